@@ -1,0 +1,169 @@
+"""An OpenMM Context behind six verbs: energy, forces, minimise, step, state, close."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.forcefield import ForceFieldSpec, build_system
+from systems.errors import SimulationError, UnknownNameError, nearest
+from systems.scene import FloatArray, Scene
+
+# Measured (see DESIGN facts and `tests/physics`): one-thread Reference wins up to about this many atoms.
+REFERENCE_PLATFORM_MAX_ATOMS = 60
+
+
+@dataclass(frozen=True)
+class State:
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, time in ps, kinetic temperature in K."""
+
+    positions_nm: FloatArray
+    potential_kj_mol: float
+    kinetic_kj_mol: float
+    time_ps: float
+    temperature_k: float
+
+
+def choose_platform(n_atoms: int, requested: str = "auto") -> tuple[str, str]:
+    """Return (platform name, the reason) for a scene of `n_atoms`; an explicit request is checked and kept."""
+    import openmm
+
+    available = [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
+    if requested != "auto":
+        if requested not in available:
+            raise UnknownNameError(
+                f"platform {requested!r} is not available here; there are: {', '.join(available)}."
+                + nearest(requested, available)
+            )
+        return requested, "asked for"
+    if n_atoms <= REFERENCE_PLATFORM_MAX_ATOMS:
+        return "Reference", f"{n_atoms} atoms: one thread without neighbour lists beats the CPU platform"
+    for gpu in ("CUDA", "HIP", "OpenCL"):
+        if gpu in available and n_atoms > 500:
+            return gpu, f"{n_atoms} atoms and a {gpu} device"
+    return "CPU", f"{n_atoms} atoms: vectorised CPU kernels win above {REFERENCE_PLATFORM_MAX_ATOMS}"
+
+
+class Engine:
+    """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        spec: ForceFieldSpec,
+        *,
+        temperature_k: float = 300.0,
+        friction_per_ps: float = 1.0,
+        timestep_ps: float = 0.004,
+        seed: int = 0,
+        platform: str = "auto",
+        threads: int = 1,
+        native_gb: bool = True,
+    ) -> None:
+        import openmm
+
+        self.scene = scene
+        self.spec = spec
+        self.platform_name, self.platform_reason = choose_platform(scene.n_atoms, platform)
+        self._system = build_system(scene, spec, native_gb=native_gb)
+        self._integrator = openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
+        # OpenMM reads a seed of 0 as "choose one from the clock".
+        self._seed = seed % (2**31 - 1) + 1
+        self._integrator.setRandomNumberSeed(self._seed)
+        self._temperature_k = temperature_k
+        properties = {"Threads": str(threads)} if self.platform_name == "CPU" else {}
+        try:
+            self._context: Any = openmm.Context(
+                self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties
+            )
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"platform {self.platform_name} cannot run {scene.name!r}: {error}") from error
+        self._context.setPositions(scene.positions_nm)
+        n_virtual = sum(self._system.isVirtualSite(i) for i in range(self._system.getNumParticles()))
+        self._n_dof = 3 * (scene.n_atoms - n_virtual) - self._system.getNumConstraints()
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def n_constraints(self) -> int:
+        return int(self._system.getNumConstraints())
+
+    def set_positions(self, positions_nm: npt.ArrayLike) -> None:
+        """Place the atoms, `(n_atoms, 3)` nm."""
+        self._context.setPositions(np.asarray(positions_nm, dtype=np.float64))
+
+    def energy(self, positions_nm: npt.ArrayLike | None = None) -> float:
+        """Return the potential energy in kJ/mol, here or at given positions `(n_atoms, 3)` nm."""
+        if positions_nm is not None:
+            self.set_positions(positions_nm)
+        return float(self._context.getState(energy=True).getPotentialEnergy()._value)
+
+    def forces(self, positions_nm: npt.ArrayLike | None = None) -> FloatArray:
+        """Return the forces `(n_atoms, 3)` in kJ/mol/nm."""
+        if positions_nm is not None:
+            self.set_positions(positions_nm)
+        return np.asarray(self._context.getState(forces=True).getForces(asNumpy=True)._value, dtype=np.float64)
+
+    def minimise(self, *, max_iterations: int = 0) -> float:
+        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol."""
+        import openmm
+
+        openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
+        return self.energy()
+
+    def thermalise(self) -> None:
+        """Draw velocities from the Maxwell-Boltzmann distribution at the bath's temperature."""
+        self._context.setVelocitiesToTemperature(self._temperature_k, self._seed)
+
+    def reset_clock(self) -> None:
+        self._context.setTime(0.0)
+        self._context.setStepCount(0)
+
+    def step(self, n_steps: int) -> None:
+        """Integrate. Raises SimulationError when OpenMM itself notices that coordinates are no longer finite."""
+        import openmm
+
+        try:
+            self._integrator.step(n_steps)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"integration failed: {error}") from error
+
+    def positions(self) -> FloatArray:
+        """Return positions `(n_atoms, 3)` nm without computing any energy."""
+        return np.asarray(self._context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
+
+    def state(self) -> State:
+        """Return positions, energies, time and kinetic temperature."""
+        raw = self._context.getState(positions=True, energy=True)
+        kinetic = float(raw.getKineticEnergy()._value)
+        return State(
+            positions_nm=np.asarray(raw.getPositions(asNumpy=True)._value, dtype=np.float64),
+            potential_kj_mol=float(raw.getPotentialEnergy()._value),
+            kinetic_kj_mol=kinetic,
+            time_ps=float(raw.getTime()._value),
+            temperature_k=2.0 * kinetic / (self._n_dof * 8.31446261815324e-3),
+        )
+
+    def checkpoint(self) -> bytes:
+        """Return OpenMM's binary checkpoint: positions, velocities, time, random states. Same platform only."""
+        return bytes(self._context.createCheckpoint())
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a checkpoint. Raises SimulationError when it was made by another platform or system."""
+        import openmm
+
+        try:
+            self._context.loadCheckpoint(blob)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"checkpoint does not fit this run: {error}") from error
+
+    def close(self) -> None:
+        """Free the Context. The engine cannot be used afterwards."""
+        self._context = None

@@ -1,0 +1,51 @@
+"""Typed errors. Each message is one line that says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class SurromdError(Exception):
+    """Base of every error a user can cause or meet; the command line prints its message and exits with 1."""
+
+
+class InputError(SurromdError):
+    """A file or an argument cannot be used as it is."""
+
+
+class UnknownNameError(InputError):
+    """A name (scene, weights, force field) that the library does not hold."""
+
+
+class UnitError(InputError):
+    """A quantity without a unit, with an unknown one, or with one of the wrong dimension."""
+
+
+class PreparationError(InputError):
+    """A molecule cannot be prepared: unknown residues, broken structure, impossible chemistry."""
+
+
+class TrajectoryError(SurromdError):
+    """A trajectory file is damaged, incomplete, or does not fit the scene."""
+
+
+class OutOfDomainError(SurromdError):
+    """A scene that the weights were not trained for."""
+
+
+class WeightsError(SurromdError):
+    """A weights file is damaged or does not fit this version."""
+
+
+class SimulationError(SurromdError):
+    """A simulation failed while running (non-finite coordinates, a platform that cannot run the scene)."""
+
+
+class StorageError(SurromdError):
+    """The disk is full or not writable; what was complete before stays readable."""
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """Return ' Did you mean X?' for the nearest of `known`, or an empty string."""
+    import difflib
+
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f" Did you mean {close[0]!r}?" if close else ""

@@ -1,0 +1,153 @@
+"""Scene: one molecule or system as plain arrays, from which every library's own object is made on demand."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A molecular system: topology, starting positions and where they came from.
+
+    Shapes: per atom `(n_atoms,)`, bonds `(n_bonds, 2)` with i < j, positions `(n_atoms, 3)` in nm, masses in dalton,
+    formal charges in elementary charges. `bond_orders` holds 1, 1.5, 2, 3, or 0 where the source does not say.
+    `residue_of_atom` indexes `residue_names`, `residue_ids` and `chain_of_residue`.
+    """
+
+    name: str
+    atom_names: tuple[str, ...]
+    elements: tuple[str, ...]
+    residue_of_atom: IntArray
+    residue_names: tuple[str, ...]
+    residue_ids: tuple[str, ...]
+    chain_of_residue: tuple[str, ...]
+    bonds: IntArray
+    bond_orders: FloatArray
+    formal_charges: IntArray
+    masses_da: FloatArray
+    positions_nm: FloatArray
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.elements)
+        per_atom = (self.atom_names, self.residue_of_atom, self.formal_charges, self.masses_da, self.positions_nm)
+        if any(len(a) != n for a in per_atom):
+            raise InputError(f"Scene {self.name!r}: per-atom arrays differ in length from its {n} elements.")
+        if self.positions_nm.shape != (n, 3):
+            raise InputError(f"Scene {self.name!r}: positions have shape {self.positions_nm.shape}, not ({n}, 3).")
+        if len(self.bonds) != len(self.bond_orders):
+            raise InputError(f"Scene {self.name!r}: {len(self.bonds)} bonds but {len(self.bond_orders)} bond orders.")
+        if len(self.bonds) and (self.bonds.min() < 0 or self.bonds.max() >= n):
+            raise InputError(f"Scene {self.name!r}: a bond names an atom outside 0..{n - 1}.")
+        for array in (self.residue_of_atom, self.bonds, self.bond_orders, self.formal_charges, self.masses_da,
+                      self.positions_nm):  # fmt: skip
+            array.setflags(write=False)
+
+    @property
+    def n_atoms(self) -> int:
+        return len(self.elements)
+
+    @property
+    def heavy_idx(self) -> IntArray:
+        """Indices of atoms that are not hydrogen, `(n_heavy,)`."""
+        return np.array([i for i, e in enumerate(self.elements) if e != "H"], dtype=np.int64)
+
+    @property
+    def topology_hash(self) -> str:
+        """Hash of the ordered topology, names included, positions left out."""
+        record = self.to_dict()
+        for key in ("positions_nm", "provenance", "name", "masses_da"):
+            record.pop(key)
+        return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def molecule_key(self) -> str:
+        """Canonical hash, free of atom order, names and positions (elements, bond graph, charge, stereo)."""
+        from systems.chemistry import molecule_key
+
+        return molecule_key(self)
+
+    @property
+    def formula(self) -> str:
+        """Hill-order formula, for people: C6H12N2O2."""
+        counts = {e: self.elements.count(e) for e in set(self.elements)}
+        order = [e for e in ("C", "H") if e in counts and "C" in counts]
+        order += sorted(e for e in counts if e not in order)
+        return "".join(f"{e}{counts[e] if counts[e] > 1 else ''}" for e in order)
+
+    def with_positions(self, positions_nm: npt.ArrayLike) -> Scene:
+        """Return the same scene at other positions `(n_atoms, 3)` nm."""
+        return replace(self, positions_nm=np.array(positions_nm, dtype=np.float64))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and strings that `from_dict` and JSON take back exactly."""
+        out = asdict(self)
+        for key, value in out.items():
+            if isinstance(value, np.ndarray):
+                out[key] = value.tolist()
+            elif isinstance(value, tuple):
+                out[key] = list(value)
+        return out
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> Scene:
+        """Rebuild a scene from `to_dict`. Raises InputError when a key is missing or unknown."""
+        try:
+            fields = dict(record)
+            for key in ("atom_names", "elements", "residue_names", "residue_ids", "chain_of_residue"):
+                fields[key] = tuple(fields[key])
+            for key in ("residue_of_atom", "bonds", "formal_charges"):
+                fields[key] = np.array(fields[key], dtype=np.int64)
+            for key in ("bond_orders", "masses_da", "positions_nm"):
+                fields[key] = np.array(fields[key], dtype=np.float64)
+            fields["bonds"] = fields["bonds"].reshape(-1, 2)
+            return Scene(**fields)
+        except (KeyError, TypeError) as error:
+            raise InputError(f"Scene record is incomplete or has unknown entries: {error}.") from error
+
+    # ---- other libraries' objects, each made here and nowhere else -------------------------------------------------
+
+    def to_openmm_topology(self) -> Any:
+        """Return an `openmm.app.Topology` with the same atom order, bonds included."""
+        from openmm import app
+
+        topology = app.Topology()
+        chains: dict[str, Any] = {}
+        residues = []
+        for name, resid, chain_id in zip(self.residue_names, self.residue_ids, self.chain_of_residue, strict=True):
+            if chain_id not in chains:
+                chains[chain_id] = topology.addChain(chain_id)
+            residues.append(topology.addResidue(name, chains[chain_id], resid))
+        atoms = []
+        for name, symbol, res in zip(self.atom_names, self.elements, self.residue_of_atom, strict=True):
+            element = app.Element.getBySymbol(symbol)
+            atoms.append(topology.addAtom(name, element, residues[res]))
+        if [a.index for a in topology.atoms()] != list(range(self.n_atoms)):
+            raise InputError(f"Scene {self.name!r}: atoms of one residue or chain are not contiguous.")
+        for (i, j), order in zip(self.bonds.tolist(), self.bond_orders.tolist(), strict=True):
+            topology.addBond(atoms[i], atoms[j], order=round(order) or None)
+        return topology
+
+    def to_mdtraj_topology(self) -> Any:
+        """Return an `mdtraj.Topology` with the same atom order, bonds included."""
+        import mdtraj
+
+        return mdtraj.Topology.from_openmm(self.to_openmm_topology())
+
+    def write_pdb(self, path: str | Path) -> None:
+        """Write a PDB file (positions in Å, CONECT for every bond, atoms in this scene's order)."""
+        from systems.pdb_text import pdb_text
+
+        Path(path).write_text(pdb_text(self))
