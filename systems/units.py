@@ -7,14 +7,19 @@ import re
 
 from systems.errors import UnitError
 
-_TIME_PS = {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "ms": 1e9}
+# Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
+_TIME_PS = {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "\u00b5s": 1e6, "\u03bcs": 1e6, "ms": 1e9}
 _WALL_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
+# These three mean the same in every MD program, so a bare number is accepted, too.
+_TEMPERATURE_K = {"K": 1.0, "": 1.0}
+_RATE_PER_PS = {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, "/ns": 1e-3, "1/ns": 1e-3, "": 1.0}
+_MASS_DA = {"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}
 _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 
 def _parse(text: str, table: dict[str, float], what: str, example: str) -> float:
     match = _NUMBER.match(text)
-    known = ", ".join(table)
+    known = ", ".join(unit for unit in table if unit and unit != "\u03bcs")
     if match is None:
         raise UnitError(f"{what} {text!r} is not a number with a unit; write it like {example} (units: {known}).")
     number, unit = match.groups()
@@ -40,6 +45,22 @@ def parse_wall_s(text: str, what: str = "budget") -> float:
     return _parse(text, _WALL_S, what, "30min")
 
 
+def parse_temperature_k(text: str, what: str = "temperature") -> float:
+    """Return a temperature in K (`300K` or `300`). Raises UnitError."""
+    return _parse(text, _TEMPERATURE_K, what, "300K")
+
+
+def parse_rate_per_ps(text: str, what: str = "friction") -> float:
+    """Return a rate in 1/ps (`1/ps`, `91/ps`, `0.1/fs` or a bare number). Raises UnitError."""
+    # "1/ps" is the number 1 with the unit "/ps", while "1 1/ps" spells the unit out; both are in the table.
+    return _parse(text, _RATE_PER_PS, what, "1/ps")
+
+
+def parse_mass_da(text: str, what: str = "hydrogen mass") -> float:
+    """Return a mass in dalton (`3Da` or `3`). Raises UnitError."""
+    return _parse(text, _MASS_DA, what, "3Da")
+
+
 def format_time_ps(time_ps: float) -> str:
     """Return a duration with the largest unit that keeps it at or above one: 1500.0 -> '1.5 ns'."""
     for unit in ("us", "ns", "ps", "fs"):
@@ -50,9 +71,9 @@ def format_time_ps(time_ps: float) -> str:
 
 def whole_steps(duration_ps: float, step_ps: float, what: str) -> int:
     """Return duration / step as a whole number, refusing (UnitError) what does not divide evenly."""
-    n = round(duration_ps / step_ps)
-    if n < 1 or abs(n * step_ps - duration_ps) > 1e-6 * max(duration_ps, step_ps):
-        raise UnitError(
-            f"{what}: {format_time_ps(duration_ps)} is not a whole multiple of {format_time_ps(step_ps)}."
-        )
+    ratio = duration_ps / step_ps
+    n = round(ratio)
+    # In steps, not relative to the duration: over a microsecond a relative bound would forgive whole steps.
+    if n < 1 or abs(ratio - n) > 1e-3:
+        raise UnitError(f"{what}: {format_time_ps(duration_ps)} is not a whole multiple of {format_time_ps(step_ps)}.")
     return n

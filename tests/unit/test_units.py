@@ -1,0 +1,120 @@
+"""Quantities: what users write comes out in ps, s, K, 1/ps and dalton, and what is ambiguous is refused."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from systems.errors import InputError, UnitError
+from systems.units import (
+    format_time_ps,
+    parse_mass_da,
+    parse_rate_per_ps,
+    parse_temperature_k,
+    parse_time_ps,
+    parse_wall_s,
+    whole_steps,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected_ps"),
+    [
+        ("2fs", 0.002),
+        ("1ps", 1.0),
+        ("50ns", 50_000.0),
+        ("1.5 us", 1.5e6),
+        ("1\u00b5s", 1e6),
+        ("1\u03bcs", 1e6),
+        ("1ms", 1e9),
+        (" 1e2 ps ", 100.0),
+        ("1E-1ps", 0.1),
+        (".5ps", 0.5),
+    ],
+)
+def test_time(text: str, expected_ps: float) -> None:
+    assert parse_time_ps(text) == pytest.approx(expected_ps, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "ns",
+        "10",
+        "10 parsecs",
+        "10NS",
+        "1.2.3ns",
+        "-1ns",
+        "0ps",
+        "1e999ns",
+        "nan ps",
+        "inf ps",
+        "1,5ns",
+        "10ns 5ps",
+    ],
+)
+def test_bad_times_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(UnitError) as caught:
+        parse_time_ps(text, "--time")
+    message = str(caught.value)
+    assert message.startswith(f"--time {text!r}")
+    assert "10ns" in message, "the message shows how to write it"
+    assert "\n" not in message
+
+
+def test_a_missing_unit_is_named_as_such_and_the_units_listed() -> None:
+    with pytest.raises(UnitError, match=r"has no unit; .*fs, ps, ns, us"):
+        parse_time_ps("10")
+    with pytest.raises(UnitError, match="unknown unit 'h'"):
+        parse_time_ps("1h")
+
+
+def test_unit_errors_are_input_errors() -> None:
+    assert issubclass(UnitError, InputError)
+
+
+def test_wall_time_and_simulated_time_do_not_mix() -> None:
+    assert parse_wall_s("30min") == 1800.0
+    assert parse_wall_s("1.5h") == 5400.0
+    assert parse_wall_s("45s") == 45.0
+    with pytest.raises(UnitError):
+        parse_wall_s("10ns")
+    with pytest.raises(UnitError):
+        parse_time_ps("30min")
+
+
+def test_temperature_friction_and_mass() -> None:
+    assert parse_temperature_k("300K") == parse_temperature_k("300") == parse_temperature_k("300 K") == 300.0
+    assert parse_rate_per_ps("91/ps") == parse_rate_per_ps("91") == parse_rate_per_ps("91 1/ps") == 91.0
+    assert parse_rate_per_ps("0.1/fs") == pytest.approx(100.0)
+    assert parse_mass_da("3Da") == parse_mass_da("3") == parse_mass_da("3 amu") == 3.0
+    for parse, text in ((parse_temperature_k, "25C"), (parse_rate_per_ps, "1ps"), (parse_mass_da, "3kg")):
+        with pytest.raises(UnitError, match="unknown unit"):
+            parse(text)
+
+
+@given(st.floats(min_value=1e-3, max_value=1e9, allow_nan=False))
+def test_what_is_printed_reads_back(time_ps: float) -> None:
+    assert parse_time_ps(format_time_ps(time_ps)) == pytest.approx(time_ps, rel=1e-5)
+
+
+def test_format_picks_the_largest_unit() -> None:
+    assert format_time_ps(1500.0) == "1.5 ns"
+    assert format_time_ps(1.0) == "1 ps"
+    assert format_time_ps(0.004) == "4 fs"
+    assert format_time_ps(2e6) == "2 us"
+
+
+@given(st.integers(min_value=1, max_value=10**9), st.sampled_from([0.0005, 0.001, 0.002, 0.004, 0.1, 0.2, 1.0, 3.0]))
+def test_whole_multiples_are_counted(n: int, step_ps: float) -> None:
+    assert whole_steps(n * step_ps, step_ps, "run") == n
+
+
+@pytest.mark.parametrize(
+    ("duration_ps", "step_ps"), [(1.0, 0.003), (0.5, 1.0), (10.0, 4.0), (1e6, 3.0), (1e9, 0.3), (1.0, 0.0041)]
+)
+def test_uneven_divisions_are_refused_however_long_the_run(duration_ps: float, step_ps: float) -> None:
+    with pytest.raises(UnitError, match="not a whole multiple"):
+        whole_steps(duration_ps, step_ps, "save interval in time steps")
