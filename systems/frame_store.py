@@ -1,0 +1,274 @@
+"""Per-frame columns, a record and a scene in one HDF5 file: the part that HDF5 trajectories and DCD companions share.
+
+Layout: `/time` (n,) float64 ps, `/surromd/chunk_idx` (n,) int32, `/surromd/flags` (n,) uint16 where frames were checked,
+`/surromd/scalars/NAME` (n,) float64, `/surromd/record` and `/surromd/scene` JSON text; more columns as the format asks.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from systems.atomic_file import AtomicFile, storage_error, write_whole
+from systems.errors import InputError, StorageError, TrajectoryError
+from systems.scene import Scene
+from systems.trajectory_types import FrameBlock
+
+FORMAT_VERSION = 1
+_COLUMN_CHUNK = 2048
+_RECORD_BYTES = 4096
+
+
+def program_version() -> str:
+    """Return the installed version of surromd, or `0` when it runs from a source tree."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("surromd")
+    except PackageNotFoundError:
+        return "0"
+
+
+def json_text(value: Any, what: str) -> str:
+    """Return JSON (ASCII), NumPy numbers and arrays included. Raises InputError for what JSON cannot hold."""
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, np.ndarray | np.generic):
+            return item.tolist()
+        if isinstance(item, Path):
+            return str(item)
+        raise TypeError(f"{type(item).__name__} has no JSON form")
+
+    try:
+        return json.dumps(value, default=plain)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"The {what} cannot be written as JSON: {error}.") from error
+
+
+def add_column(
+    file: h5py.File, name: str, n_frames: int, dtype: str, *, tail: tuple[int, ...] = (), chunk: int = _COLUMN_CHUNK
+) -> h5py.Dataset:
+    """Create an extendable dataset `(n_frames, *tail)`. Floats start as NaN, so that what was never written shows."""
+    # No compression: measured on alanine dipeptide, gzip 1 with shuffle saves 27 % of the size and makes appends
+    # 15 times and reads 4 times slower; and a chunk that keeps its place survives a crash while it is rewritten.
+    return file.create_dataset(
+        name, shape=(n_frames, *tail), maxshape=(None, *tail), chunks=(chunk, *tail), dtype=dtype,
+        fillvalue=np.nan if dtype.startswith(("f", "<f")) else 0,
+    )  # fmt: skip
+
+
+def set_text(group: h5py.Group, name: str, text: str, capacity: int = 0) -> None:
+    """Write ASCII text as one fixed-length string, in place where it fits: a single small write, which is atomic."""
+    data = text.encode("ascii")
+    if name in group and group[name].dtype.itemsize < len(data):
+        del group[name]
+        capacity = max(2 * len(data), capacity)
+    if name not in group:
+        group.create_dataset(name, shape=(), dtype=f"S{max(len(data), capacity, 1)}")
+    group[name][()] = np.bytes_(data)
+
+
+def get_json(file: h5py.File, name: str, path: Path) -> Any:
+    """Return the JSON value of a text dataset. Raises TrajectoryError when it is missing or damaged."""
+    try:
+        return json.loads(file[name][()])
+    except (KeyError, ValueError, TypeError, OSError, RuntimeError) as error:
+        raise TrajectoryError(f"{path} is damaged: its {name} cannot be read ({error}).") from error
+
+
+def create_store(
+    path: Path, scene: Scene, record: dict[str, Any], lay_out: Callable[[h5py.File], None], *, overwrite: bool
+) -> None:
+    """Create the file with all headers and no frames; it appears under its name only when it is whole.
+
+    `lay_out` adds the format's own groups and columns. Raises TrajectoryError when the file exists and `overwrite` is
+    False, InputError for a record that is not JSON, StorageError when the disk refuses.
+    """
+    refuse_existing(path, overwrite)
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        group = file.create_group("surromd")
+        group.attrs["format_version"] = np.int64(FORMAT_VERSION)
+        group.attrs["largest_append"] = np.int64(0)
+        group.create_group("scalars")
+        set_text(group, "record", json_text(record, "record"), _RECORD_BYTES)
+        set_text(group, "scene", json_text(scene.to_dict(), "scene"))
+        add_column(file, "surromd/chunk_idx", 0, "<i4")
+        lay_out(file)
+    write_new(path, image.getvalue())
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise TrajectoryError when `path` exists and must not be replaced."""
+    if path.exists() and not overwrite:
+        raise TrajectoryError(f"{path} exists already; overwrite it, resume it, or choose another name.")
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Write a whole file under a temporary name and rename it. Raises StorageError; nothing half-written stays."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        try:
+            write_whole(descriptor, data, 0)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise storage_error(path, error, "no file was made") from error
+
+
+def open_hdf5(path: Path, source: Any = None, mode: str = "r") -> h5py.File:
+    """Open an HDF5 file. Raises TrajectoryError, in one line, when it is absent, cut short or no HDF5 file."""
+    if not path.exists():
+        raise TrajectoryError(f"{path} does not exist.")
+    try:
+        return h5py.File(path if source is None else source, mode)
+    except (OSError, RuntimeError, ValueError) as error:
+        text = str(error)
+        if "truncated" in text:
+            reason = "it is cut short; restore it from a whole copy"
+        elif "signature" in text:
+            reason = "it is not an HDF5 file"
+        else:
+            reason = text.replace("\n", " ")
+        raise TrajectoryError(f"{path} cannot be read: {reason}.") from error
+
+
+def column_names(file: h5py.File) -> list[str]:
+    """Return the names of all per-frame columns present in the file."""
+    fixed = ("coordinates", "time", "particles/trajectory/position/step", "surromd/flags", "surromd/chunk_idx")
+    names = [name for name in fixed if name in file]
+    if "surromd/scalars" in file:
+        names += [f"surromd/scalars/{name}" for name in file["surromd/scalars"]]
+    return names
+
+
+def consistent_length(file: h5py.File, path: Path) -> int:
+    """Return the number of frames that every column holds.
+
+    Columns may differ by one append in flight (a writer that was killed); the frames behind the shortest are not
+    counted. Raises TrajectoryError for any other difference and for blocks of data that are missing.
+    """
+    try:
+        columns = {name: file[name] for name in column_names(file)}
+        lengths = {name: int(column.shape[0]) for name, column in columns.items()}
+        in_flight = int(file["surromd"].attrs["largest_append"]) if "surromd" in file else 0
+        shortest, longest = min(lengths.values()), max(lengths.values())
+        if longest - shortest > in_flight:
+            listed = ", ".join(f"/{name} {n}" for name, n in lengths.items())
+            raise TrajectoryError(f"{path} is damaged: its columns differ in length ({listed} frames).")
+        for name, column in columns.items():
+            if column.chunks and "surromd" in file:
+                stored = column.id.get_num_chunks()
+                if stored < -(-shortest // column.chunks[0]):
+                    raise TrajectoryError(f"{path} is damaged: blocks of /{name} are missing.")
+    except (KeyError, ValueError, OSError, RuntimeError, AttributeError, IndexError) as error:
+        raise TrajectoryError(f"{path} is damaged: {str(error).splitlines()[0]}.") from error
+    return shortest
+
+
+class FrameStore:
+    """Appends to a file made by `create_store`, one transaction per append.
+
+    Raises TrajectoryError when the file is damaged, not ours, or written by another process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        open_hdf5(path).close()
+        self._atomic = AtomicFile(path)
+        try:
+            self.file = open_hdf5(path, self._atomic, "r+")
+            if "surromd" not in self.file:
+                raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; choose another name.")
+            self.scene = Scene.from_dict(get_json(self.file, "surromd/scene", path))
+            self.record: dict[str, Any] = get_json(self.file, "surromd/record", path)
+            self.n_frames = consistent_length(self.file, path)
+            if any(len(self.file[name]) != self.n_frames for name in column_names(self.file)):
+                self.truncate(self.n_frames)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def last_time_ps(self) -> float | None:
+        return float(self.file["time"][self.n_frames - 1]) if self.n_frames else None
+
+    def append(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
+        """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError."""
+        n, start = len(block), self.n_frames
+        self._check_flags(block)
+        if n > int(self.file["surromd"].attrs["largest_append"]):
+            # On disk before the frames are, so that a reader can tell an append in flight from damage.
+            self.file["surromd"].attrs["largest_append"] = np.int64(n)
+            self._commit()
+        for name in block.scalars:
+            if f"surromd/scalars/{name}" not in self.file:
+                add_column(self.file, f"surromd/scalars/{name}", start, "<f8")
+        if block.flags is not None and "surromd/flags" not in self.file:
+            add_column(self.file, "surromd/flags", start, "<u2")
+        values: dict[str, npt.NDArray[Any]] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}
+        if block.flags is not None:
+            values["surromd/flags"] = block.flags
+        for name in self.file["surromd/scalars"]:
+            values[f"surromd/scalars/{name}"] = block.scalars.get(name, np.full(n, np.nan))
+        for name, data in values.items():
+            dataset = self.file[name]
+            dataset.resize(start + n, axis=0)
+            dataset[start:] = data
+        self._commit()
+        self.n_frames += n
+
+    def _check_flags(self, block: FrameBlock) -> None:
+        have = "surromd/flags" in self.file
+        if self.n_frames and have != (block.flags is not None):
+            state = "with" if have else "without"
+            raise InputError(f"{self.path}: the frames before were written {state} flags; flag all frames of a file or none.")
+
+    def truncate(self, n_frames: int) -> None:
+        """Cut all columns to `n_frames`. Raises InputError when there are fewer, StorageError."""
+        if not 0 <= n_frames <= self.n_frames:
+            raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
+        for name in column_names(self.file):
+            self.file[name].resize(n_frames, axis=0)
+        if n_frames == 0 and "surromd/flags" in self.file:
+            del self.file["surromd/flags"]
+        self._commit()
+        self.n_frames = n_frames
+
+    def update_record(self, entries: dict[str, Any]) -> None:
+        """Merge `entries` into the stored record. Raises InputError, StorageError."""
+        merged = {**self.record, **entries}
+        set_text(self.file["surromd"], "record", json_text(merged, "record"))
+        self._commit()
+        self.record = merged
+
+    def _commit(self) -> None:
+        self.file.flush()
+        try:
+            self._atomic.commit()
+        except OSError as error:
+            raise self.failed(error) from error
+
+    def failed(self, error: OSError) -> StorageError:
+        """Close the store after a failed write and return the error to raise."""
+        self._atomic.abandon()
+        self.close()
+        return storage_error(self.path, error, f"the {self.n_frames} frames written before are complete and readable")
+
+    def close(self) -> None:
+        """Close the file; twice does no harm. What is not committed is dropped."""
+        if getattr(self, "file", None):
+            self._atomic.abandon()
+            self.file.close()
+        self._atomic.close()

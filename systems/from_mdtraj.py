@@ -1,0 +1,130 @@
+"""Scenes from MDTraj topologies, and trajectories of other programs through MDTraj's readers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.errors import InputError, TrajectoryError
+from systems.scene import Scene
+from systems.trajectory_types import Float32Array, TrajectoryReader
+
+
+def scene_from_mdtraj_topology(
+    topology: Any, positions_nm: npt.ArrayLike, *, name: str = "trajectory", source: str = ""
+) -> Scene:
+    """Return a Scene with the atoms, bonds and bond orders of an `mdtraj.Topology`, at positions `(n_atoms, 3)` nm.
+
+    Bond orders that the topology does not state are 0, formal charges 0. Raises InputError when the numbers of atoms
+    differ.
+    """
+    positions = np.array(positions_nm, dtype=np.float64)
+    if positions.shape != (topology.n_atoms, 3):
+        raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
+    atoms, residues = list(topology.atoms), list(topology.residues)
+    bonds = sorted(
+        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), _order(b)) for b in topology.bonds
+    )
+    symbols = [a.element.symbol if a.element is not None else "VS" for a in atoms]
+    return Scene(
+        name=name,
+        atom_names=tuple(a.name for a in atoms),
+        elements=tuple(symbols),
+        residue_of_atom=np.array([a.residue.index for a in atoms], dtype=np.int64),
+        residue_names=tuple(r.name for r in residues),
+        residue_ids=tuple(str(r.resSeq) for r in residues),
+        chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
+        bonds=np.array([b[:2] for b in bonds], dtype=np.int64).reshape(-1, 2),
+        bond_orders=np.array([b[2] for b in bonds], dtype=np.float64),
+        formal_charges=np.array([getattr(a, "formal_charge", None) or 0 for a in atoms], dtype=np.int64),
+        masses_da=np.array([a.element.mass if a.element is not None else 0.0 for a in atoms], dtype=np.float64),
+        positions_nm=positions,
+        provenance={"source": source} if source else {},
+    )
+
+
+def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, path: Path) -> Scene:
+    """Return the Scene of an MDTraj HDF5 file's topology JSON. Raises TrajectoryError when it is damaged."""
+    import mdtraj
+    from mdtraj.core import element
+    from mdtraj.core.topology import bond_name_to_type
+
+    try:
+        record = json.loads(text)
+        topology = mdtraj.Topology()
+        for chain_record in sorted(record["chains"], key=lambda c: c["index"]):
+            chain = topology.add_chain(chain_record.get("chain_id"))
+            for entry in sorted(chain_record["residues"], key=lambda r: r["index"]):
+                residue = topology.add_residue(entry["name"], chain, resSeq=entry.get("resSeq", entry["index"] + 1))
+                for atom in sorted(entry["atoms"], key=lambda a: a["index"]):
+                    symbol = atom["element"]
+                    kind = element.get_by_symbol(symbol) if symbol else element.virtual
+                    topology.add_atom(atom["name"], kind, residue, formal_charge=atom.get("formal_charge"))
+        atoms = list(topology.atoms)
+        metadata = record.get("bond_metadata") or [{"order": None, "type": None}] * len(record["bonds"])
+        for (i, j), bond in zip(record["bonds"], metadata, strict=True):
+            topology.add_bond(atoms[i], atoms[j], order=bond["order"], type=bond_name_to_type(bond["type"]))
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise TrajectoryError(f"{path} is damaged: its /topology cannot be understood ({error}).") from error
+    return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
+
+
+def load_topology(top: Path) -> tuple[Any, Float32Array]:
+    """Return `(mdtraj.Topology, positions (n_atoms, 3) nm)` of a structure file. Raises InputError."""
+    import mdtraj
+
+    try:
+        structure = mdtraj.load(str(top))
+    except Exception as error:  # each MDTraj reader raises its own kinds
+        raise InputError(f"{top} cannot be read as a structure: {_first_line(error)}.") from error
+    return structure.topology, structure.xyz[0]
+
+
+class MdtrajReader(TrajectoryReader):
+    """Any format that MDTraj reads (XTC, TRR, NetCDF, PDB, ...), whole in memory. Raises InputError, TrajectoryError."""
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        import mdtraj
+
+        self.path = path
+        if not path.exists():
+            raise TrajectoryError(f"{path} does not exist.")
+        try:
+            frames = mdtraj.load(str(path), top=None if top is None else str(top))
+        except Exception as error:  # each MDTraj reader raises its own kinds
+            raise TrajectoryError(f"{path} cannot be read: {_first_line(error)}.") from error
+        self._positions_nm = np.asarray(frames.xyz, dtype=np.float32)
+        self.n_frames, self.n_atoms = frames.n_frames, frames.n_atoms
+        self.time_ps = np.asarray(frames.time, dtype=np.float64)
+        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        self.scene = None
+        if self.n_frames:
+            self.scene = scene_from_mdtraj_topology(
+                frames.topology, self._positions_nm[0], name=path.stem, source=path.name
+            )
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._positions_nm[start:stop:stride].copy()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def _order(bond: Any) -> float:
+    if bond.order is not None:
+        return float(bond.order)
+    return 0.0 if bond.type is None else float(bond.type)
+
+
+def _chain_id(chain: Any) -> str:
+    given = getattr(chain, "chain_id", None)
+    return str(given) if given else chr(ord("A") + chain.index % 26)
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0].rstrip(".") if lines else type(error).__name__

@@ -1,0 +1,67 @@
+"""The one trajectory codec: HDF5 (the full record) and DCD (what everybody reads), streaming, append, resume."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError, TrajectoryError
+from systems.scene import Scene
+from systems.trajectory_types import FrameBlock, TrajectoryReader, TrajectoryWriter
+
+__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "open_trajectory", "open_writer"]
+
+_HDF5 = (".h5", ".hdf5")
+
+
+def open_writer(
+    path: str | Path, scene: Scene, record: dict[str, Any], *, append: bool = False, overwrite: bool = False
+) -> TrajectoryWriter:
+    """Start a trajectory file (`.h5`, `.hdf5` or `.dcd`), or continue one with `append=True`.
+
+    A DCD is accompanied by `NAME.pdb` (topology) and `NAME.meta.h5` (record, exact times, flags). With `append` the
+    file must be ours and hold the same ordered topology; what it records stays, new keys of `record` are added, and an
+    append that a crash interrupted is cut off. `record` must be JSON-able.
+    Raises InputError for an unknown suffix or record; TrajectoryError when the file exists (and neither `append` nor
+    `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another process;
+    StorageError when the folder is missing, not writable or full.
+    """
+    path = Path(path)
+    if append and overwrite:
+        raise InputError(f"{path}: append and overwrite exclude each other.")
+    if append and not path.exists():
+        raise TrajectoryError(f"{path} does not exist and cannot be continued.")
+    if path.name.endswith(".meta.h5"):
+        raise InputError(f"{path}: names ending in .meta.h5 are kept for the companions of DCD files; choose another.")
+    if path.suffix.lower() in _HDF5:
+        from systems.hdf5_file import Hdf5Writer
+
+        return Hdf5Writer(path, scene, record, append=append, overwrite=overwrite)
+    if path.suffix.lower() == ".dcd":
+        from systems.dcd_file import DcdWriter
+
+        return DcdWriter(path, scene, record, append=append, overwrite=overwrite)
+    raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
+
+
+def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
+    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, or any format MDTraj reads.
+
+    `top` names a structure file for formats without topology; a DCD of ours finds its companions itself. A file
+    without our record has `record == {}` and `flags is None`.
+    Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
+    InputError when a topology is needed, or does not fit.
+    """
+    path = Path(path)
+    top = None if top is None else Path(top)
+    if path.suffix.lower() in _HDF5:
+        from systems.hdf5_file import Hdf5Reader
+
+        return Hdf5Reader(path)
+    if path.suffix.lower() == ".dcd":
+        from systems.dcd_file import DcdReader
+
+        return DcdReader(path, top)
+    from systems.from_mdtraj import MdtrajReader
+
+    return MdtrajReader(path, top)

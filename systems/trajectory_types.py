@@ -1,0 +1,174 @@
+"""What every trajectory writer and reader offers, whatever the format; and the checks that all of them share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.errors import InputError, TrajectoryError
+from systems.scene import Scene
+
+Float32Array = npt.NDArray[np.float32]
+Float64Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBlock:
+    """Frames that belong together, checked: positions `(n, n_atoms, 3)` float32 nm, all else `(n,)`."""
+
+    positions_nm: Float32Array
+    time_ps: Float64Array
+    flags: npt.NDArray[np.uint16] | None
+    chunk_idx: npt.NDArray[np.int32]
+    scalars: dict[str, Float64Array]
+
+    def __len__(self) -> int:
+        return len(self.time_ps)
+
+
+class TrajectoryWriter(ABC):
+    """Appends frames to one file. Each `append` is whole on disk, or not there at all, when it returns or raises."""
+
+    path: Path
+    scene: Scene
+    n_frames: int
+    last_time_ps: float | None
+
+    def append(
+        self,
+        positions_nm: npt.ArrayLike,
+        time_ps: npt.ArrayLike,
+        *,
+        flags: npt.ArrayLike | None = None,
+        chunk_idx: int | None = -1,
+        scalars: dict[str, npt.ArrayLike] | None = None,
+    ) -> None:
+        """Append frames `(n, n_atoms, 3)` nm at times `(n,)` ps, later than all before, and flush them to disk.
+
+        `flags` `(n,)` are validity bits (systems.validity), given for all frames of a file or for none; `chunk_idx` is
+        the surrogate's chunk these frames came from (-1: none); `scalars` are further `(n,)` series by name, NaN in
+        frames where they are not given.
+        Raises InputError for frames that do not fit the scene, the times or what was appended before; StorageError
+        when the disk is full (what was complete stays readable, the writer is then closed to further frames).
+        """
+        block = self._checked(positions_nm, time_ps, flags, chunk_idx, scalars or {})
+        if len(block):
+            self._append(block)
+            self.n_frames += len(block)
+            self.last_time_ps = float(block.time_ps[-1])
+
+    @abstractmethod
+    def _append(self, block: FrameBlock) -> None: ...
+
+    @abstractmethod
+    def truncate(self, n_frames: int) -> None:
+        """Cut the file to its first `n_frames` frames (to resume from a checkpoint). Raises InputError, StorageError."""
+
+    @abstractmethod
+    def update_record(self, entries: dict[str, Any]) -> None:
+        """Merge JSON-able `entries` into the record (top-level keys are replaced). Raises InputError, StorageError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the file; twice does no harm."""
+
+    def __enter__(self) -> TrajectoryWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:  # fmt: skip
+        self.close()
+
+    def _checked(
+        self,
+        positions_nm: npt.ArrayLike,
+        time_ps: npt.ArrayLike,
+        flags: npt.ArrayLike | None,
+        chunk_idx: int | None,
+        scalars: dict[str, npt.ArrayLike],
+    ) -> FrameBlock:
+        where = f"{self.path}, after frame {self.n_frames}"
+        positions = np.ascontiguousarray(positions_nm, dtype=np.float32)
+        times = np.atleast_1d(np.asarray(time_ps, dtype=np.float64))
+        n = len(times)
+        if positions.shape != (n, self.scene.n_atoms, 3) or times.ndim != 1:
+            raise InputError(
+                f"{where}: positions have shape {positions.shape} and times {times.shape}; "
+                f"expected (n, {self.scene.n_atoms}, 3) and (n,)."
+            )
+        before = [] if self.last_time_ps is None else [self.last_time_ps]
+        if not np.isfinite(times).all() or (np.diff(np.concatenate([before, times])) <= 0).any():
+            raise InputError(f"{where}: times must be finite and increase from frame to frame.")
+        if flags is not None:
+            flags = np.asarray(flags)
+            if flags.shape != (n,) or flags.dtype.kind not in "ui":
+                raise InputError(f"{where}: flags must be {n} integers, not {flags.dtype} of shape {flags.shape}.")
+        series = {name: np.asarray(values, dtype=np.float64) for name, values in scalars.items()}
+        for name, values in series.items():
+            if values.shape != (n,) or "/" in name or not name:
+                raise InputError(f"{where}: scalar {name!r} must have shape ({n},) and no slash in its name.")
+        chunk = np.full(n, -1 if chunk_idx is None else chunk_idx, dtype=np.int32)
+        return FrameBlock(positions, times, None if flags is None else flags.astype(np.uint16), chunk, series)
+
+
+class TrajectoryReader(ABC):
+    """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say."""
+
+    path: Path
+    scene: Scene | None
+    record: dict[str, Any]
+    n_frames: int
+    n_atoms: int
+    time_ps: Float64Array
+    flags: npt.NDArray[np.uint16] | None
+    chunk_idx: npt.NDArray[np.int32] | None
+    scalars: dict[str, Float64Array]
+
+    def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
+        """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).
+
+        Raises InputError for a stride below 1, TrajectoryError when the frames cannot be read.
+        """
+        if stride < 1:
+            raise InputError(f"{self.path}: stride must be at least 1, not {stride}.")
+        first, last, step = slice(start, stop, stride).indices(self.n_frames)
+        if first >= last:
+            return np.empty((0, self.n_atoms, 3), dtype=np.float32)
+        return self._read(first, last, step)
+
+    @abstractmethod
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array: ...
+
+    def iter_blocks(self, n_frames_per_block: int = 4096) -> Iterator[Float32Array]:
+        """Yield positions in consecutive blocks of at most `n_frames_per_block` frames."""
+        if n_frames_per_block < 1:
+            raise InputError(f"{self.path}: a block must hold at least one frame, not {n_frames_per_block}.")
+        for start in range(0, self.n_frames, n_frames_per_block):
+            yield self.read(start, start + n_frames_per_block)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the file; twice does no harm."""
+
+    def __enter__(self) -> TrajectoryReader:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:  # fmt: skip
+        self.close()
+
+
+def check_same_topology(path: Path, stored: Scene, scene: Scene) -> None:
+    """Raise TrajectoryError unless both scenes have the same ordered topology."""
+    if stored.topology_hash != scene.topology_hash:
+        raise TrajectoryError(
+            f"{path} holds {stored.name!r} ({stored.n_atoms} atoms, topology {stored.topology_hash}), which is not "
+            f"{scene.name!r} ({scene.n_atoms} atoms, topology {scene.topology_hash}); choose another file."
+        )
