@@ -199,4 +199,4 @@ def _lock(descriptor: int, path: Path) -> None:
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EAGAIN):
-            raise TrajectoryError(f"{path} is being written by another process; wait for it, or choose another name.") from error
+            raise TrajectoryError(f"{path} is being written by another process; wait, or take another name.") from error

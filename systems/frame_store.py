@@ -1,7 +1,8 @@
 """Per-frame columns, a record and a scene in one HDF5 file: the part that HDF5 trajectories and DCD companions share.
 
-Layout: `/time` (n,) float64 ps, `/surromd/chunk_idx` (n,) int32, `/surromd/flags` (n,) uint16 where frames were checked,
-`/surromd/scalars/NAME` (n,) float64, `/surromd/record` and `/surromd/scene` JSON text; more columns as the format asks.
+Layout: `/time` (n,) float64 ps, `/surromd/chunk_idx` (n,) int32, `/surromd/flags` (n,) uint16 where frames were
+checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/record` and `/surromd/scene` JSON text; more columns as the
+format asks.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def write_new(path: Path, data: bytes) -> None:
             write_whole(descriptor, data, 0)
         finally:
             os.close(descriptor)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise storage_error(path, error, "no file was made") from error
@@ -190,11 +191,13 @@ class FrameStore:
         try:
             self.file = open_hdf5(path, self._atomic, "r+")
             if "surromd" not in self.file:
-                raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; choose another name.")
+                raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
             self.scene = Scene.from_dict(get_json(self.file, "surromd/scene", path))
             self.record: dict[str, Any] = get_json(self.file, "surromd/record", path)
             self.n_frames = consistent_length(self.file, path)
-            if any(len(self.file[name]) != self.n_frames for name in column_names(self.file)):
+            self.largest_append = int(self.file["surromd"].attrs["largest_append"])
+            self._columns = {name: self.file[name] for name in column_names(self.file)}
+            if any(len(column) != self.n_frames for column in self._columns.values()):
                 self.truncate(self.n_frames)
         except BaseException:
             self.close()
@@ -202,46 +205,58 @@ class FrameStore:
 
     @property
     def last_time_ps(self) -> float | None:
-        return float(self.file["time"][self.n_frames - 1]) if self.n_frames else None
+        return float(self._columns["time"][self.n_frames - 1]) if self.n_frames else None
+
+    def first_times_ps(self) -> npt.NDArray[np.float64]:
+        """Return the times of the first two frames (fewer when there are fewer)."""
+        times: npt.NDArray[np.float64] = self._columns["time"][: min(self.n_frames, 2)]
+        return times
 
     def append(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
         """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError."""
         n, start = len(block), self.n_frames
-        self._check_flags(block)
-        if n > int(self.file["surromd"].attrs["largest_append"]):
-            # On disk before the frames are, so that a reader can tell an append in flight from damage.
-            self.file["surromd"].attrs["largest_append"] = np.int64(n)
-            self._commit()
+        self.check_flags(block)
+        self.announce(n)
         for name in block.scalars:
-            if f"surromd/scalars/{name}" not in self.file:
-                add_column(self.file, f"surromd/scalars/{name}", start, "<f8")
-        if block.flags is not None and "surromd/flags" not in self.file:
-            add_column(self.file, "surromd/flags", start, "<u2")
+            self._need_column(f"surromd/scalars/{name}", "<f8")
         values: dict[str, npt.NDArray[Any]] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}
         if block.flags is not None:
+            self._need_column("surromd/flags", "<u2")
             values["surromd/flags"] = block.flags
-        for name in self.file["surromd/scalars"]:
-            values[f"surromd/scalars/{name}"] = block.scalars.get(name, np.full(n, np.nan))
-        for name, data in values.items():
-            dataset = self.file[name]
-            dataset.resize(start + n, axis=0)
-            dataset[start:] = data
+        for name, column in self._columns.items():
+            column.resize(start + n, axis=0)
+            if name in values:
+                column[start:] = values[name]
+            else:  # a scalar that this append does not give stays NaN
+                column[start:] = block.scalars.get(name.rpartition("/")[2], np.full(n, np.nan))
         self._commit()
         self.n_frames += n
 
-    def _check_flags(self, block: FrameBlock) -> None:
-        have = "surromd/flags" in self.file
+    def announce(self, n_frames: int) -> None:
+        """Note, before they are written, that up to `n_frames` frames may be in flight. Raises StorageError."""
+        if n_frames > self.largest_append:
+            self.file["surromd"].attrs["largest_append"] = np.int64(n_frames)
+            self._commit()
+            self.largest_append = n_frames
+
+    def _need_column(self, name: str, dtype: str) -> None:
+        if name not in self._columns:
+            self._columns[name] = add_column(self.file, name, self.n_frames, dtype)
+
+    def check_flags(self, block: FrameBlock) -> None:
+        """Raise InputError when this block has flags and the frames before have none, or the reverse."""
+        have = "surromd/flags" in self._columns
         if self.n_frames and have != (block.flags is not None):
             state = "with" if have else "without"
-            raise InputError(f"{self.path}: the frames before were written {state} flags; flag all frames of a file or none.")
+            raise InputError(f"{self.path}: earlier frames were written {state} flags; flag all frames or none.")
 
     def truncate(self, n_frames: int) -> None:
         """Cut all columns to `n_frames`. Raises InputError when there are fewer, StorageError."""
         if not 0 <= n_frames <= self.n_frames:
             raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
-        for name in column_names(self.file):
-            self.file[name].resize(n_frames, axis=0)
-        if n_frames == 0 and "surromd/flags" in self.file:
+        for column in self._columns.values():
+            column.resize(n_frames, axis=0)
+        if n_frames == 0 and self._columns.pop("surromd/flags", None) is not None:
             del self.file["surromd/flags"]
         self._commit()
         self.n_frames = n_frames

@@ -85,7 +85,7 @@ def load_topology(top: Path) -> tuple[Any, Float32Array]:
 
 
 class MdtrajReader(TrajectoryReader):
-    """Any format that MDTraj reads (XTC, TRR, NetCDF, PDB, ...), whole in memory. Raises InputError, TrajectoryError."""
+    """Any format that MDTraj reads (XTC, TRR, NetCDF, PDB, ...), whole in memory. Raises TrajectoryError."""
 
     def __init__(self, path: Path, top: Path | None) -> None:
         import mdtraj

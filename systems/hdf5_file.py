@@ -133,7 +133,7 @@ class Hdf5Reader(TrajectoryReader):
             if not self._file:
                 raise InputError(f"{self.path} is closed.") from error
             reason = str(error).splitlines()[0]
-            raise TrajectoryError(f"{self.path} is damaged: frames {start} to {stop} cannot be read ({reason}).") from error
+            raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
         return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, 
             time_ps = np.arange(n_frames, dtype=np.float64)
         flags = file["surromd/flags"][:n_frames] if "surromd/flags" in file else None
         chunk_idx = file["surromd/chunk_idx"][:n_frames] if "surromd/chunk_idx" in file else None
-        group = file["surromd/scalars"] if "surromd/scalars" in file else {}
+        group = file.get("surromd/scalars", {})
         scalars = {name: group[name][:n_frames] for name in group}
     except (OSError, RuntimeError, KeyError) as error:
         raise TrajectoryError(f"{path} is damaged: {str(error).splitlines()[0]}.") from error
@@ -214,8 +214,9 @@ def _topology_json(scene: Scene) -> str:
                 number = int(digits)
             except ValueError:
                 number = residue + 1
+            name = scene.residue_names[residue]
             chains[-1]["residues"].append(
-                {"index": n_residues, "name": scene.residue_names[residue], "resSeq": number, "segmentID": "", "atoms": []}
+                {"index": n_residues, "name": name, "resSeq": number, "segmentID": "", "atoms": []}
             )
             n_residues, last_residue = n_residues + 1, residue
         chains[-1]["residues"][-1]["atoms"].append(

@@ -69,7 +69,7 @@ class TrajectoryWriter(ABC):
 
     @abstractmethod
     def truncate(self, n_frames: int) -> None:
-        """Cut the file to its first `n_frames` frames (to resume from a checkpoint). Raises InputError, StorageError."""
+        """Cut the file to its first `n_frames` frames, to resume from there. Raises InputError, StorageError."""
 
     @abstractmethod
     def update_record(self, entries: dict[str, Any]) -> None:
