@@ -1,0 +1,224 @@
+"""The verbs, as plain functions: each does what the command of the same name does, and returns what it printed.
+
+Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton. A `scene` is a `systems.scene.Scene`, or what
+the command line takes: a library name, a path, or `sequence:ACE-ALA-NME`. Everything a user can get wrong raises a
+`systems.errors.SurromdError` whose message is one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, find_trajectories, guarded_outputs
+from surrogate.progress import progress_bar
+from systems.errors import InputError, UnknownNameError, nearest
+
+if TYPE_CHECKING:
+    from md_reference.forcefield import ForceFieldSpec
+    from surrogate.judge.comparison import Comparison
+    from systems.scene import Scene
+
+PathLike = str | Path
+Trajectories = PathLike | Sequence[PathLike]
+
+
+def systems(name: str | None = None) -> list[dict[str, Any]]:
+    """Return what the library holds: one record per named scene, or the one asked for, with its atoms and torsions.
+
+    Raises UnknownNameError (with the nearest name).
+    """
+    from systems import library
+
+    return [_describe(each, whole=name is not None) for each in ([name] if name is not None else library.names())]
+
+
+def _describe(name: str, *, whole: bool) -> dict[str, Any]:
+    from systems import library
+
+    scene = library.load(name)
+    record: dict[str, Any] = {
+        "name": name,
+        "title": library.describe(name),
+        "n_atoms": scene.n_atoms,
+        "formula": scene.formula,
+    }
+    if whole:
+        from systems.chemistry import backbone_torsions
+
+        record |= {
+            "n_bonds": len(scene.bonds),
+            "residues": list(scene.residue_names),
+            "atoms": list(scene.atom_names),
+            "mass_da": float(scene.masses_da.sum()),
+            "charge_e": int(scene.formal_charges.sum()),
+            "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items()},
+            "topology_hash": scene.topology_hash,
+            "molecule_key": scene.molecule_key,
+        }
+    return record
+
+
+def prepare(scene: str | Scene) -> Scene:
+    """Return a Scene for what a user may write: a Scene itself, a library name, a path, or `sequence:...`."""
+    if not isinstance(scene, str):
+        return scene
+    from systems.prepare import prepare as prepare_spec
+
+    return prepare_spec(scene)
+
+
+def reference(
+    scene: str | Scene,
+    out: PathLike,
+    *,
+    time_ps: float,
+    save_every_ps: float = 1.0,
+    force_field: str = "ff14SB",
+    solvent: str = "obc2",
+    temperature_k: float = 300.0,
+    friction_per_ps: float = 1.0,
+    timestep_ps: float = 0.004,
+    hydrogen_mass_da: float | None = 3.0,
+    ensemble: str = "nvt",
+    replicas: int = 1,
+    platform: str = "auto",
+    seed: int = 0,
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+) -> list[Path]:
+    """Simulate a scene with OpenMM (Langevin middle integrator) and return the trajectories written.
+
+    `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
+    `seed + 1`, ... `hydrogen_mass_da=None` keeps natural masses. `resume` goes on from the checkpoint beside `out`.
+    Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
+    """
+    from md_reference.replicas import replica_paths, simulate_replicas
+    from md_reference.simulate import MDConfig
+
+    _check_ensemble(ensemble)
+    config = MDConfig(
+        time_ps=time_ps,
+        save_every_ps=save_every_ps,
+        temperature_k=temperature_k,
+        friction_per_ps=friction_per_ps,
+        timestep_ps=timestep_ps,
+        seed=seed,
+        platform=platform,
+        force=_force(force_field, solvent, hydrogen_mass_da),
+    )
+    _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything is prepared
+    outs = replica_paths(Path(out), replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
+    molecule = prepare(scene)
+    label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
+    with (
+        guarded_outputs(outs, resumable="the same command with --resume goes on"),
+        progress_bar(label, quiet=quiet, ps_per_frame=save_every_ps) as progress,
+    ):
+        return simulate_replicas(molecule, config, outs, resume=resume, overwrite=overwrite, progress=progress)
+
+
+def _force(force_field: str, solvent: str, hydrogen_mass_da: float | None) -> ForceFieldSpec:
+    from md_reference.forcefield import ForceFieldSpec
+
+    return ForceFieldSpec(force_field=force_field, solvent=solvent, hydrogen_mass_da=hydrogen_mass_da)
+
+
+def _check_ensemble(ensemble: str) -> None:
+    if ensemble.lower() != "nvt":
+        raise InputError(f"ensemble {ensemble!r} is not available; only nvt (Langevin) is, so far.")
+
+
+def compare(
+    reference: Trajectories,
+    candidates: Sequence[Trajectories],
+    out_html: PathLike | None = None,
+    *,
+    replicate: Trajectories | None = None,
+    top: PathLike | None = None,
+    lag_ps: float | None = None,
+    labels: Sequence[str] | None = None,
+) -> Comparison:
+    """Judge candidates against a reference, write the report (NAME.html and NAME.json) and return the comparison.
+
+    The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
+    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other. `top`: topology for
+    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly.
+    Raises InputError, TrajectoryError, OutOfDomainError.
+    """
+    from surrogate.judge.comparison import compare as judge
+    from surrogate.judge.ensemble import load_ensemble
+
+    if not candidates:
+        raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
+    if labels is not None and len(labels) != len(candidates):
+        raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
+    if out_html is not None:
+        check_outputs([Path(out_html)], [".html"], overwrite=True)
+    truth = load_ensemble(find_trajectories(reference), top=top, lag_ps=lag_ps)
+    others = [
+        load_ensemble(
+            find_trajectories(candidate),
+            label=labels[k] if labels else None,
+            template=truth.scene,
+            top=top,
+            lag_ps=lag_ps,
+        )
+        for k, candidate in enumerate(candidates)
+    ]
+    floor = None
+    if replicate is not None:
+        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=top, lag_ps=lag_ps)
+    result = judge(truth, others, floor, truth.scene)
+    if out_html is not None:
+        from surrogate.judge.report import write_report
+
+        write_report(result, Path(out_html))
+    return result
+
+
+def info(path: PathLike) -> dict[str, Any]:
+    """Return what a trajectory, a windows file or a weights file is and where it came from (JSON-able).
+
+    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
+    """
+    from surrogate.describe import describe_file
+
+    return describe_file(Path(path))
+
+
+def windows(
+    references: Trajectories, out: PathLike, *, canonical: bool = True, overwrite: bool = False, quiet: bool = False
+) -> Path:
+    """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
+
+    Raises InputError when scenes, save intervals or conditions differ, TrajectoryError for damaged files.
+    """
+    from surrogate.data.frames import collect_frames
+
+    out = Path(out)
+    check_outputs([out], [".h5"], overwrite=overwrite)
+    collect_frames(find_trajectories(references), canonical=canonical).save(out)
+    return out
+
+
+def weights_path(weights: PathLike) -> Path:
+    """Return the file of shipped weights by name, or the path itself.
+
+    Raises UnknownNameError (with the nearest name) or InputError when there is no such file.
+    """
+    path = Path(weights)
+    if path.suffix == ".safetensors" or path.exists():
+        if not path.is_file():
+            raise InputError(f"{path}: no such weights file.")
+        return path
+    shipped = {p.stem: p for p in sorted((Path(__file__).parent / "pretrained").glob("*.safetensors"))}
+    if str(weights) not in shipped:
+        raise UnknownNameError(
+            f"no weights are called {str(weights)!r}; shipped: {', '.join(shipped) or 'none'}."
+            f"{nearest(str(weights), list(shipped))} A trained file is named by its path (.safetensors)."
+        )
+    return shipped[str(weights)]

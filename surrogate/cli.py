@@ -1,0 +1,415 @@
+"""The command line: parsing and printing only. Every verb is one call of `surrogate.api`, imported when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from systems.errors import SurromdError
+from systems.units import (
+    parse_mass_da,
+    parse_rate_per_ps,
+    parse_temperature_k,
+    parse_time_ps,
+    parse_wall_s,
+)
+
+
+class _Group(TyperGroup):
+    """Turns whatever a verb raises into one line on stderr and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        if os.environ.get("SURROMD_DEBUG") == "1":
+            return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            _fail(f"interrupted; {stop.args[0] if stop.args else 'nothing was written'}", 130)
+        except SurromdError as error:
+            _fail(f"error: {error}", 1)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            _fail(f"error: {_os_error(error)}", 1)
+        except MemoryError:
+            _fail("error: out of memory; ask for fewer frames or replicas at once", 1)
+        except _usage_errors():
+            raise
+        except Exception as error:  # a fault of ours: one line for the user, the rest on demand
+            _fail(f"error: unexpected {type(error).__name__}: {error} (a bug; SURROMD_DEBUG=1 shows where)", 1)
+
+
+def _usage_errors() -> tuple[type[BaseException], ...]:
+    """Click's own exceptions, which end in its own messages and exit codes (typer 0.26 and newer vendor click)."""
+    usage = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+    return (usage, typer.Exit, typer.Abort)
+
+
+def _fail(message: str, code: int) -> None:
+    typer.echo(" ".join(message.split()), err=True)
+    raise typer.Exit(code) from None
+
+
+def _os_error(error: OSError) -> str:
+    # h5py puts the errno into the text and leaves the attribute empty.
+    if error.errno == 28 or "No space left" in str(error) or "errno = 28" in str(error):
+        where = f" ({error.filename})" if error.filename else ""
+        return f"the disk is full{where}; free some space and run again (--resume where the verb has it)"
+    if error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Reference MD with OpenMM, learned surrogate rollouts, and a judge that compares the two.",
+    epilog="SCENE: library name, path (.pdb, .cif) or sequence:ACE-ALA-NME. Durations carry units: 50ns, 10ps, 2fs.",
+)
+
+
+class Precision(StrEnum):
+    auto = "auto"
+    fp32 = "fp32"
+    bf16 = "bf16"
+
+
+SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Library name, path or sequence:ACE-ALA-NME.")]
+ForceFieldOpt = Annotated[str, typer.Option("--force-field", help="ff14SB or ff99SB-ILDN.")]
+SolventOpt = Annotated[str, typer.Option("--solvent", help="obc2, vacuum or amber99-obc.")]
+TemperatureOpt = Annotated[str, typer.Option("--temperature", help="Of the bath.")]
+FrictionOpt = Annotated[str, typer.Option("--friction", help="Of the Langevin bath.")]
+TimestepOpt = Annotated[str, typer.Option("--timestep", help="Integration step.")]
+HydrogenMassOpt = Annotated[str, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'.")]
+EnsembleOpt = Annotated[str, typer.Option("--ensemble", help="nvt.")]
+ReplicasOpt = Annotated[
+    int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
+]
+PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform, or auto.")]
+SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
+ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
+OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.")]
+JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the report.")] = Path(
+        "surromd-demo"
+    ),
+    seed: SeedOpt = 0,
+    quiet: QuietOpt = False,
+) -> None:
+    """The whole way on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
+    from surrogate import api
+
+    result = api.demo(out, seed=seed, quiet=quiet)
+    _print_comparison(result, out / "report.html", as_json=False, quiet=quiet)
+
+
+@app.command()
+def systems(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this one.")] = None,
+    as_json: JsonOpt = False,
+) -> None:
+    """List the library of named scenes, or describe one."""
+    from surrogate import api
+
+    found = api.systems(name)
+    if as_json:
+        _print_json(found)
+    elif name is None:
+        for entry in found:
+            typer.echo(f"{entry['name']:<24} {entry['n_atoms']:>5} atoms  {entry['formula']:<14} {entry['title']}")
+    else:
+        _print_pairs(found[0])
+
+
+@app.command()
+def plan(
+    scene: SceneArg,
+    force_field: ForceFieldOpt = "ff14SB",
+    solvent: SolventOpt = "obc2",
+    temperature: TemperatureOpt = "300K",
+    friction: FrictionOpt = "1/ps",
+    timestep: TimestepOpt = "4fs",
+    hydrogen_mass: HydrogenMassOpt = "3Da",
+    ensemble: EnsembleOpt = "nvt",
+    replicas: ReplicasOpt = 1,
+    platform: PlatformOpt = "auto",
+    as_json: JsonOpt = False,
+) -> None:
+    """What a reference run of SCENE will do, what it skips, why, and what that saves."""
+    from surrogate import api
+
+    account = api.plan(
+        scene,
+        force_field=force_field,
+        solvent=solvent,
+        temperature_k=parse_temperature_k(temperature, "--temperature"),
+        friction_per_ps=parse_rate_per_ps(friction, "--friction"),
+        timestep_ps=parse_time_ps(timestep, "--timestep"),
+        hydrogen_mass_da=_hydrogen_mass(hydrogen_mass),
+        ensemble=ensemble,
+        replicas=replicas,
+        platform=platform,
+    )
+    if as_json:
+        _print_json(account)
+    else:
+        _print_pairs(account)
+
+
+@app.command()
+def reference(
+    scene: SceneArg,
+    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
+    save_every: Annotated[str, typer.Option("--save-every", help="Interval between saved frames.")] = "1ps",
+    force_field: ForceFieldOpt = "ff14SB",
+    solvent: SolventOpt = "obc2",
+    temperature: TemperatureOpt = "300K",
+    friction: FrictionOpt = "1/ps",
+    timestep: TimestepOpt = "4fs",
+    hydrogen_mass: HydrogenMassOpt = "3Da",
+    ensemble: EnsembleOpt = "nvt",
+    replicas: ReplicasOpt = 1,
+    platform: PlatformOpt = "auto",
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Simulate SCENE with OpenMM and write the trajectory."""
+    from surrogate import api
+
+    written = api.reference(
+        scene,
+        out,
+        time_ps=parse_time_ps(time, "--time"),
+        save_every_ps=parse_time_ps(save_every, "--save-every"),
+        force_field=force_field,
+        solvent=solvent,
+        temperature_k=parse_temperature_k(temperature, "--temperature"),
+        friction_per_ps=parse_rate_per_ps(friction, "--friction"),
+        timestep_ps=parse_time_ps(timestep, "--timestep"),
+        hydrogen_mass_da=_hydrogen_mass(hydrogen_mass),
+        ensemble=ensemble,
+        replicas=replicas,
+        platform=platform,
+        seed=seed,
+        resume=resume,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+    _print_written(written, as_json, quiet)
+
+
+@app.command()
+def windows(
+    references: Annotated[
+        list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Turn reference trajectories into training data: one compact file."""
+    from surrogate import api
+
+    _print_written([api.windows(references, out, overwrite=overwrite, quiet=quiet)], as_json, quiet)
+
+
+@app.command()
+def train(
+    references: Annotated[
+        list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write, .safetensors.")],
+    arch: Annotated[str, typer.Option("--arch", help="lam-slide.")] = "lam-slide",
+    config: Annotated[Path | None, typer.Option("--config", help="TOML of model and training settings.")] = None,
+    budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Train a surrogate on reference trajectories."""
+    from surrogate import api
+
+    written = api.train(
+        references,
+        out,
+        arch=arch,
+        config=config,
+        budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
+        steps=steps,
+        seed=seed,
+        resume=resume,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+    _print_written([written], as_json, quiet)
+
+
+@app.command()
+def rollout(
+    scene: SceneArg,
+    weights: Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")],
+    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 100ns.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
+    save_every: Annotated[
+        str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
+    ] = None,
+    replicas: ReplicasOpt = 1,
+    solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
+    precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Run outside the domain of the weights, at your risk.")
+    ] = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Roll SCENE forward with a trained surrogate, in chunks."""
+    from surrogate import api
+
+    written = api.rollout(
+        scene,
+        weights,
+        out,
+        time_ps=parse_time_ps(time, "--time"),
+        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
+        replicas=replicas,
+        seed=seed,
+        solver_steps=solver_steps,
+        precision=precision.value,
+        resume=resume,
+        overwrite=overwrite,
+        force=force,
+        quiet=quiet,
+    )
+    _print_written(written, as_json, quiet)
+
+
+@app.command()
+def compare(
+    reference: Annotated[str, typer.Argument(metavar="REF", help="The truth: a file, folder, 'glob' or a,b,c.")],
+    candidates: Annotated[
+        list[str], typer.Argument(metavar="TRAJ...", help="Each argument one candidate, written alike.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; its numbers go to .json.")] = Path(
+        "report.html"
+    ),
+    replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
+    top: Annotated[Path | None, typer.Option("--top", help="Topology of files that carry none.")] = None,
+    lag: Annotated[str | None, typer.Option("--lag", help="Time between frames, where a file does not say.")] = None,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Judge trajectories against a reference: is it right, how wrong is it, what did it cost?"""
+    from surrogate import api
+
+    result = api.compare(
+        reference,
+        candidates,
+        out,
+        replicate=replicate,
+        top=top,
+        lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
+    )
+    _print_comparison(result, out, as_json=as_json, quiet=quiet)
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A trajectory, a windows file or weights.")],
+    as_json: JsonOpt = False,
+) -> None:
+    """What a file is and where it came from."""
+    from surrogate import api
+
+    found = api.info(path)
+    if as_json:
+        _print_json(found)
+    else:
+        _print_pairs(found)
+
+
+def _hydrogen_mass(text: str) -> float | None:
+    return None if text in ("natural", "none") else parse_mass_da(text, "--hydrogen-mass")
+
+
+def _print_json(value: Any) -> None:
+    import json
+
+    typer.echo(json.dumps(value, indent=2, default=str))
+
+
+def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
+    """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
+    shown = {k: v for k, v in record.items() if v is not None}
+    width = max((len(k) for k in shown), default=0)
+    for key, value in shown.items():
+        margin = " " * indent
+        if isinstance(value, dict):
+            typer.echo(f"{margin}{key}")
+            _print_pairs(value, indent + 2)
+        elif isinstance(value, (list, tuple)) and any(isinstance(v, str) and " " in v for v in value):
+            typer.echo(f"{margin}{key}")
+            for line in value:
+                typer.echo(f"{margin}  {line}")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
+            typer.echo(f"{margin}{key:<{width}}  {text}")
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
+    """Say what was written: its length and what it cost."""
+    from surrogate import api
+
+    records = [api.info(path) for path in paths] if as_json or not quiet else []
+    if as_json:
+        _print_json(records)
+    for path, record in zip(paths, records, strict=False):
+        if not as_json:
+            typer.echo(f"{path}: {record['summary']}")
+
+
+def _print_comparison(result: Any, report: Path, *, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        _print_json(result.to_dict())
+        return
+    typer.echo(f"report: {report}")
+
+
+def main() -> None:
+    """Entry point of the command `surromd`."""
+    try:
+        app(prog_name="surromd")
+    except KeyboardInterrupt:  # outside any verb: while starting
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

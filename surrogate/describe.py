@@ -1,0 +1,103 @@
+"""What a file is and where it came from: trajectories, windows and weights, told apart by what they hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError
+from systems.units import format_time_ps
+
+
+def describe_file(path: Path) -> dict[str, Any]:
+    """Return a JSON-able record of a file; `summary` is one line about it.
+
+    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() == ".safetensors":
+        return _weights(path)
+    if path.suffix.lower() in (".h5", ".hdf5") and _is_windows(path):
+        return _windows(path)
+    return _trajectory(path)
+
+
+def _trajectory(path: Path) -> dict[str, Any]:
+    import numpy as np
+
+    from systems.trajectory import open_trajectory
+    from systems.validity import INVALID
+
+    with open_trajectory(path) as reader:
+        times, flags, scene, record = reader.time_ps, reader.flags, reader.scene, dict(reader.record)
+        n_frames, n_atoms = reader.n_frames, reader.n_atoms
+    lag_ps = float(np.median(np.diff(times))) if n_frames > 1 else None
+    span = "" if lag_ps is None else f", {format_time_ps(n_frames * lag_ps)} at {format_time_ps(lag_ps)}"
+    cost = record.get("cost") or {}
+    wall = f", {cost['wall_s']:.3g} s" if "wall_s" in cost else ""
+    unfinished = " (unfinished)" if record.get("completed") is False else ""
+    return {
+        "file": str(path),
+        "type": record.get("kind", "foreign") + " trajectory",
+        "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
+        "scene": None if scene is None else scene.name,
+        "formula": None if scene is None else scene.formula,
+        "topology_hash": None if scene is None else scene.topology_hash,
+        "n_frames": n_frames,
+        "n_atoms": n_atoms,
+        "first_ps": float(times[0]) if n_frames else None,
+        "last_ps": float(times[-1]) if n_frames else None,
+        "save_every_ps": lag_ps,
+        "invalid_frames": None if flags is None else int(np.count_nonzero(flags & INVALID)),
+        "size_mb": path.stat().st_size / 1e6,
+        "record": record,
+    }
+
+
+def _is_windows(path: Path) -> bool:
+    from surrogate.data.frames import is_windows_file
+
+    return is_windows_file(path)
+
+
+def _windows(path: Path) -> dict[str, Any]:
+    from surrogate.data.frames import load_frames
+
+    frames = load_frames(path)
+    return {
+        "file": str(path),
+        "type": "windows",
+        "summary": f"{frames.n_frames} frames of {frames.scene.name}, {format_time_ps(frames.total_ps)} at "
+        f"{format_time_ps(frames.lag_ps)}, from {len(frames.sources)} trajectories",
+        "scene": frames.scene.name,
+        "formula": frames.scene.formula,
+        "n_frames": frames.n_frames,
+        "n_atoms": frames.scene.n_atoms,
+        "save_every_ps": frames.lag_ps,
+        "canonical": frames.canonical,
+        "conditions": frames.conditions,
+        "sources": [source["file"] for source in frames.sources],
+        "size_mb": path.stat().st_size / 1e6,
+    }
+
+
+def _weights(path: Path) -> dict[str, Any]:
+    from surrogate.training.checkpoint import load_weights
+
+    weights = load_weights(path)
+    n_parameters = sum(p.numel() for p in weights.model.parameters())
+    return {
+        "file": str(path),
+        "type": "weights",
+        "summary": f"{n_parameters / 1e6:.2f} M parameters for {weights.domain.describe()}",
+        "hash": weights.hash,
+        "parameters": n_parameters,
+        "scene": weights.domain.scene.name,
+        "formula": weights.domain.scene.formula,
+        "lag_ps": weights.domain.lag_ps,
+        "conditions": weights.domain.conditions,
+        "config": weights.model.config.to_dict(),
+        "provenance": weights.provenance,
+        "size_mb": path.stat().st_size / 1e6,
+    }

@@ -1,0 +1,113 @@
+"""Files that verbs write and read: checked before the work starts, no husks left behind, replicas found by pattern."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from systems.errors import InputError, SurromdError
+
+TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
+
+
+def check_outputs(
+    paths: Sequence[Path], suffixes: Sequence[str], *, resume: bool = False, overwrite: bool = False
+) -> None:
+    """Refuse outputs that cannot be meant, before anything is computed.
+
+    Raises InputError for another suffix, a folder that does not exist, an existing file (unless `resume` or
+    `overwrite`), or both switches at once.
+    """
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite exclude each other.")
+    for path in paths:
+        if path.suffix.lower() not in suffixes:
+            raise InputError(f"{path}: the output must end in {' or '.join(suffixes)}.")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; create {path.parent} first.")
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; name a file.")
+        if path.exists() and not (resume or overwrite):
+            raise InputError(f"{path} exists; add --overwrite to replace it, or choose another name.")
+
+
+@contextmanager
+def guarded_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
+    """Run a verb that writes trajectories: on failure remove files without frames; on Ctrl-C say what is kept.
+
+    `resumable`: what the user does to go on, said when there is something to go on from. Files that were there before
+    are never removed. Raises KeyboardInterrupt with the account as its message.
+    """
+    before = {p for path in paths for p in _family(path) if p.exists()}
+    try:
+        yield
+    except KeyboardInterrupt:
+        counts = {path: frames for path in paths if (frames := _sweep(path, before)) is not None}
+        kept = ", ".join(f"{path} holds {frames} frames" for path, frames in counts.items())
+        raise KeyboardInterrupt(f"{kept}; {resumable}" if kept else "nothing was written") from None
+    except BaseException:
+        for path in paths:
+            _sweep(path, before)
+        raise
+
+
+def _sweep(path: Path, before: set[Path]) -> int | None:
+    """Return the number of frames of a trajectory, or remove it and its companions (None) if it holds none."""
+    from systems.trajectory import open_trajectory
+
+    if not path.exists():
+        n_frames = 0
+    else:
+        try:
+            with open_trajectory(path) as reader:
+                n_frames = reader.n_frames
+        except SurromdError:
+            n_frames = 0
+    if n_frames:
+        return n_frames
+    for member in _family(path):
+        if member not in before:
+            member.unlink(missing_ok=True)
+    return None
+
+
+def _family(path: Path) -> list[Path]:
+    """A trajectory file and what the writers put beside it."""
+    members = [path, path.with_name(path.name + ".checkpoint")]
+    if path.suffix.lower() == ".dcd":
+        from systems.dcd_file import companions
+
+        members += companions(path)
+    return members
+
+
+def find_trajectories(spec: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return the files that a user means by a path, a folder, a glob pattern, a comma-separated list or a sequence.
+
+    A folder stands for the trajectories in it (HDF5 before DCD, if it holds both). Raises InputError when nothing is
+    found.
+    """
+    if not isinstance(spec, (str, Path)):
+        return [path for part in spec for path in find_trajectories(part)]
+    path = Path(spec)
+    if path.is_dir():
+        files = [p for p in sorted(path.iterdir()) if not p.name.endswith(".meta.h5")]
+        for suffixes in ((".h5", ".hdf5"), (".dcd",), (".xtc",)):
+            found = [p for p in files if p.suffix.lower() in suffixes]
+            if found:
+                return found
+        raise InputError(f"{path}: no trajectory (.h5, .dcd, .xtc) in this folder.")
+    if path.exists():
+        return [path]
+    text = str(spec)
+    if "," in text:
+        return [p for part in text.split(",") if part.strip() for p in find_trajectories(part.strip())]
+    if any(c in text for c in "*?["):
+        import glob
+
+        found = [Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")]  # noqa: PTH207 - any root
+        if found:
+            return found
+        raise InputError(f"{text}: no file matches.")
+    raise InputError(f"{text}: no such file.")

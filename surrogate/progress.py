@@ -1,0 +1,58 @@
+"""One progress bar for every long verb: share done, speed in the verb's own unit, time left. Always on stderr."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+# (units done, units in all) -> None
+ProgressFn = Callable[[int, int], None]
+
+
+@contextmanager
+def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) -> Iterator[ProgressFn | None]:
+    """Yield a function that a running verb calls with (done, total), or None when `quiet`.
+
+    With `ps_per_frame` the bar shows simulated time and speed in µs/day, otherwise plain counts. The first call sets
+    the starting point, so that a resumed run does not count as speed what was there before.
+    """
+    if quiet:
+        yield None
+        return
+    import time
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeRemainingColumn(compact=True),
+        TextColumn("left"),
+    )
+    first: tuple[int, float] | None = None
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=None, note="")
+
+        def advance(done: int, total: int) -> None:
+            nonlocal first
+            now = time.monotonic()
+            if first is None:
+                first = (done, now)
+            rate = (done - first[0]) / (now - first[1]) if now > first[1] else 0.0
+            bar.update(task, completed=done, total=total, note=_note(done, total, rate, ps_per_frame))
+
+        yield advance
+
+
+def _note(done: int, total: int, per_s: float, ps_per_frame: float | None) -> str:
+    if ps_per_frame is None:
+        return f"{done}/{total}"
+    from systems.units import format_time_ps
+
+    text = f"{format_time_ps(total * ps_per_frame)}"
+    if per_s > 0:
+        text += f" at {per_s * ps_per_frame * 86400e-6:.3g} µs/day"
+    return text
