@@ -205,6 +205,85 @@ def windows(
     return out
 
 
+def train(
+    references: Trajectories,
+    out: PathLike,
+    *,
+    arch: str = "lam-slide",
+    config: PathLike | None = None,
+    budget_s: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+) -> Path:
+    """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
+
+    Ends after `budget_s` seconds of training or `steps` optimiser steps over both stages, whichever is given. `config`:
+    a TOML file of model settings. Beside `out`, a CSV holds the training curves and, until done, files the state that
+    `resume` goes on from. Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
+    """
+    architectures = ["lam-slide"]
+    if arch not in architectures:
+        raise UnknownNameError(f"unknown architecture {arch!r}; known: {', '.join(architectures)}.")
+    if budget_s is None and steps is None:
+        raise InputError("say how long to train: --budget 30min or --steps 10000.")
+    if steps is not None and steps < 2:
+        raise InputError("--steps must be at least 2: one for each stage.")
+    out = Path(out)
+    check_outputs([out], [".safetensors"], resume=resume, overwrite=overwrite)
+    states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+    if states and not (resume or overwrite):
+        raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
+    if resume and out.exists() and not states:
+        return out
+    paths = find_trajectories(references)
+
+    from surrogate.data.frames import collect_frames, is_windows_file, load_frames
+    from surrogate.models.lam_slide.config import LamSlideConfig
+    from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
+
+    model_config = LamSlideConfig() if config is None else LamSlideConfig.from_toml(config)
+    in_windows = [is_windows_file(path) for path in paths]
+    if any(in_windows) and len(paths) > 1:
+        raise InputError("give either trajectories or one windows file to train on.")
+    frames = load_frames(paths[0]) if any(in_windows) else collect_frames(paths, canonical=model_config.canonical)
+    first = None if steps is None else max(1, round(steps * STAGE_ONE_SHARE))
+    settings = TrainingConfig(
+        budget_s=budget_s,
+        stage_one_steps=first,
+        stage_two_steps=None if steps is None or first is None else steps - first,
+        seed=seed,
+        device=_device(device),
+    )
+    with progress_bar(f"training {frames.scene.name}", quiet=quiet) as advance:
+
+        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+            done = (
+                share * STAGE_ONE_SHARE if stage == "autoencoder" else STAGE_ONE_SHARE + share * (1 - STAGE_ONE_SHARE)
+            )
+            if advance is not None:
+                advance(round(1000 * done), 1000, stage)
+
+        try:
+            return train_lam_slide(frames, out, model_config, settings, resume=resume, progress=report)
+        except KeyboardInterrupt:
+            kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+            if not kept:
+                raise KeyboardInterrupt("no training state had been saved yet") from None
+            raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
+
+
+def _device(device: str) -> str:
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return device
+
+
 def weights_path(weights: PathLike) -> Path:
     """Return the file of shipped weights by name, or the path itself.
 

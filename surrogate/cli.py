@@ -6,7 +6,7 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -19,6 +19,9 @@ from systems.units import (
     parse_time_ps,
     parse_wall_s,
 )
+
+if TYPE_CHECKING:
+    from surrogate.judge.comparison import Comparison
 
 
 class _Group(TyperGroup):
@@ -380,8 +383,8 @@ def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
             typer.echo(f"{margin}{key:<{width}}  {text}")
 
 
-def _plain(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+def _plain(value: Any, digits: int = 6) -> str:
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def _print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
@@ -396,10 +399,22 @@ def _print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
             typer.echo(f"{path}: {record['summary']}")
 
 
-def _print_comparison(result: Any, report: Path, *, as_json: bool, quiet: bool) -> None:
+def _print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool) -> None:
+    """Print each candidate's verdict and its figures between reference and replicate."""
     if as_json:
         _print_json(result.to_dict())
         return
+    for judgement in () if quiet else result.judgements:
+        typer.echo(f"{judgement.account.label}: {judgement.verdict}")
+        typer.echo(f"  {'':<44} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+        for row in judgement.rows:
+            figures = (row.reference, row.candidate, row.replicate)
+            numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
+            typer.echo(f"  {row.metric[:44]:<44} {numbers} {row.unit:<8} {row.verdict}")
+        if judgement.speed_ratio is not None:
+            typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
+    for note in () if quiet else result.notes:
+        typer.echo(f"note: {note}")
     typer.echo(f"report: {report}")
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
-# (units done, units in all) -> None
-ProgressFn = Callable[[int, int], None]
+
+class ProgressFn(Protocol):
+    """Called by a running verb with what is done and what there is to do; `note` replaces the default account."""
+
+    def __call__(self, done: int, total: int, note: str | None = None) -> None: ...
 
 
 @contextmanager
@@ -36,13 +40,14 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=None, note="")
 
-        def advance(done: int, total: int) -> None:
+        def advance(done: int, total: int, note: str | None = None) -> None:
             nonlocal first
             now = time.monotonic()
             if first is None:
                 first = (done, now)
             rate = (done - first[0]) / (now - first[1]) if now > first[1] else 0.0
-            bar.update(task, completed=done, total=total, note=_note(done, total, rate, ps_per_frame))
+            text = _note(done, total, rate, ps_per_frame) if note is None else note
+            bar.update(task, completed=done, total=total, note=text)
 
         yield advance
 

@@ -1,0 +1,291 @@
+"""The command line from outside: start-up time, exit codes, one clear line for every bad input, nothing left behind."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from surrogate import api
+from surrogate.cli import app
+
+COMMANDS = ["demo", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
+SURROMD = [sys.executable, "-m", "surrogate.cli"]
+HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib", "lightning_fabric"]
+
+
+def run(*arguments: str) -> Any:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def refused(result: Any, *, code: int = 1) -> str:
+    """Return the message of a refusal, after checking that it is one line on stderr and nothing else."""
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    assert "Traceback" not in result.stderr
+    return lines[0]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="session")
+def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reference trajectory of 20 frames, made once through the command line."""
+    path = tmp_path_factory.mktemp("short") / "ref.h5"
+    result = run("reference", "alanine-dipeptide", "--time", "2ps", "--save-every", "100fs", "-o", str(path))
+    assert result.exit_code == 0, result.stderr
+    return path
+
+
+# ---- starting ------------------------------------------------------------------------------------------------------
+
+
+def test_help_takes_less_than_half_a_second_of_processor_time() -> None:
+    spent = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([*SURROMD, "--help"], capture_output=True, text=True, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        assert all(command in done.stdout for command in COMMANDS)
+    assert min(spent) < 0.5, f"{spent} s"
+
+
+def test_starting_loads_no_heavy_library() -> None:
+    code = f"import sys, surrogate.cli, surrogate; print([m for m in {HEAVY} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str) -> None:
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert "Usage" in result.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["no-such-command"],
+        ["reference"],
+        ["reference", "alanine-dipeptide", "--time", "1ns"],
+        ["rollout", "alanine-dipeptide", "--no-such-flag"],
+        ["reference", "alanine-dipeptide", "--time", "1ns", "-o", "x.h5", "--replicas", "0"],
+        ["rollout", "x", "--weights", "w", "--time", "1ns", "-o", "x.h5", "--precision", "fp8"],
+    ],
+)
+def test_bad_usage_exits_with_2(here: Path, arguments: list[str]) -> None:
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stderr
+    assert not list(here.iterdir())
+
+
+# ---- bad input -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["systems", "alanine-dipeptid"], "Did you mean 'alanine-dipeptide'?"),
+        (["reference", "alanin-dipeptide", "--time", "1ps", "-o", "x.h5"], "Did you mean 'alanine-dipeptide'?"),
+        (["reference", "missing.pdb", "--time", "1ps", "-o", "x.h5"], "missing.pdb"),
+        (["reference", "alanine-dipeptide", "--time", "10", "-o", "x.h5"], "no unit"),
+        (["reference", "alanine-dipeptide", "--time", "10 parsec", "-o", "x.h5"], "unknown unit"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "--temperature", "25C", "-o", "x.h5"], "--temperature"),
+        (["reference", "alanine-dipeptide", "--time", "10ps", "--save-every", "3ps", "-o", "x.h5"], "whole multiple"),
+        (["reference", "alanine-dipeptide", "--time", "10ps", "--timestep", "3fs", "-o", "x.h5"], "whole multiple"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.xyz"], ".h5 or .hdf5 or .dcd"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "no/such/x.h5"], "folder does not exist"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.h5", "--force-field", "ff14sb"], "ff14SB"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.h5", "--solvent", "obc"], "obc2"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.h5", "--ensemble", "npt"], "nvt"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.h5", "--platform", "Abacus"], "Reference"),
+        (["reference", "alanine-dipeptide", "--time", "1ps", "-o", "x.h5", "--resume", "--overwrite"], "exclude"),
+        (["reference", "sequence:ACE-XYZ-NME", "--time", "1ps", "-o", "x.h5"], "XYZ"),
+        (["info", "missing.h5"], "missing.h5: no such file"),
+        (["compare", "missing.h5", "also-missing.h5"], "missing.h5: no such file"),
+        (["compare", "no-*.h5", "also-missing.h5"], "no file matches"),
+        (["train", "missing.h5", "-o", "w.safetensors", "--budget", "1ns"], "--budget '1ns'"),
+        (["rollout", "alanine-dipeptide", "--weights", "alanine", "--time", "1ns", "-o", "x.h5"], "alanine-dipeptide"),
+        (
+            ["rollout", "alanine-dipeptide", "--weights", "no.safetensors", "--time", "1ns", "-o", "x.h5"],
+            "no.safetensors",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(here: Path, arguments: list[str], said: str) -> None:
+    message = refused(run(*arguments))
+    assert said in message
+    assert not list(here.iterdir())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"this is not a structure\n",
+        bytes(range(256)),
+        b"ATOM      1  N   ALA A   1      xx.xxx   0.000   0.000  1.00  0.00           N\nEND\n",
+    ],
+    ids=["empty", "text", "binary", "bad number"],
+)
+def test_unreadable_pdb(here: Path, content: bytes) -> None:
+    (here / "bad.pdb").write_bytes(content)
+    message = refused(run("reference", "bad.pdb", "--time", "1ps", "-o", "x.h5"))
+    assert "bad.pdb" in message
+    assert [p.name for p in here.iterdir()] == ["bad.pdb"]
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
+def test_truncated_hdf5_is_refused_not_read_as_far_as_it_goes(here: Path, short_run: Path, keep: float) -> None:
+    whole = short_run.read_bytes()
+    (here / "cut.h5").write_bytes(whole[: int(keep * len(whole))])
+    assert "cut.h5" in refused(run("info", "cut.h5"))
+    assert "cut.h5" in refused(run("compare", str(short_run), "cut.h5", "-o", "report.html"))
+    assert [p.name for p in here.iterdir()] == ["cut.h5"]
+
+
+def test_a_molecule_the_weights_do_not_cover(here: Path) -> None:
+    message = refused(
+        run("rollout", "sequence:ACE-GLY-NME", "--weights", "alanine-dipeptide", "--time", "1ns", "-o", "x.h5")
+    )
+    assert "surromd reference" in message or "surromd train" in message, "it says what to run instead"
+    assert not list(here.iterdir())
+
+
+def test_existing_output_is_kept_unless_overwritten(here: Path) -> None:
+    (here / "x.h5").write_bytes(b"precious")
+    arguments = ["reference", "alanine-dipeptide", "--time", "400fs", "--save-every", "40fs", "-o", "x.h5", "--quiet"]
+    assert "--overwrite" in refused(run(*arguments))
+    assert (here / "x.h5").read_bytes() == b"precious"
+    assert run(*arguments, "--overwrite").exit_code == 0
+    assert api.info("x.h5")["n_frames"] == 10
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device", "x.h5"), OSError("Can't write data (errno = 28, ...)")]
+)
+def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch, error: OSError) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(api, "info", full)
+    assert "the disk is full" in refused(run("info", "x.h5"))
+
+
+def test_a_fault_of_ours_is_one_line_unless_debugging(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("of all things")
+
+    monkeypatch.setattr(api, "info", broken)
+    assert "SURROMD_DEBUG=1" in refused(run("info", "x.h5"))
+    monkeypatch.setenv("SURROMD_DEBUG", "1")
+    assert isinstance(run("info", "x.h5").exception, ZeroDivisionError)
+
+
+# ---- working -------------------------------------------------------------------------------------------------------
+
+
+def test_systems_lists_and_describes() -> None:
+    listed = run("systems")
+    assert listed.exit_code == 0
+    assert "alanine-dipeptide" in listed.stdout
+    described = json.loads(run("systems", "alanine-dipeptide", "--json").stdout)[0]
+    assert described["n_atoms"] == 22
+    assert described["torsions"] == {"phi": 1, "psi": 1, "omega": 2}
+
+
+def test_plan_says_what_is_skipped() -> None:
+    result = run("plan", "alanine-dipeptide")
+    assert result.exit_code == 0, result.stderr
+    assert "Reference" in result.stdout
+    assert "skipped" in result.stdout
+    assert json.loads(run("plan", "alanine-dipeptide", "--json").stdout)
+
+
+def test_reference_to_json_and_info(short_run: Path) -> None:
+    found = json.loads(run("info", str(short_run), "--json").stdout)
+    assert found["n_frames"] == 20
+    assert found["n_atoms"] == 22
+    assert found["save_every_ps"] == pytest.approx(0.1)
+    assert found["record"]["force_field"] == "ff14SB"
+    text = run("info", str(short_run))
+    assert "20 frames of 22 atoms" in text.stdout
+
+
+def test_replicas_are_numbered_and_differ(here: Path) -> None:
+    result = run(
+        *["reference", "alanine-dipeptide", "--time", "400fs", "--save-every", "40fs", "--replicas", "2"],
+        *["-o", "x.dcd", "--json", "--quiet"],
+    )
+    assert result.exit_code == 0, result.stderr
+    assert [Path(r["file"]).name for r in json.loads(result.stdout)] == ["x_r0.dcd", "x_r1.dcd"]
+    expected = {f"x_r{k}{suffix}" for k in (0, 1) for suffix in (".dcd", ".pdb", ".meta.h5")}
+    assert {p.name for p in here.iterdir()} == expected
+    import mdtraj
+
+    a, b = (mdtraj.load(f"x_r{k}.dcd", top=f"x_r{k}.pdb").xyz for k in (0, 1))
+    assert a.shape == (10, 22, 3)
+    assert abs(a - b).max() > 1e-3
+
+
+def test_compare_writes_both_reports(here: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    made = tmp_path_factory.mktemp("compare")
+    assert (
+        run("reference", "alanine-dipeptide", "--time", "20ps", "--save-every", "40fs", "--replicas", "2",
+            "-o", str(made / "x.h5"), "--quiet").exit_code == 0
+    )  # fmt: skip
+    result = run("compare", str(made / "x_r0.h5"), str(made / "x_r1.h5"), "-o", "report.html")
+    assert result.exit_code == 0, result.stderr
+    assert {p.name for p in here.iterdir()} == {"report.html", "report.json"}
+    assert "report.html" in result.stdout
+    json.loads((here / "report.json").read_text())
+    page = (here / "report.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page.replace(
+        "https://doi.org", ""
+    )
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
+    arguments = ["reference", "alanine-dipeptide", "--time", "200ns", "--save-every", "1ps", "-o", "x.h5", "--quiet"]
+    with subprocess.Popen([*SURROMD, *arguments], stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and not (here / "x.h5").exists():
+            time.sleep(0.1)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert len(stderr.splitlines()) == 1, stderr
+    assert "x.h5 holds" in stderr and "--resume" in stderr
+    kept = api.info("x.h5")
+    assert kept["n_frames"] > 0
+    assert f"{kept['n_frames']} frames" in stderr
+
+
+def test_windows_train_and_rollout(here: Path, short_run: Path) -> None:
+    shutil.copy(short_run, here / "ref.h5")
+    assert run("windows", "ref.h5", "-o", "w.h5", "--quiet").exit_code == 0
+    assert json.loads(run("info", "w.h5", "--json").stdout)["type"] == "windows"
