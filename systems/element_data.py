@@ -1,0 +1,62 @@
+"""Atomic weights, covalent radii, and the element of a PDB atom name."""
+
+from __future__ import annotations
+
+# Symbol: (standard atomic weight in Da, IUPAC 2021 abridged; covalent radius in nm, Cordero et al., Dalton 2008, 2832).
+_TABLE: dict[str, tuple[float, float]] = {
+    "H": (1.008, 0.031), "He": (4.0026, 0.028), "Li": (6.94, 0.128), "Be": (9.0122, 0.096), "B": (10.81, 0.084),
+    "C": (12.011, 0.076), "N": (14.007, 0.071), "O": (15.999, 0.066), "F": (18.998, 0.057), "Ne": (20.180, 0.058),
+    "Na": (22.990, 0.166), "Mg": (24.305, 0.141), "Al": (26.982, 0.121), "Si": (28.085, 0.111), "P": (30.974, 0.107),
+    "S": (32.06, 0.105), "Cl": (35.45, 0.102), "Ar": (39.95, 0.106), "K": (39.098, 0.203), "Ca": (40.078, 0.176),
+    "Sc": (44.956, 0.170), "Ti": (47.867, 0.160), "V": (50.942, 0.153), "Cr": (51.996, 0.139), "Mn": (54.938, 0.150),
+    "Fe": (55.845, 0.142), "Co": (58.933, 0.138), "Ni": (58.693, 0.124), "Cu": (63.546, 0.132), "Zn": (65.38, 0.122),
+    "Ga": (69.723, 0.122), "Ge": (72.630, 0.120), "As": (74.922, 0.119), "Se": (78.971, 0.120), "Br": (79.904, 0.120),
+    "Kr": (83.798, 0.116), "Rb": (85.468, 0.220), "Sr": (87.62, 0.195), "Mo": (95.95, 0.154), "Ru": (101.07, 0.146),
+    "Rh": (102.91, 0.142), "Pd": (106.42, 0.139), "Ag": (107.87, 0.145), "Cd": (112.41, 0.144), "Sn": (118.71, 0.139),
+    "Sb": (121.76, 0.139), "Te": (127.60, 0.138), "I": (126.90, 0.139), "Xe": (131.29, 0.140), "Cs": (132.91, 0.244),
+    "Ba": (137.33, 0.215), "Pt": (195.08, 0.136), "Au": (196.97, 0.136), "Hg": (200.59, 0.132), "Pb": (207.2, 0.146),
+}  # fmt: skip
+_MONATOMIC_RESIDUES = {"CL": "Cl", "CLA": "Cl", "CL-": "Cl", "NA": "Na", "SOD": "Na", "NA+": "Na", "K": "K", "POT": "K",
+                       "K+": "K", "CA": "Ca", "CAL": "Ca", "MG": "Mg", "ZN": "Zn", "FE": "Fe", "CU": "Cu", "MN": "Mn",
+                       "BR": "Br", "IOD": "I", "CES": "Cs", "LI": "Li", "LIT": "Li", "CD": "Cd", "CO": "Co",
+                       "NI": "Ni", "HG": "Hg"}  # fmt: skip
+_UNNAMED_RESIDUES = ("UNL", "UNK", "LIG", "MOL", "DRG")
+_TWO_LETTER_IN_LIGANDS = ("Cl", "Br", "Si", "Se", "Na", "Mg", "Zn", "Fe", "Li", "As")
+
+
+def atomic_weight_da(symbol: str) -> float:
+    """Standard atomic weight in dalton. Raises KeyError for a symbol the table lacks."""
+    return _TABLE[symbol][0]
+
+
+def covalent_radius_nm(symbol: str) -> float:
+    """Covalent radius in nm. Raises KeyError for a symbol the table lacks."""
+    return _TABLE[symbol][1]
+
+
+def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: bool = False) -> str | None:
+    """Return the element of an atom from the element column or, failing this, from its PDB name; None when unknown.
+
+    `written` is the element column, whatever its case; `name_field` the atom name, which may start with digits
+    (`1HH3`). `CA` is calcium in a residue called CA and carbon elsewhere.
+    """
+    symbol = written.strip("0123456789+- ").capitalize()
+    if symbol == "D":
+        return "H"
+    if symbol in _TABLE:
+        return symbol
+    name = name_field.strip().upper()
+    letters = name.lstrip("0123456789'\"*")
+    if not letters or not letters[0].isalpha():
+        return None
+    residue = residue_name.upper()
+    monatomic = _MONATOMIC_RESIDUES.get(residue)
+    if monatomic and letters.rstrip("0123456789+-") in (residue.rstrip("+-"), monatomic.upper()):
+        return monatomic
+    two = letters[:2].capitalize()
+    if (hetero or residue in _UNNAMED_RESIDUES) and two in _TWO_LETTER_IN_LIGANDS:
+        return two
+    if residue in ("MSE", "SEC") and two == "Se":
+        return two
+    first = "H" if letters[0] == "D" and name != letters else letters[0]
+    return first if first in _TABLE else (two if two in _TABLE else None)

@@ -1,0 +1,180 @@
+"""Geometry of frames: torsion angles and superposition, vectorised over frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.errors import InputError
+
+FloatArray = npt.NDArray[np.floating[Any]]
+
+_NEWTON_STEPS = 60
+_DEGENERATE = 1e-5
+
+
+def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
+    """Return torsion angles `(n_frames, k)` in [-pi, pi], positive by the IUPAC convention.
+
+    `positions_nm (n_frames, n_atoms, 3)` or one frame `(n_atoms, 3)` (then the result is `(k,)`), `quads (k, 4)`.
+    Computed in the dtype given, float32 or float64. Source: IUPAC-IUB 1970, rule 1.2; the atan2 form of Blondel and
+    Karplus, J. Comput. Chem. 17, 1132 (1996). Raises InputError for arrays of another shape.
+    """
+    x, single = _frames(positions_nm)
+    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
+    a, b, c, d = (x[:, idx[:, k]] for k in range(4))
+    middle = c - b
+    first = np.cross(b - a, middle)
+    second = np.cross(middle, d - c)
+    sine = np.einsum("nkx,nkx->nk", b - a, second) * np.linalg.norm(middle, axis=-1)
+    cosine = np.einsum("nkx,nkx->nk", first, second)
+    angles: FloatArray = np.arctan2(sine, cosine)
+    return angles[0] if single else angles
+
+
+def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
+    """Return the signed volumes `(n_frames, k)` nm^3 of (b-a) x (c-a) . (d-a) for quadruples (a, b, c, d) `(k, 4)`.
+
+    One frame `(n_atoms, 3)` gives `(k,)`. For a stereocentre `a` with neighbours b, c, d the sign is its handedness.
+    """
+    x, single = _frames(positions_nm)
+    idx = np.asarray(quads, dtype=np.int64).reshape(-1, 4)
+    origin = x[:, idx[:, 0]]
+    b, c, d = (x[:, idx[:, k]] - origin for k in (1, 2, 3))
+    volumes: FloatArray = np.einsum("nkx,nkx->nk", np.cross(b, c), d)
+    return volumes[0] if single else volumes
+
+
+def superposition(
+    positions_nm: npt.ArrayLike,
+    template_nm: npt.ArrayLike,
+    *,
+    idx: npt.ArrayLike | None = None,
+    weights: npt.ArrayLike | None = None,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return the rotations `(n, 3, 3)` and translations `(n, 3)` nm that lay each frame over the template.
+
+    A frame x moves to `x @ R.T + t`. `positions_nm (n, n_atoms, 3)`, `template_nm (n_atoms, 3)`; `idx` selects the
+    atoms that are fitted (all by default), `weights` weighs those (equal by default). Rotations are proper: a mirror
+    image stays one. Where the best rotation is not unique (one atom, collinear atoms) one of the best is returned.
+    Source: quaternion form of Horn (1987) with the characteristic polynomial solved by Newton's method as in Theobald,
+    Acta Cryst. A61, 478 (2005); near-degenerate frames are solved by full diagonalisation. Raises InputError for
+    shapes that do not fit or weights that are negative or all zero.
+    """
+    x, _ = _frames(positions_nm)
+    y = np.asarray(template_nm, dtype=np.float64)
+    if y.shape != x.shape[1:]:
+        raise InputError(f"Superposition: frames have {x.shape[1]} atoms, the template has shape {y.shape}.")
+    if idx is not None:
+        chosen = np.asarray(idx, dtype=np.int64)
+        x, y = x[:, chosen], y[chosen]
+    if y.shape[0] == 0:
+        raise InputError("Superposition: no atom to fit.")
+    w = np.ones(len(y)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape != (len(y),) or (w < 0).any() or not w.sum() > 0:
+        raise InputError(f"Superposition: weights of shape {w.shape} for {len(y)} fitted atoms, or not positive.")
+    w = w / w.sum()
+    centre_x = np.tensordot(x.astype(np.float64, copy=False), w, axes=(1, 0))
+    centre_y = w @ y
+    target = (y - centre_y) * w[:, None]
+    covariance = np.tensordot(x.astype(np.float64, copy=False), target, axes=(1, 0))
+    # Weighted and centred target: sum_a w_a (y_a - c) = 0, so frames need no centring here except for rounding.
+    covariance -= centre_x[:, :, None] * target.sum(axis=0)[None, None, :]
+    rotation = _best_rotations(covariance)
+    translation = centre_y - np.einsum("nij,nj->ni", rotation, centre_x)
+    return rotation, translation
+
+
+def superpose(
+    positions_nm: npt.ArrayLike,
+    template_nm: npt.ArrayLike,
+    *,
+    idx: npt.ArrayLike | None = None,
+    weights: npt.ArrayLike | None = None,
+) -> FloatArray:
+    """Return the frames laid over the template, same shape and dtype as given; see `superposition`.
+
+    All atoms move; `idx` and `weights` say which of them are fitted. One frame `(n_atoms, 3)` gives one frame.
+    """
+    x, single = _frames(positions_nm)
+    rotation, translation = superposition(x, template_nm, idx=idx, weights=weights)
+    moved = np.matmul(x, rotation.transpose(0, 2, 1).astype(x.dtype))
+    moved += translation.astype(x.dtype)[:, None, :]
+    out: FloatArray = moved[0] if single else moved
+    return out
+
+
+def _frames(positions_nm: npt.ArrayLike) -> tuple[FloatArray, bool]:
+    x = np.asarray(positions_nm)
+    if x.dtype not in (np.float32, np.float64):
+        x = x.astype(np.float64)
+    single = x.ndim == 2
+    if single:
+        x = x[None]
+    if x.ndim != 3 or x.shape[2] != 3:
+        raise InputError(f"Positions have shape {x.shape}, not (n_frames, n_atoms, 3).")
+    return x, single
+
+
+def _best_rotations(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rotations maximising tr(R S) for S = sum_a w_a x_a y_a^T, `(n, 3, 3)`."""
+    # Each S is brought to unit scale first, so that one threshold tells degenerate frames from good ones.
+    scale = np.sqrt(np.einsum("nij,nij->n", covariance, covariance))
+    s = covariance / np.where(scale > 0, scale, 1.0)[:, None, None]
+    key = np.empty((len(s), 4, 4))
+    key[:, 0, 0] = s[:, 0, 0] + s[:, 1, 1] + s[:, 2, 2]
+    key[:, 1, 1] = s[:, 0, 0] - s[:, 1, 1] - s[:, 2, 2]
+    key[:, 2, 2] = s[:, 1, 1] - s[:, 0, 0] - s[:, 2, 2]
+    key[:, 3, 3] = s[:, 2, 2] - s[:, 0, 0] - s[:, 1, 1]
+    key[:, 0, 1] = key[:, 1, 0] = s[:, 1, 2] - s[:, 2, 1]
+    key[:, 0, 2] = key[:, 2, 0] = s[:, 2, 0] - s[:, 0, 2]
+    key[:, 0, 3] = key[:, 3, 0] = s[:, 0, 1] - s[:, 1, 0]
+    key[:, 1, 2] = key[:, 2, 1] = s[:, 0, 1] + s[:, 1, 0]
+    key[:, 1, 3] = key[:, 3, 1] = s[:, 0, 2] + s[:, 2, 0]
+    key[:, 2, 3] = key[:, 3, 2] = s[:, 1, 2] + s[:, 2, 1]
+    quaternion = _top_eigenvectors(key, s)
+    w, x, y, z = quaternion.T
+    rotation = np.empty((len(s), 3, 3))
+    rotation[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    rotation[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    rotation[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    rotation[:, 0, 1], rotation[:, 1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+    rotation[:, 0, 2], rotation[:, 2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+    rotation[:, 1, 2], rotation[:, 2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
+    return rotation
+
+
+def _top_eigenvectors(key: npt.NDArray[np.float64], s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Unit eigenvectors `(n, 4)` of the largest eigenvalue of traceless symmetric `key (n, 4, 4)`."""
+    c2 = -2.0 * np.einsum("nij,nij->n", s, s)
+    with np.errstate(invalid="ignore"):  # frames with NaN stay NaN
+        c1 = -8.0 * np.linalg.det(s)
+        c0 = np.linalg.det(key)
+    root = np.full(len(s), np.sqrt(3.0) + 1e-9)  # an upper bound at unit scale: Newton then falls monotonically
+    for _ in range(_NEWTON_STEPS):
+        value = ((root * root + c2) * root + c1) * root + c0
+        slope = (4.0 * root * root + 2.0 * c2) * root + c1
+        step = np.where(slope > 0, value / np.where(slope > 0, slope, 1.0), 0.0)
+        root = root - step
+        if np.abs(step).max(initial=0.0) < 1e-15:
+            break
+    # P(K) / (K - root) by Horner's rule: every column is the wanted eigenvector, times a factor.
+    eye = np.eye(4)
+    columns = key + root[:, None, None] * eye
+    columns = columns @ key + (root * root + c2)[:, None, None] * eye
+    columns = columns @ key + ((root * root + c2) * root + c1)[:, None, None] * eye
+    norms = np.sqrt(np.einsum("nij,nij->nj", columns, columns))
+    best = norms.argmax(axis=1)
+    rows = np.arange(len(s))
+    length = norms[rows, best]
+    bad = ~(length > _DEGENERATE)
+    vector = columns[rows, :, best] / np.where(bad, 1.0, length)[:, None]
+    if bad.any():
+        finite = np.isfinite(key[bad]).all(axis=(1, 2))
+        solved = np.full((int(bad.sum()), 4), np.nan)
+        if finite.any():
+            solved[finite] = np.linalg.eigh(key[bad][finite])[1][:, :, -1]
+        vector[bad] = solved
+    return vector
