@@ -9,7 +9,7 @@ from types import TracebackType
 
 from systems.errors import StorageError, TrajectoryError
 
-_BTREE = b"TREE"
+_BTREE, _SYMBOLS = b"TREE", b"SNOD"
 
 
 def storage_error(path: str | os.PathLike[str], error: OSError, kept: str) -> StorageError:
@@ -40,8 +40,9 @@ class AtomicFile:
     data which never arrived, and then the whole file is lost. Given to h5py as its file object, this class collects the
     writes of one append and puts them out in an order in which every prefix is a readable file: first what lies beyond
     the old end of the file (nothing refers to it yet; if the disk fills here, the file is cut back and is byte for byte
-    what it was), then the superblock (end of file), then index nodes from the root down, then data inside old chunks,
-    and the object headers, which hold the lengths, last. No space is needed after the first step.
+    what it was), then the superblock (end of file), then index nodes from the root down, then data inside old chunks and
+    the object headers, which hold the lengths, and names last. No space is needed after the first step. A transaction
+    that shortens the file (`shrinks`) goes the other way: lengths first.
 
     One writer at a time: an advisory POSIX lock, which leaves HDF5 readers of the running file alone.
     Raises TrajectoryError when another process writes the file, StorageError when it cannot be opened for writing.
@@ -109,7 +110,7 @@ class AtomicFile:
 
     # ---- transactions ----------------------------------------------------------------------------------------------
 
-    def plan(self) -> list[tuple[int, bytes]]:
+    def plan(self, *, shrinks: bool = False) -> list[tuple[int, bytes]]:
         """Return the pending writes as `(offset, bytes)` in the order in which `commit` makes them."""
         old_end = self._committed_size
         beyond: list[tuple[int, bytes]] = []
@@ -120,14 +121,14 @@ class AtomicFile:
                 inside.append((offset, block[:split]))
             if split < len(block):
                 beyond.append((offset + split, block[split:]))
-        return beyond + sorted(_latest(inside), key=_rank)
+        return beyond + sorted(_latest(inside), key=_rank, reverse=shrinks)
 
-    def commit(self) -> None:
+    def commit(self, *, shrinks: bool = False) -> None:
         """Put the collected writes on disk. On failure raise OSError with the file as it was before the transaction."""
         if self._dead:
             raise OSError(errno.EIO, "an earlier write failed")
         try:
-            for offset, block in self.plan():
+            for offset, block in self.plan(shrinks=shrinks):
                 write_whole(self._fd, block, offset)
             if os.fstat(self._fd).st_size != self._size:
                 os.ftruncate(self._fd, self._size)
@@ -181,13 +182,13 @@ def _latest(writes: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
 
 
 def _rank(item: tuple[int, bytes]) -> tuple[int, int]:
-    """Order of in-place writes: superblock, index nodes from the root down, then from the end of the file backwards."""
+    """Order of in-place writes: superblock, index nodes from the root down, from the end of the file back, names."""
     offset, block = item
     if offset == 0:
         return (0, 0)
     if block[:4] == _BTREE and len(block) > 5:
         return (1, -block[5])
-    return (2, -offset)
+    return (3 if block[:4] == _SYMBOLS else 2, -offset)
 
 
 def _lock(descriptor: int, path: Path) -> None:

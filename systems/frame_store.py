@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -188,17 +189,24 @@ class FrameStore:
         self.path = path
         open_hdf5(path).close()
         self._atomic = AtomicFile(path)
+        self._columns: dict[str, h5py.Dataset] = {}
         try:
             self.file = open_hdf5(path, self._atomic, "r+")
+        except BaseException:
+            self._atomic.close()
+            raise
+        # At exit too: HDF5 must not call into a file object that the interpreter has already taken apart.
+        self._close = weakref.finalize(self, _close, self.file, self._atomic)
+        try:
             if "surromd" not in self.file:
                 raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
             self.scene = Scene.from_dict(get_json(self.file, "surromd/scene", path))
             self.record: dict[str, Any] = get_json(self.file, "surromd/record", path)
             self.n_frames = consistent_length(self.file, path)
             self.largest_append = int(self.file["surromd"].attrs["largest_append"])
-            self._columns = {name: self.file[name] for name in column_names(self.file)}
+            self._columns.update({name: self.file[name] for name in column_names(self.file)})
             if any(len(column) != self.n_frames for column in self._columns.values()):
-                self.truncate(self.n_frames)
+                self.truncate(self.n_frames)  # what a crash left behind the last whole append
         except BaseException:
             self.close()
             raise
@@ -254,12 +262,16 @@ class FrameStore:
         """Cut all columns to `n_frames`. Raises InputError when there are fewer, StorageError."""
         if not 0 <= n_frames <= self.n_frames:
             raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
+        usual = self.largest_append
+        self.announce(self.n_frames - n_frames)
         for column in self._columns.values():
             column.resize(n_frames, axis=0)
+        self._commit(shrinks=True)
+        self.n_frames, self.largest_append = n_frames, usual
+        self.file["surromd"].attrs["largest_append"] = np.int64(usual)
         if n_frames == 0 and self._columns.pop("surromd/flags", None) is not None:
             del self.file["surromd/flags"]
         self._commit()
-        self.n_frames = n_frames
 
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
@@ -268,10 +280,10 @@ class FrameStore:
         self._commit()
         self.record = merged
 
-    def _commit(self) -> None:
+    def _commit(self, *, shrinks: bool = False) -> None:
         self.file.flush()
         try:
-            self._atomic.commit()
+            self._atomic.commit(shrinks=shrinks)
         except OSError as error:
             raise self.failed(error) from error
 
@@ -283,7 +295,10 @@ class FrameStore:
 
     def close(self) -> None:
         """Close the file; twice does no harm. What is not committed is dropped."""
-        if getattr(self, "file", None):
-            self._atomic.abandon()
-            self.file.close()
-        self._atomic.close()
+        self._close()
+
+
+def _close(file: h5py.File, atomic: AtomicFile) -> None:
+    atomic.abandon()
+    file.close()
+    atomic.close()
