@@ -1,0 +1,297 @@
+"""The comparison: reference, replicate and candidates in; a frozen value with rows, curves and a verdict out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from surrogate.judge import curves, metrics, relaxation, verdict
+from surrogate.judge.account import Account, Faults, account_of, faults_of, speed_ratio
+from surrogate.judge.curves import Curves
+from surrogate.judge.ensemble import Ensemble, equal_lags
+from surrogate.judge.rows import Options, Row, Trio, make_sample
+from surrogate.judge.statistics import block_length, effective_samples, make_blocks
+from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry
+from systems import validity
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.units import format_time_ps
+from systems.validity import Geometry
+
+_MIN_FRAMES = 20
+_SHORT_IN_CORRELATION_TIMES = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """One candidate against the reference: rows with a word each, what is wrong (worst first), and the verdict.
+
+    `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` stand behind the error
+    bars; `correlation_ps` is the slowest torsion's integrated autocorrelation time in the reference, which makes it
+    `effective_samples` independent samples; `speed_ratio` is simulated time per wall second over the reference's.
+    """
+
+    account: Account
+    status: verdict.Status
+    verdict: str
+    findings: tuple[str, ...]
+    rows: tuple[Row, ...]
+    compared_ps: float
+    n_frames: int
+    block_ps: float
+    n_blocks: int
+    correlation_ps: float
+    effective_samples: float
+    speed_ratio: float | None
+    faults: tuple[Faults, Faults, Faults]
+    skipped: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
+    curves: Curves
+
+    def row(self, key: str) -> Row:
+        """Return the row whose key is, or starts with, `key`. Raises InputError when there is none."""
+        for row in self.rows:
+            if row.key == key or row.key.startswith(f"{key}:"):
+                return row
+        raise InputError(f"{self.account.label}: no metric {key!r}; there are {', '.join(r.key for r in self.rows)}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Everything a report says, and nothing that needs computing."""
+
+    scene_name: str
+    formula: str
+    n_atoms: int
+    temperature_k: float
+    lag_ps: float
+    reference: Account
+    replicate: Account | None
+    judgements: tuple[Judgement, ...]
+    notes: tuple[str, ...]
+    options: Options
+    versions: dict[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; what is not finite becomes None."""
+        plain: dict[str, Any] = _jsonable(
+            {k: v for k, v in vars(self).items() if k not in ("judgements", "reference", "replicate", "options")}
+        )
+        plain["reference"] = _jsonable(asdict(self.reference))
+        plain["replicate"] = None if self.replicate is None else _jsonable(asdict(self.replicate))
+        plain["options"] = _jsonable(asdict(self.options))
+        plain["judgements"] = []
+        for judgement in self.judgements:
+            nested = ("rows", "curves", "account", "faults")
+            out = _jsonable({k: v for k, v in vars(judgement).items() if k not in nested})
+            out["account"] = _jsonable(asdict(judgement.account))
+            out["faults"] = [_jsonable(asdict(f)) for f in judgement.faults]
+            out["rows"] = [r.to_dict() for r in judgement.rows]
+            out["curves"] = judgement.curves.to_dict()
+            plain["judgements"].append(out)
+        return plain
+
+
+def compare(
+    reference: Ensemble,
+    candidates: Sequence[Ensemble],
+    replicate: Ensemble | None = None,
+    scene: Scene | None = None,
+    *,
+    options: Options | None = None,
+) -> Comparison:
+    """Judge each candidate against the reference, beside a replicate of equal length.
+
+    All ensembles must hold the atoms of `scene` (the reference's by default) in its order. Without a replicate the
+    reference is cut in two halves, the second serving as the replicate of the first. Each candidate is judged by
+    itself, at the longest length that it shares with reference and replicate: adding a candidate changes no other's
+    numbers. Raises InputError when there is no candidate, atoms differ, or too few frames are left.
+    """
+    if not candidates:
+        raise InputError("Nothing to compare with the reference: give at least one trajectory.")
+    chosen = options or Options()
+    stage = scene or reference.scene
+    everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
+    for ensemble in everyone:
+        if ensemble.scene.elements != stage.elements:
+            raise InputError(f"{ensemble.label}: its atoms are not those of {stage.name!r} in the same order.")
+    thinned = equal_lags(everyone)
+    torsions = backbone(stage)
+    geometry = reference_geometry(thinned[0])
+    measured = [measure(e, torsions, geometry) for e in thinned]
+    notes = [note for e in thinned for note in e.notes]
+    truth = measured[0]
+    if replicate is None:
+        half = truth.n_frames // 2
+        other = replace(truth.frames(half, 2 * half), label=f"{truth.label} (second half)")
+        truth = replace(truth.frames(0, half), label=f"{truth.label} (first half)")
+        notes.append(
+            f"No replicate was given: the reference is cut in two halves of {format_time_ps(truth.total_ps)}; the "
+            "candidates are compared with the first, and the second is the replicate."
+        )
+    else:
+        other = measured[-1]
+    temperature = reference.record.get("temperature_k")
+    if not isinstance(temperature, (int, float)):
+        temperature = 300.0
+        notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
+    accounts = [account_of(e) for e in everyone]
+    judgements = tuple(
+        _judge(stage, torsions, geometry, truth, features, other, chosen, accounts[0], account)
+        for features, account in zip(measured[1 : 1 + len(candidates)], accounts[1 : 1 + len(candidates)], strict=True)
+    )
+    notes += [f"Validity check left out: {x}." for x in geometry.excluded]
+    return Comparison(
+        scene_name=stage.name,
+        formula=stage.formula,
+        n_atoms=stage.n_atoms,
+        temperature_k=float(temperature),
+        lag_ps=thinned[0].lag_ps,
+        reference=accounts[0],
+        replicate=None if replicate is None else accounts[-1],
+        judgements=judgements,
+        notes=tuple(dict.fromkeys(notes)),
+        options=chosen,
+        versions=_versions(),
+    )
+
+
+def _judge(
+    scene: Scene,
+    torsions: Backbone,
+    geometry: Geometry,
+    reference: Features,
+    candidate: Features,
+    replicate: Features,
+    options: Options,
+    reference_account: Account,
+    account: Account,
+) -> Judgement:
+    trio, correlation = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
+    rows = metrics.validity_rows(trio)
+    bond_rows, bonds = metrics.bond_rows(trio)
+    rows += bond_rows + metrics.population_rows(trio) + metrics.torsion_rows(trio)
+    kinetic, correlations, skipped = relaxation.correlation_rows(trio)
+    slowest, projected, without_tica = relaxation.tica_rows(trio)
+    seams, without_seams = relaxation.boundary_row(trio)
+    judged = verdict.judge_rows([*rows, *kinetic, *slowest, *seams], options)
+    found = verdict.findings(judged)
+    compared = trio.reference.features.total_ps
+    truth = trio.reference
+    return Judgement(
+        account=account,
+        status=verdict.status(judged),
+        verdict=verdict.sentence(judged, found, format_time_ps(compared)),
+        findings=found,
+        rows=judged,
+        compared_ps=compared,
+        n_frames=truth.features.n_frames,
+        block_ps=truth.blocks.n_frames_each * truth.features.lag_ps,
+        n_blocks=truth.blocks.n_blocks,
+        correlation_ps=correlation * truth.features.lag_ps,
+        effective_samples=effective_samples(truth.features.n_frames, correlation),
+        speed_ratio=speed_ratio(account, reference_account),
+        faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
+        skipped=(*_skipped(trio), *skipped, *without_tica, *without_seams),
+        notes=tuple(_trimming(trio, reference, candidate, replicate, correlation)),
+        curves=Curves(
+            ramachandran=curves.ramachandran_maps(trio),
+            histograms=(*curves.torsion_histograms(trio), *projected),
+            correlations=tuple(correlations),
+            timelines=tuple(curves.timeline(s.features) for s in trio.samples),
+            bonds=tuple(bonds),
+        ),
+    )
+
+
+def _equal_terms(
+    scene: Scene,
+    torsions: Backbone,
+    geometry: Geometry,
+    reference: Features,
+    candidate: Features,
+    replicate: Features,
+    options: Options,
+) -> tuple[Trio, float]:
+    """Cut all three to one number of frames and divide them into blocks of one length; the slowest time in frames."""
+    n = min(reference.n_frames, candidate.n_frames, replicate.n_frames)
+    if n < _MIN_FRAMES:
+        raise InputError(
+            f"{candidate.label}: only {n} frames can be compared at equal length; at least {_MIN_FRAMES} are needed "
+            "(without a replicate the reference counts half)."
+        )
+    cut = [f.frames(0, n) for f in (reference, candidate, replicate)]
+    times = [relaxation.longest_correlation(f) for f in cut]
+    each = block_length(n, max(times))
+    n_rows = 12 + 8 * (len(torsions.phi) + len(torsions.psi))
+    options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
+    truth, rolled, other = (
+        make_sample(f, make_blocks(f.segment_lengths, each), options, stream) for stream, f in enumerate(cut)
+    )
+    return Trio(scene, torsions, geometry, truth, rolled, other, options), times[0]
+
+
+def _trimming(
+    trio: Trio, reference: Features, candidate: Features, replicate: Features, correlation: float
+) -> list[str]:
+    notes = []
+    compared = trio.reference.features
+    for features in (reference, candidate, replicate):
+        if features.n_frames > compared.n_frames:
+            notes.append(
+                f"{features.label}: the first {format_time_ps(compared.total_ps)} of "
+                f"{format_time_ps(features.total_ps)} are used, for equal length."
+            )
+    if compared.n_frames < _SHORT_IN_CORRELATION_TIMES * 2 * correlation:
+        notes.append(
+            f"The compared length is only {compared.n_frames / (2 * correlation):.0f} correlation times of the slowest "
+            "torsion: too short to judge by; error bars are themselves uncertain."
+        )
+    return notes
+
+
+def _skipped(trio: Trio) -> list[tuple[str, str]]:
+    skipped = []
+    done = {check[0] for check in metrics.applicable_checks(trio.geometry)}
+    for flag, what, why in (
+        (validity.BOND_HALF_ANGSTROM, "Bond lengths", "the scene has no bonds"),
+        (validity.CLASH, "Clashes", "no two atoms are more than three bonds apart"),
+        (validity.CHIRALITY, "Stereocentres", "the scene has none"),
+        (validity.OMEGA, "Peptide and double bonds", "the scene has none"),
+        (validity.RING, "Planar rings", "the scene has none"),
+    ):
+        if flag not in done:
+            skipped.append((what, why))
+    if not len(trio.torsions.phi) and not len(trio.torsions.psi):
+        skipped.append(("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion"))
+    elif not trio.torsions.residues:
+        skipped.append(("Joint φ/ψ maps", "no residue has both torsions"))
+    return skipped
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {}
+    for package in ("surromd", "numpy", "scipy", "deeptime"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_jsonable(v) for v in value]
+    if isinstance(value, np.generic):
+        return _jsonable(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

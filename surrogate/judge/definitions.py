@@ -1,0 +1,92 @@
+"""What each number in the report means, and where the definition comes from. Text only."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Definition(NamedTuple):
+    """One term of the report."""
+
+    term: str
+    meaning: str
+    source: str
+
+
+DEFINITIONS: tuple[Definition, ...] = (
+    Definition(
+        "Equal terms",
+        "All trajectories are compared at the same save interval and cut to the same number of frames (from the start, "
+        "replicas in the order given). Segments are never joined: no time correlation crosses from one to the next.",
+        "",
+    ),
+    Definition(
+        "Replicate, floor",
+        "An independent piece of the same MD of the same length, judged exactly as the candidate is. What it scores is "
+        "the floor: no simulation of this length can be expected to do better.",
+        "",
+    ),
+    Definition(
+        "Distance",
+        "Jensen-Shannon distance: the square root of the divergence, natural logarithm; 0 for equal histograms, "
+        "0.8326 (the root of ln 2) for histograms without overlap. 100 bins on [-π, π] for one torsion, 50 × 50 "
+        "for φ and ψ together, 100 bins over the reference's range for TIC 0 and bond lengths. Frames beyond the "
+        "range, and frames that are not finite, have bins of their own, so that a broken frame costs and never helps.",
+        "Lin, IEEE Trans. Inf. Theory 37, 145 (1991); Endres and Schindelin, ibid. 49, 1858 (2003); bins as in MDGen "
+        "(Jing et al., 2024)",
+    ),
+    Definition(
+        "Basins",
+        "α: -120° ≤ ψ < 80°; β: the rest of the circle; the cuts lie at the two minima of the ψ density of "
+        "alanine dipeptide. φ > 0: the left-handed region. Frames that are not finite belong to no basin and stay in "
+        "the denominator. Tolerance: a free-energy difference of 1 kJ/mol at 300 K.",
+        "",
+    ),
+    Definition(
+        "Autocorrelation of cos ψ",
+        "C(t) = <δx(0) δx(t)> / <δx²>, x = cos ψ, deviations from the mean over all segments, averaged over all pairs "
+        "of frames inside segments.",
+        "",
+    ),
+    Definition(
+        "Relaxation time",
+        "The integral of C(t) to its first zero crossing (trapezoid rule): the integrated autocorrelation time.",
+        "",
+    ),
+    Definition(
+        "TIC 0",
+        "The slowest linear combination of cos and sin of all φ and ψ, fitted on the reference alone (reversible "
+        "TICA, mean removed). Its timescale is -τ / ln λ(τ), with λ the time-symmetrised autocorrelation of the "
+        "projected trajectory at the lag τ: on the reference this is TICA's own eigenvalue.",
+        "Pérez-Hernández et al., J. Chem. Phys. 139, 015102 (2013); deeptime (Hoffmann et al., 2022)",
+    ),
+    Definition(
+        "Valid frames",
+        "Finite; every bond within 0.5 Å of its mean in the reference (the published stability rule) and, more "
+        "strictly, within 20 %; no two atoms (beyond 1-4 neighbours) closer than the reference allows; every "
+        "stereocentre, double bond and peptide bond as in the reference; planar rings planar. A frame "
+        "that fails any but the 20 % rule is invalid.",
+        "Fu et al., 'Forces are not enough', TMLR (2023)",
+    ),
+    Definition(
+        "Error bars",
+        "95 % intervals from a block bootstrap: blocks of ten correlation times of the slowest torsion (never fewer "
+        "than 10 nor more than 100 blocks), 400 draws, centred on the value, widened for the small number of blocks by "
+        "Student's t.",
+        "Künsch, Ann. Statist. 17, 1217 (1989); Flyvbjerg and Petersen, J. Chem. Phys. 91, 461 (1989)",
+    ),
+    Definition(
+        "Significance",
+        "Distances: block permutation test, blocks of candidate and reference dealt at random. Numbers: t test with "
+        "combined standard errors. All p-values are corrected for their number (Holm); the level is 5 % for the whole "
+        "table.",
+        "Holm, Scand. J. Statist. 6, 65 (1979)",
+    ),
+    Definition(
+        "Words",
+        "agrees: no significant difference, and one as large as the tolerance would have shown. close: significant, "
+        "but within the tolerance. differs: significant and beyond the tolerance. fails: cannot be computed where the "
+        "reference can, or a validity check missed tenfold. undecided: error bars wider than the tolerance.",
+        "",
+    ),
+)

@@ -1,0 +1,205 @@
+"""Error bars: blocks of correlated frames, bootstrap over blocks, permutation tests, effective sample size.
+
+Everything resampled here is a sum over blocks (histogram counts, lagged products), so one draw is one row of a matrix
+product and no frame is touched twice.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+MIN_BLOCKS = 10
+MAX_BLOCKS = 100
+BLOCK_IN_CORRELATION_TIMES = 10
+
+
+class Piece(NamedTuple):
+    """Frames `start:stop` of one segment, belonging to block `block`."""
+
+    segment: int
+    start: int
+    stop: int
+    block: int
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A division of all segments into blocks that are close to independent."""
+
+    pieces: tuple[Piece, ...]
+    n_blocks: int
+    n_frames_each: int
+
+    @staticmethod
+    def whole(segment_lengths: Sequence[int]) -> Blocks:
+        """Return one block per segment."""
+        pieces = tuple(Piece(i, 0, n, i) for i, n in enumerate(segment_lengths))
+        return Blocks(pieces, len(pieces), max(segment_lengths, default=0))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval.
+
+    `error` is the standard error; `log_error` that of the logarithm (NaN when the number is not positive);
+    `n_blocks` the number of blocks behind it, so `n_blocks - 1` degrees of freedom.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    error: float = math.nan
+    log_error: float = math.nan
+    n_blocks: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able numbers; what is not finite becomes None."""
+        return {k: (v if math.isfinite(v) else None) for k, v in vars(self).items()}
+
+
+def block_length(n_frames: int, correlation_frames: float) -> int:
+    """Return the block length in frames: ten correlation times, but at least 10 and at most 100 blocks in all."""
+    wanted = BLOCK_IN_CORRELATION_TIMES * correlation_frames if math.isfinite(correlation_frames) else n_frames
+    shortest, longest = n_frames / MAX_BLOCKS, n_frames / MIN_BLOCKS
+    return max(1, int(min(max(wanted, shortest), longest)))
+
+
+def make_blocks(segment_lengths: Sequence[int], n_frames_each: int) -> Blocks:
+    """Divide segments into blocks of about `n_frames_each` frames.
+
+    A long segment is cut evenly; segments shorter than a block are gathered whole. No piece crosses a segment.
+    """
+    pieces: list[Piece] = []
+    block, gathered = 0, 0
+    for segment, n in enumerate(segment_lengths):
+        n_cuts = round(n / n_frames_each)
+        if n_cuts >= 2:
+            if gathered:
+                block, gathered = block + 1, 0
+            edges = np.linspace(0, n, n_cuts + 1).astype(int).tolist()
+            for start, stop in itertools.pairwise(edges):
+                pieces.append(Piece(segment, start, stop, block))
+                block += 1
+        elif n > 0:
+            pieces.append(Piece(segment, 0, n, block))
+            gathered += n
+            if gathered >= 0.75 * n_frames_each:
+                block, gathered = block + 1, 0
+    return Blocks(tuple(pieces), pieces[-1].block + 1 if pieces else 0, n_frames_each)
+
+
+def bootstrap_weights(n_blocks: int, n_draws: int, rng: np.random.Generator) -> FloatArray:
+    """Return how often each block is drawn, `(n_draws, n_blocks)`: the block bootstrap as multinomial counts."""
+    return rng.multinomial(n_blocks, np.full(n_blocks, 1.0 / n_blocks), size=n_draws).astype(np.float64)
+
+
+def _t_quantile(probability: float, n_blocks: int) -> float:
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(n_blocks - 1, 1), probability))
+
+
+def estimate(value: float, draws: npt.ArrayLike, n_blocks: int, *, log: bool = False) -> Estimate:
+    """Return `value` with its 95 % interval from bootstrap `draws` `(n_draws,)`.
+
+    The draws are centred on the value (resampling biases every histogram distance upward), and their spread is widened
+    by Student's t over the normal quantile and by sqrt(B / (B - 1)), because B blocks are few. With `log` the interval
+    is made for the logarithm, for quantities that are positive and skewed (times, ratios).
+    """
+    array = np.asarray(draws, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    if not math.isfinite(value) or len(array) < 2 or n_blocks < 2:
+        return Estimate(value, n_blocks=n_blocks)
+    widen = math.sqrt(n_blocks / (n_blocks - 1))
+    t_over_normal = _t_quantile(0.975, n_blocks) / 1.959964
+    log_error = math.nan
+    if value > 0:
+        positive = array[array > 0]
+        log_error = float(np.log(positive).std() * widen) if len(positive) == len(array) else math.nan
+    error = float(array.std() * widen)
+    if log and math.isfinite(log_error):
+        logs = np.log(array)
+        low, high = np.quantile(logs, [0.025, 0.975]) - logs.mean()
+        factor = widen * t_over_normal
+        bounds = value * math.exp(factor * low), value * math.exp(factor * high)
+    else:
+        low, high = np.quantile(array, [0.025, 0.975]) - array.mean()
+        bounds = value + widen * t_over_normal * low, value + widen * t_over_normal * high
+    return Estimate(value, float(bounds[0]), float(bounds[1]), error, log_error, n_blocks)
+
+
+def difference_p(a: Estimate, b: Estimate, *, log: bool = False) -> float:
+    """Return the two-sided p-value of a = b: Student's t of the difference over the combined standard error.
+
+    With `log` the logarithms are compared. Two numbers without any spread give 1 when equal and 0 when not; NaN when
+    one of them is not finite.
+    """
+    from scipy.special import stdtr
+
+    if log and a.value > 0 and b.value > 0 and math.isfinite(a.log_error) and math.isfinite(b.log_error):
+        gap, combined = abs(math.log(a.value / b.value)), math.hypot(a.log_error, b.log_error)
+    else:
+        gap, combined = abs(a.value - b.value), math.hypot(a.error, b.error)
+    if not (math.isfinite(gap) and math.isfinite(combined)):
+        return math.nan
+    if combined == 0.0:
+        return 1.0 if gap == 0.0 else 0.0
+    freedom = max(min(a.n_blocks, b.n_blocks) - 1, 1)
+    return float(2.0 * stdtr(freedom, -gap / combined))
+
+
+def permutation_p(
+    counts_a: FloatArray,
+    counts_b: FloatArray,
+    distance: Callable[[FloatArray, FloatArray], FloatArray],
+    rng: np.random.Generator,
+    n_permutations: int = 1000,
+) -> float:
+    """Return the p-value of "both sets of blocks come from one distribution" under the statistic `distance`.
+
+    `counts_a` and `counts_b` are histograms per block, `(n_blocks_a | n_blocks_b, n_bins)`. Blocks are dealt at random
+    to two sides; the p-value is the share of deals at least as far apart as the data. Blocks must be longer than the
+    correlation time for the blocks to be exchangeable.
+    """
+    pooled = np.concatenate([counts_a, counts_b])
+    n_a, n = len(counts_a), len(pooled)
+    observed = float(distance(counts_a.sum(0)[None], counts_b.sum(0)[None])[0])
+    total = pooled.sum(0)
+    n_as_far, done = 0, 0
+    batch = max(1, min(n_permutations, int(2e6 // max(pooled.shape[1], 1))))
+    while done < n_permutations:
+        size = min(batch, n_permutations - done)
+        order = rng.random((size, n)).argsort(axis=1)
+        side = np.zeros((size, n))
+        np.put_along_axis(side, order[:, :n_a], 1.0, axis=1)
+        left = side @ pooled
+        n_as_far += int((distance(left, total - left) >= observed * (1 - 1e-12)).sum())
+        done += size
+    return (n_as_far + 1) / (n_permutations + 1)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values corrected for their number (Holm, Scand. J. Statist. 6, 65, 1979); NaN stays NaN, uncounted."""
+    finite = [i for i, p in enumerate(p_values) if math.isfinite(p)]
+    adjusted = [math.nan] * len(p_values)
+    running = 0.0
+    for rank, i in enumerate(sorted(finite, key=lambda i: p_values[i])):
+        running = max(running, min(1.0, (len(finite) - rank) * p_values[i]))
+        adjusted[i] = running
+    return adjusted
+
+
+def effective_samples(n_frames: int, correlation_frames: float) -> float:
+    """Return the number of independent samples, n / (2 tau), tau the integrated autocorrelation time in frames."""
+    if not correlation_frames > 0:
+        return math.nan
+    return n_frames / max(2.0 * correlation_frames, 1.0)

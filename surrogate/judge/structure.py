@@ -1,0 +1,165 @@
+"""What is measured on each frame: backbone torsions, bond lengths, validity flags. One pass over the positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.ensemble import Ensemble, Flags, Frames
+from systems.scene import Scene
+from systems.validity import Geometry
+
+IntArray = npt.NDArray[np.int64]
+Series = npt.NDArray[np.float32]
+
+_BLOCK_FRAMES = 2048
+_GEOMETRY_FRAMES = 20_000
+# A thermal bond is 2 pm or more wide; what is narrower than this was held by a constraint.
+CONSTRAINED_BELOW_NM = 5e-4
+
+
+class Residue(NamedTuple):
+    """One residue with both backbone torsions: columns of `Features.phi` and `Features.psi`, and its name."""
+
+    phi: int
+    psi: int
+    label: str
+
+
+@dataclass(frozen=True, eq=False)
+class Backbone:
+    """Backbone torsions of a scene: quadruples `(k, 4)`, their labels, and the residues that have both."""
+
+    phi: IntArray
+    psi: IntArray
+    phi_labels: tuple[str, ...]
+    psi_labels: tuple[str, ...]
+    residues: tuple[Residue, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Per-frame measurements of one ensemble, one array per segment.
+
+    `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
+    frame is not finite. `chunk_idx` `(n,)` or None.
+    """
+
+    label: str
+    lag_ps: float
+    phi: Sequence[Series]
+    psi: Sequence[Series]
+    bonds_nm: Sequence[Series]
+    flags: Sequence[Flags]
+    chunk_idx: Sequence[npt.NDArray[np.int32]] | None
+
+    @property
+    def segment_lengths(self) -> list[int]:
+        return [len(f) for f in self.flags]
+
+    @property
+    def n_frames(self) -> int:
+        return sum(self.segment_lengths)
+
+    @property
+    def total_ps(self) -> float:
+        return self.n_frames * self.lag_ps
+
+    def frames(self, start: int, stop: int) -> Features:
+        """Return frames `start:stop`, counted through the segments in order; segments keep their bounds."""
+        spans = []
+        offset = 0
+        for n in self.segment_lengths:
+            spans.append((max(start - offset, 0), max(min(stop - offset, n), 0)))
+            offset += n
+
+        def cut(series: Sequence[npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:
+            return [s[a:b] for s, (a, b) in zip(series, spans, strict=True) if b > a]
+
+        return replace(
+            self,
+            phi=cut(self.phi),
+            psi=cut(self.psi),
+            bonds_nm=cut(self.bonds_nm),
+            flags=cut(self.flags),
+            chunk_idx=None if self.chunk_idx is None else cut(self.chunk_idx),
+        )
+
+
+def backbone(scene: Scene) -> Backbone:
+    """Return the backbone torsions of `scene`, found in its bond graph, with labels such as 'ALA 2'."""
+    from systems.chemistry import backbone_torsions
+
+    found = backbone_torsions(scene)
+    phi = np.asarray(found["phi"], dtype=np.int64).reshape(-1, 4)
+    psi = np.asarray(found["psi"], dtype=np.int64).reshape(-1, 4)
+
+    # phi is C-N-CA-C and psi N-CA-C-N: the residue is that of CA.
+    def label(alpha_carbon: int) -> str:
+        residue = int(scene.residue_of_atom[alpha_carbon])
+        return f"{scene.residue_names[residue]} {scene.residue_ids[residue]}"
+
+    of_carbon = {int(quad[1]): k for k, quad in enumerate(psi)}
+    residues = tuple(
+        Residue(k, of_carbon[int(quad[2])], label(int(quad[2])))
+        for k, quad in enumerate(phi)
+        if int(quad[2]) in of_carbon
+    )
+    return Backbone(phi, psi, tuple(label(int(q[2])) for q in phi), tuple(label(int(q[1])) for q in psi), residues)
+
+
+def reference_geometry(reference: Ensemble) -> Geometry:
+    """Return what valid frames look like, learned from at most 20,000 frames spread over the reference."""
+    from systems.validity import geometry_from_frames
+
+    stride = max(1, reference.n_frames // _GEOMETRY_FRAMES)
+    frames: Frames = np.concatenate([s[::stride] for s in reference.segments])
+    finite = np.isfinite(frames).all(axis=(1, 2))
+    return geometry_from_frames(reference.scene, frames[finite])
+
+
+def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry) -> Features:
+    """Measure every frame of `ensemble`, in blocks that stay in the processor's cache."""
+    from systems.geometry import torsion
+    from systems.validity import check_frames
+
+    bonds = np.asarray(geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
+    phi, psi, lengths, flags = [], [], [], []
+    for segment in ensemble.segments:
+        n = len(segment)
+        phi.append(np.empty((n, len(torsions.phi)), dtype=np.float32))
+        psi.append(np.empty((n, len(torsions.psi)), dtype=np.float32))
+        lengths.append(np.empty((n, len(bonds)), dtype=np.float32))
+        flags.append(np.empty(n, dtype=np.uint16))
+        for start in range(0, n, _BLOCK_FRAMES):
+            part = slice(start, min(start + _BLOCK_FRAMES, n))
+            block = segment[part]
+            broken = ~np.isfinite(block).all(axis=(1, 2))
+            with np.errstate(invalid="ignore", over="ignore"):
+                phi[-1][part] = torsion(block, torsions.phi)
+                psi[-1][part] = torsion(block, torsions.psi)
+                vectors = block[:, bonds[:, 1]] - block[:, bonds[:, 0]]
+                lengths[-1][part] = np.sqrt(np.einsum("fbx,fbx->fb", vectors, vectors))
+                flags[-1][part] = check_frames(block, geometry)
+            for series in (phi[-1], psi[-1], lengths[-1]):
+                series[part][broken] = np.nan
+    return Features(ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx)
+
+
+def bond_label(scene: Scene, i: int, j: int) -> str:
+    """Return a bond's name for people: 'C-N (ACE 1 - ALA 2)' or 'CA-HA (ALA 2)'."""
+    a, b = int(scene.residue_of_atom[i]), int(scene.residue_of_atom[j])
+    where = f"{scene.residue_names[a]} {scene.residue_ids[a]}"
+    if a != b:
+        where += f" - {scene.residue_names[b]} {scene.residue_ids[b]}"
+    return f"{scene.atom_names[i]}-{scene.atom_names[j]} ({where})"
+
+
+def first_invalid_ps(features: Features, mask: int) -> float | None:
+    """Return the earliest time in its segment, ps, at which a frame carries any bit of `mask`; None when none does."""
+    times = [int(np.argmax((f & mask) != 0)) * features.lag_ps for f in features.flags if ((f & mask) != 0).any()]
+    return min(times) if times else None

@@ -1,0 +1,142 @@
+"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; and one sentence for the whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+from surrogate.judge.rows import Options, Row, Word
+from surrogate.judge.statistics import holm
+
+Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
+
+_FAILS_AT = 10.0
+_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
+_MENTIONED = 3
+
+
+def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
+    """Return the rows with corrected p-values and a word each.
+
+    agrees: no significant difference (5 % over all rows, Holm), and a difference beyond the tolerance would have shown;
+    close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
+    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
+    """
+    corrected = holm([r.p_value for r in rows])
+    return tuple(
+        replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
+        for row, p in zip(rows, corrected, strict=True)
+    )
+
+
+def _word(row: Row, p: float, significance: float) -> Word:
+    if row.kind == "share":
+        return _share_word(row)
+    value = row.candidate.value
+    if not math.isfinite(value):
+        known = row.reference is None or math.isfinite(row.reference.value)
+        return "fails" if known else "undecided"
+    if not math.isfinite(p):
+        return "undecided"
+    within = _within_tolerance(row)
+    if p < significance:
+        return "close" if within else "differs"
+    if row.kind == "distance":
+        return "agrees" if within else "undecided"
+    return "agrees" if _resolution(row) <= row.tolerance else "undecided"
+
+
+def _within_tolerance(row: Row) -> bool:
+    """A distance is held against the floor (or a bound, where it has no ratio), a number against the reference's."""
+    if row.kind == "distance":
+        measured = row.candidate.value if row.ratio is None else row.ratio.value
+        return measured <= row.tolerance
+    if row.reference is None:
+        return False
+    return abs(row.candidate.value - row.reference.value) <= row.tolerance
+
+
+def _resolution(row: Row) -> float:
+    """The difference that this much data could just have shown: 1.96 combined standard errors."""
+    if row.reference is None:
+        return math.nan
+    combined = math.hypot(row.reference.error, row.candidate.error)
+    if combined == 0.0 and row.tolerance == 0.0:
+        return math.inf
+    return 1.96 * combined
+
+
+def _share_word(row: Row) -> Word:
+    failing = 100.0 - row.candidate.value
+    others = [100.0 - e.value for e in (row.reference, row.replicate) if e is not None]
+    excess = failing - max(others, default=0.0)
+    if not math.isfinite(excess):
+        return "fails"
+    if excess <= 1e-9:
+        return "agrees"
+    if excess <= row.tolerance:
+        return "close"
+    return "differs" if excess <= _FAILS_AT * row.tolerance else "fails"
+
+
+def status(rows: Sequence[Row]) -> Status:
+    """Return the word for the whole: that of the worst row; undecided when most statistical rows are."""
+    words = [r.verdict for r in rows]
+    if "fails" in words:
+        return "broken"
+    if "differs" in words:
+        return "different"
+    statistical = [r.verdict for r in rows if r.kind != "share"]
+    if statistical and statistical.count("undecided") > 0.5 * len(statistical):
+        return "undecided"
+    return "close" if "close" in words else "indistinguishable"
+
+
+def findings(rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return what is wrong, worst first; within one severity validity first, then by how far beyond the tolerance."""
+    bad = [r for r in rows if _SEVERITY[r.verdict] > 0 and r.key != "valid:all"]
+    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.group != "validity", -_excess(r)))
+    return tuple(r.statement for r in bad)
+
+
+def _excess(row: Row) -> float:
+    """How many tolerances off."""
+    value = row.candidate.value
+    if not math.isfinite(value):
+        return math.inf
+    if row.kind == "distance":
+        off = value if row.ratio is None else row.ratio.value - 1.0
+    else:
+        off = abs(value - (100.0 if row.kind == "share" or row.reference is None else row.reference.value))
+    return off / row.tolerance if row.tolerance > 0 else off
+
+
+def sentence(rows: Sequence[Row], found: Sequence[str], compared: str) -> str:
+    """Return the verdict in one or two sentences; `compared` is the compared length in words."""
+    kind = status(rows)
+    n = len(rows)
+    undecided = sum(r.verdict == "undecided" for r in rows)
+    worst = "; ".join(found[:_MENTIONED])
+    more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
+    tail = ""
+    if undecided:
+        tail = f" {undecided} of {n} metrics cannot be decided with this much reference."
+    if kind == "broken":
+        return f"Broken: {worst}{more}.{tail}"
+    if kind == "different":
+        return f"Differs from reference MD over {compared}: {worst}{more}.{tail}"
+    if kind == "close":
+        n_close = sum(r.verdict == "close" for r in rows)
+        verb = "differs" if n_close == 1 else "differ"
+        return (
+            f"Close to reference MD over {compared}: {n_close} of {n} metrics {verb} measurably, each within its "
+            f"tolerance: {worst}{more}.{tail}"
+        )
+    if kind == "undecided":
+        return f"Undecided over {compared}: the error bars are wider than the tolerances.{tail}"
+    return (
+        f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics differs significantly "
+        f"from it.{tail}"
+    )
