@@ -134,7 +134,7 @@ def _match_skeletons(
 
 
 def _walk(scene: Scene, near: list[list[int]], classes: AtomClasses) -> list[tuple[int, int | None]]:
-    """Atoms but terminal hydrogens in breadth-first order, rare classes first, each with the atom it was reached from."""
+    """Atoms but terminal hydrogens in breadth-first order, rare classes first, each with its parent."""
     kept = [i for i in range(scene.n_atoms) if not _is_leaf_hydrogen(scene, near, i)]
     count: dict[int, int] = {}
     for i in kept:

@@ -38,10 +38,14 @@ class AtomRecord:
 
 @dataclass
 class StructureFile:
-    """The first model of a structure file: records in the file's order, CONECT pairs, and what was passed over."""
+    """The first model of a structure file: records in the file's order, CONECT pairs, and what was passed over.
+
+    `chain_ends` holds the atoms that a TER record follows.
+    """
 
     atoms: list[AtomRecord]
     conect: list[tuple[int, int]] = field(default_factory=list)
+    chain_ends: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
 
 
@@ -115,6 +119,8 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
                 repeated.add(atom.serial)
             index_of[atom.serial] = len(found.atoms)
             found.atoms.append(atom)
+        elif record.startswith("TER") and found.atoms and not ended:
+            found.chain_ends.add(len(found.atoms) - 1)
         elif record == "CONECT":
             conect_lines.append(line)
     if n_models > 1:

@@ -40,7 +40,7 @@ def scene_from_records(
         faulty = ", ".join(atom_label(atoms[i]) for i in error.atoms[:4])
         more = f" and {len(error.atoms) - 4} more" if len(error.atoms) > 4 else ""
         raise PreparationError(
-            f"{name}: the bonds of {faulty}{more} fit no valence; give the structure with all hydrogens, "
+            f"the bonds of {faulty}{more} fit no valence; give the structure with all hydrogens, "
             "and with CONECT records if its geometry is unusual."
         ) from error
     residue_of_atom, keys = residue_runs(atoms)

@@ -1,0 +1,266 @@
+"""Bonds of a structure file: from residue templates, CONECT records or distances; and what is missing from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.element_data import covalent_radius_nm
+from systems.errors import PreparationError
+from systems.pdb_records import AtomRecord
+from systems.residues import ResidueTemplate, canonical_heavy_name, template_for
+from systems.structure import atom_label
+
+_PEPTIDE_NM = 0.20
+_DISULFIDE_NM = 0.25
+_HYDROGEN_NM = 0.16
+_TOLERANCE_NM = 0.04
+_COINCIDENT_NM = 0.03
+_CONECT_SLACK_NM = 0.1
+
+
+@dataclass
+class Residue:
+    """All atoms of one residue, wherever they stand in the file. `heavy` is empty when the names fit no template."""
+
+    key: tuple[str, str, str]
+    atoms: list[int]
+    template: ResidueTemplate | None
+    heavy: dict[str, int] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+    lacks_hydrogens: bool = False
+
+    @property
+    def label(self) -> str:
+        return f"{self.key[2]} {self.key[0]}{self.key[1]}"
+
+
+@dataclass
+class Bonding:
+    """Bonds `(n_bonds, 2)`, the residues in the order of the file, and an account of where bonds came from.
+
+    `peptide_bonds` are the pairs (C, N) that join standard residues.
+    """
+
+    bonds: npt.NDArray[np.int64]
+    residues: list[Residue]
+    notes: list[str]
+    peptide_bonds: set[tuple[int, int]]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no standard residue lacks an atom."""
+        return not any(r.missing or r.lacks_hydrogens for r in self.residues)
+
+
+def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -> Bonding:
+    """Return the bonds of these atoms.
+
+    Standard residues take heavy-atom bonds from their template, hydrogens go to the nearest heavy atom, peptide and
+    disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
+    distances within 0.04 nm of the sum of covalent radii if not. Raises PreparationError for atoms that coincide and
+    hydrogens far from everything.
+    """
+    from scipy.spatial import cKDTree
+
+    x = np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0
+    tree = cKDTree(x)
+    near = tree.query_pairs(0.35, output_type="ndarray").reshape(-1, 2)
+    length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d < _COINCIDENT_NM:
+            raise PreparationError(
+                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} stand on one point ({d * 10:.2f} Å apart); "
+                "remove one of them."
+            )
+    residues = _residues(atoms)
+    of_atom = {i: r for r in residues for i in r.atoms}
+    bonds: set[tuple[int, int]] = set()
+    notes: list[str] = []
+    for residue in residues:
+        if residue.heavy and residue.template is not None:
+            names = [*residue.template.bonds, *([("C", "OXT")] if "OXT" in residue.heavy else [])]
+            bonds |= {_pair(residue.heavy[a], residue.heavy[b]) for a, b in names if {a, b} <= set(residue.heavy)}
+    peptide = _peptide_bonds(near, length, of_atom)
+    bonds |= {_pair(c, n) for c, n in peptide}
+    bonds |= _accepted_conect(atoms, x, conect, of_atom, notes)
+    free = _free_atoms(residues, bonds, notes)
+    bonds |= _bonds_by_distance(atoms, near, length, free)
+    bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free)
+    bonds |= _disulfides(atoms, near, length, bonds, of_atom)
+    bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
+    _note_missing(residues, atoms, bonded)
+    return Bonding(bonded, residues, notes, peptide)
+
+
+def _pair(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i < j else (j, i)
+
+
+def _residues(atoms: Sequence[AtomRecord]) -> list[Residue]:
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for i, atom in enumerate(atoms):
+        groups.setdefault(atom.residue_key, []).append(i)
+    residues = []
+    for key, members in groups.items():
+        residue = Residue(key, members, template_for(key[2]))
+        if residue.template is not None:
+            heavy: dict[str, int] = {}
+            fits = True
+            for i in members:
+                if atoms[i].element != "H":
+                    name = canonical_heavy_name(residue.template, atoms[i].name)
+                    fits = fits and name is not None and name not in heavy and name[0] == atoms[i].element
+                    heavy[name or ""] = i
+            if fits:
+                residue.heavy = heavy
+        residues.append(residue)
+    return residues
+
+
+def _peptide_bonds(
+    near: npt.NDArray[np.int64], length: npt.NDArray[np.float64], of_atom: dict[int, Residue]
+) -> set[tuple[int, int]]:
+    best: dict[int, tuple[float, int]] = {}
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d >= _PEPTIDE_NM or of_atom[i] is of_atom[j]:
+            continue
+        for c, n in ((i, j), (j, i)):
+            is_carbonyl = of_atom[c].heavy.get("C") == c and "O" in of_atom[c].heavy
+            if is_carbonyl and of_atom[n].heavy.get("N") == n and d < best.get(c, (1.0, 0))[0]:
+                best[c] = (d, n)
+    return {(c, n) for c, (_, n) in best.items()}
+
+
+def _accepted_conect(
+    atoms: Sequence[AtomRecord],
+    x: npt.NDArray[np.float64],
+    conect: Sequence[tuple[int, int]],
+    of_atom: dict[int, Residue],
+    notes: list[str],
+) -> set[tuple[int, int]]:
+    """CONECT pairs, but those that span impossible distances, and those inside standard residues (templates know)."""
+    accepted = set()
+    too_long = 0
+    for i, j in conect:
+        if of_atom[i] is of_atom[j] and of_atom[i].heavy:
+            continue
+        limit = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _CONECT_SLACK_NM
+        if float(np.linalg.norm(x[i] - x[j])) > limit:
+            too_long += 1
+        else:
+            accepted.add(_pair(i, j))
+    if too_long:
+        notes.append(f"{too_long} CONECT bonds are impossibly long and are ignored")
+    return accepted
+
+
+def _free_atoms(residues: list[Residue], bonds: set[tuple[int, int]], notes: list[str]) -> set[int]:
+    """Atoms whose bonds must come from distances."""
+    bonded = {i for pair in bonds for i in pair}
+    free: set[int] = set()
+    for residue in residues:
+        if residue.heavy:
+            continue
+        if len(residue.atoms) > 1 and all(i in bonded for i in residue.atoms):
+            notes.append(f"{residue.label}: bonds from CONECT records")
+        else:
+            free |= set(residue.atoms)
+            if len(residue.atoms) > 1:
+                notes.append(f"{residue.label}: bonds from distances")
+    return free
+
+
+def _bonds_by_distance(
+    atoms: Sequence[AtomRecord], near: npt.NDArray[np.int64], length: npt.NDArray[np.float64], free: set[int]
+) -> set[tuple[int, int]]:
+    found = set()
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if (i in free or j in free) and "H" not in (atoms[i].element, atoms[j].element):
+            reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
+            if d < reach:
+                found.add((i, j))
+    return found
+
+
+def _hydrogen_bonds_to_parents(
+    atoms: Sequence[AtomRecord],
+    x: npt.NDArray[np.float64],
+    bonds: set[tuple[int, int]],
+    of_atom: dict[int, Residue],
+    free: set[int],
+) -> set[tuple[int, int]]:
+    """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing."""
+    from scipy.spatial import cKDTree
+
+    bonded = {i for pair in bonds for i in pair}
+    heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H"], dtype=np.int64)
+    tree = cKDTree(x[heavy]) if len(heavy) else None
+    found = set()
+    for i, atom in enumerate(atoms):
+        if atom.element != "H" or i in bonded:
+            continue
+        own = np.array([j for j in of_atom[i].atoms if atoms[j].element != "H"], dtype=np.int64)
+        parent, distance = -1, np.inf
+        if i not in free and len(own):
+            gaps = np.linalg.norm(x[own] - x[i], axis=1)
+            parent, distance = int(own[gaps.argmin()]), float(gaps.min())
+        if distance > _HYDROGEN_NM and tree is not None:
+            gap, k = tree.query(x[i])
+            parent, distance = int(heavy[k]), float(gap)
+        if distance > _HYDROGEN_NM:
+            nearest = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
+            raise PreparationError(f"Hydrogen {atom_label(atom)} is {nearest}; correct or remove it.")
+        found.add(_pair(i, parent))
+    return found
+
+
+def _disulfides(
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    bonds: set[tuple[int, int]],
+    of_atom: dict[int, Residue],
+) -> set[tuple[int, int]]:
+    degree: dict[int, int] = {}
+    for pair in bonds:
+        for i in pair:
+            degree[i] = degree.get(i, 0) + 1
+    return {
+        (i, j)
+        for (i, j), d in zip(near.tolist(), length.tolist(), strict=True)
+        if d < _DISULFIDE_NM and all(of_atom[k].heavy.get("SG") == k and degree.get(k, 0) == 1 for k in (i, j))
+    }
+
+
+def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> None:
+    """Fill `missing` and `lacks_hydrogens` of the standard residues."""
+    neighbours: list[list[int]] = [[] for _ in atoms]
+    for i, j in bonds.tolist():
+        neighbours[i].append(j)
+        neighbours[j].append(i)
+
+    def hydrogens(i: int) -> int:
+        return sum(atoms[j].element == "H" for j in neighbours[i])
+
+    for residue in residues:
+        template, heavy = residue.template, residue.heavy
+        if template is None or not heavy:
+            continue
+        residue.missing = [a for a in template.heavy if a not in heavy]
+        needed = dict(template.hydrogens)
+        if template.is_amino_acid and {"N", "C"} <= set(heavy):
+            joined_c = any(atoms[j].element == "N" and j not in residue.atoms for j in neighbours[heavy["C"]])
+            joined_n = any(atoms[j].element == "C" and j not in residue.atoms for j in neighbours[heavy["N"]])
+            if not joined_c and "OXT" not in heavy and not hydrogens(heavy["C"]):
+                residue.missing.append("OXT")
+            needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
+            if template.name == "CYS" and residue.key[2].upper() not in ("CYM", "CYX", "CYS2"):
+                partners = [j for j in neighbours[heavy["SG"]] if atoms[j].element == "S"] if "SG" in heavy else [0]
+                needed["SG"] = 0 if partners else 1
+        residue.lacks_hydrogens = any(hydrogens(heavy[a]) < n for a, n in needed.items() if a in heavy)
+        if template.name == "HIS" and {"ND1", "NE2"} <= set(heavy):
+            residue.lacks_hydrogens |= not (hydrogens(heavy["ND1"]) or hydrogens(heavy["NE2"]))

@@ -1,0 +1,189 @@
+"""A Scene from what the user names: a library system, a PDB or mmCIF file, or a peptide sequence."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from systems.bonding import Bonding, Residue, find_bonds
+from systems.errors import InputError, PreparationError, SurromdError
+from systems.pdb_records import AtomRecord, read_structure
+from systems.residues import is_water
+from systems.scene import Scene
+from systems.structure import scene_from_records
+
+_FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
+_OTHER_SUFFIXES = (".sdf", ".mol", ".mol2", ".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
+_COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
+
+
+def prepare(spec: str, *, ph: float = 7.0) -> Scene:
+    """Return the scene that `spec` names: `alanine-dipeptide`, `molecule.pdb`, `sequence:ACE-ALA-NME`.
+
+    Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
+    line each, in `scene.provenance["repairs"]`. `ph` decides the protonation where hydrogens are missing.
+    Raises UnknownNameError, InputError or PreparationError, each in one line.
+    """
+    from systems import library
+
+    if not 0.0 <= ph <= 14.0:
+        raise InputError(f"pH {ph:g} lies outside 0 to 14.")
+    text = str(spec).strip()
+    kind, _, rest = text.partition(":")
+    if kind.lower() == "sequence":
+        from systems.sequence import build_peptide
+
+        return build_peptide(rest, ph=ph)
+    if kind.lower() == "smiles":
+        raise InputError("SMILES input is not supported yet; give a PDB file with all hydrogens and CONECT records.")
+    path = Path(text).expanduser()
+    if text in library.names():
+        return library.load(text)
+    suffix = path.suffix.lower()
+    if suffix in _OTHER_SUFFIXES:
+        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB or mmCIF.")
+    if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
+        return prepare_file(path, ph=ph)
+    return library.load(text)
+
+
+def prepare_file(path: Path, *, ph: float = 7.0) -> Scene:
+    """Return the scene of a PDB or mmCIF file; see `prepare`."""
+    try:
+        return _prepare_file(path, ph)
+    except PreparationError as error:
+        if str(path) in str(error):
+            raise
+        raise PreparationError(f"{path}: {error}") from error
+    except SurromdError:
+        raise
+
+
+def _prepare_file(path: Path, ph: float) -> Scene:
+    found = read_structure(path)
+    repairs = list(found.notes)
+    kept = _choose_alternates(found.atoms, repairs)
+    kept = _without_water(found.atoms, kept, repairs)
+    atoms = [found.atoms[i] for i in kept]
+    new_index = {old: new for new, old in enumerate(kept)}
+    conect = [(new_index[i], new_index[j]) for i, j in found.conect if i in new_index and j in new_index]
+    bonding = find_bonds(atoms, conect)
+    repairs += bonding.notes
+    _refuse_gaps(bonding, atoms, {new_index[i] for i in found.chain_ends if i in new_index})
+    bonds = bonding.bonds
+    if not bonding.is_complete:
+        _refuse_beyond_repair(bonding, atoms)
+        from systems.repair import complete
+
+        atoms, bonds, account = complete(atoms, bonding, ph=ph)
+        repairs += account
+    else:
+        _refuse_bare_skeletons(bonding.residues, atoms)
+    scene = scene_from_records(
+        atoms,
+        bonds,
+        name=path.name.removesuffix(".gz").rsplit(".", 1)[0],
+        provenance={
+            "source": "file",
+            "file": path.name,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "ph": ph,
+            "repairs": repairs,
+        },
+    )
+    _refuse_long_double_bonds(scene)
+    return scene
+
+
+def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[int]:
+    """Indices of the atoms that stay: of alternate locations, each residue's most occupied."""
+    occupancy: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for atom in atoms:
+        if atom.altloc:
+            occupancy.setdefault((atom.chain, atom.residue_id), {}).setdefault(atom.altloc, []).append(atom.occupancy)
+    chosen = {k: max(v, key=lambda a: (sum(v[a]) / len(v[a]), -ord(a[0]))) for k, v in occupancy.items()}
+    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[a.chain, a.residue_id] == a.altloc]
+    if len(kept) < len(atoms):
+        labels = ", ".join(f"{c}{r}:{a}" for (c, r), a in list(chosen.items())[:6]) + (
+            " ..." if len(chosen) > 6 else ""
+        )
+        repairs.append(
+            f"alternate locations in {len(chosen)} residues: the most occupied kept ({labels}), "
+            f"{len(atoms) - len(kept)} atoms left out"
+        )
+    return kept
+
+
+def _without_water(atoms: Sequence[AtomRecord], kept: list[int], repairs: list[str]) -> list[int]:
+    dry = [i for i in kept if not is_water(atoms[i].residue_name)]
+    if not dry or len(dry) == len(kept):
+        return kept
+    n = len({atoms[i].residue_key for i in kept} - {atoms[i].residue_key for i in dry})
+    repairs.append(f"{n} water molecules left out")
+    return dry
+
+
+def _refuse_gaps(bonding: Bonding, atoms: Sequence[AtomRecord], chain_ends: set[int]) -> None:
+    """Neighbours in one chain, neither an end by its atoms, a cap or TER, whose C and N no bond joins."""
+    bonded_n = {i for pair in bonding.peptide_bonds for i in pair}
+    for before, residue in pairwise(bonding.residues):
+        c, n = before.heavy.get("C", -1), residue.heavy.get("N", -1)
+        if min(c, n) < 0 or {c, n} & bonded_n or before.key[0] != residue.key[0] or chain_ends & set(before.atoms):
+            continue
+        names = (before.template.name if before.template else "", residue.template.name if residue.template else "")
+        if all(names) and names[0] not in ("NME", "NH2") and names[1] != "ACE" and "OXT" not in before.heavy:
+            gap = np.linalg.norm(np.subtract(atoms[c].position_angstrom, atoms[n].position_angstrom))
+            raise PreparationError(
+                f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart); "
+                "fill the gap, or end the chain there with caps or a TER record."
+            )
+
+
+def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
+    for residue in bonding.residues:
+        if residue.template is None or not residue.heavy:
+            if len(residue.atoms) == 1 and atoms[residue.atoms[0]].element != "C":
+                continue
+            short = next(r for r in bonding.residues if r.missing or r.lacks_hydrogens)
+            raise PreparationError(
+                f"{short.label} lacks atoms that cannot be added beside {residue.label}, which is no standard residue; "
+                "give the structure with all atoms and hydrogens."
+            )
+        essential = [a for a in ("N", "CA", "C") if a in residue.template.heavy and a in residue.missing]
+        if essential:
+            raise PreparationError(
+                f"{residue.label} has only {' '.join(residue.heavy)} of its heavy atoms; "
+                "give a structure with at least the whole backbone."
+            )
+
+
+def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:
+    """A molecule without any hydrogen is most often a file without hydrogens, and would get absurd double bonds."""
+    for residue in residues:
+        symbols = [atoms[i].element for i in residue.atoms]
+        if residue.heavy or "C" not in symbols or "H" in symbols:
+            continue
+        if len(symbols) > 3 and not (
+            {"F", "Cl", "Br", "I"} & set(symbols) and set(symbols) <= _COMPLETE_WITHOUT_HYDROGEN
+        ):
+            raise PreparationError(
+                f"{residue.label} has no hydrogens and is no standard amino acid; add them first (for instance "
+                "`obabel in.pdb -O out.pdb -h`)."
+            )
+
+
+def _refuse_long_double_bonds(scene: Scene) -> None:
+    """Two carbons that each lack a hydrogen look like a double bond; its length tells."""
+    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
+        if order >= 2 and scene.elements[i] == scene.elements[j] == "C":
+            length = float(np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j]))
+            if length > 0.150:
+                a, b = (f"{scene.residue_names[scene.residue_of_atom[k]]} {scene.atom_names[k]}" for k in (i, j))
+                raise PreparationError(
+                    f"{a} and {b} lack hydrogens (a double bond of {length * 10:.2f} Å is none); "
+                    "give the structure with all hydrogens."
+                )

@@ -1,0 +1,228 @@
+"""Missing heavy atoms and hydrogens of standard residues, added by PDBFixer and OpenMM."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+from collections.abc import Iterator, Sequence
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.bonding import Bonding, Residue
+from systems.errors import PreparationError
+from systems.pdb_records import AtomRecord
+from systems.structure import atom_label
+
+_CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
+
+
+def complete(
+    atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float
+) -> tuple[list[AtomRecord], npt.NDArray[np.int64], list[str]]:
+    """Return atoms, bonds and an account of what was added to structures of standard residues.
+
+    Heavy atoms of the file keep their positions; hydrogens of residues that had all of theirs keep them too, the others
+    get new ones, in the protonation that the file shows or, where it shows none, the usual one at `ph`. Names become
+    the standard ones, residues stand in chain order. Raises PreparationError when PDBFixer cannot complete the
+    structure.
+    """
+    from openmm import Platform, app, unit
+    from pdbfixer import PDBFixer
+
+    chains = _chains(bonding)
+    residues = [r for chain in chains for r in chain]
+    text = _heavy_atom_text(atoms, chains)
+    variants = [variant_of(residue, atoms, bonding.bonds) for residue in residues]
+    reference = Platform.getPlatformByName("Reference")
+    try:
+        with fixed_random_numbers():
+            fixer = PDBFixer(pdbfile=io.StringIO(text), platform=reference)
+            fixer.missingResidues = {}
+            fixer.findMissingAtoms()
+            fixer.addMissingAtoms(seed=1)
+            modeller = app.Modeller(fixer.topology, fixer.positions)
+            modeller.addHydrogens(pH=ph, variants=variants, platform=reference)
+    except Exception as error:  # PDBFixer and OpenMM raise bare Exceptions, KeyErrors and ValueErrors alike
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise PreparationError(f"PDBFixer could not complete the structure ({reason}).") from error
+    positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
+    records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
+    _refuse_lost_bonds(records, bonds, atoms, bonding)
+    records = _keep_hydrogens(records, bonds, atoms, bonding)
+    return records, bonds, _account(residues, records)
+
+
+def records_from_openmm(
+    topology: Any, positions_nm: npt.NDArray[np.float64], keys: Sequence[tuple[str, str, str]]
+) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
+    """Return records and bonds of an OpenMM topology whose residues are `keys` (chain, number, name), in that order."""
+    records = []
+    for residue, (chain, number, name) in zip(topology.residues(), keys, strict=True):
+        for atom in residue.atoms():
+            x, y, z = (positions_nm[atom.index] * 10.0).tolist()
+            records.append(
+                AtomRecord(
+                    serial=str(atom.index + 1),
+                    name=atom.name,
+                    altloc="",
+                    residue_name=name,
+                    chain=chain,
+                    residue_id=number,
+                    position_angstrom=(x, y, z),
+                    occupancy=1.0,
+                    element=atom.element.symbol,
+                    hetero=False,
+                )
+            )
+    bonds = {(min(a.index, b.index), max(a.index, b.index)) for a, b in topology.bonds()}
+    return records, np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
+
+
+@contextlib.contextmanager
+def fixed_random_numbers() -> Iterator[None]:
+    """Make OpenMM's Modeller, which draws from Python's global generator, repeatable; then puts it back."""
+    state = random.getstate()
+    random.seed(1)
+    try:
+        yield
+    finally:
+        random.setstate(state)
+
+
+def variant_of(residue: Residue, atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> str | None:
+    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
+    name = residue.key[2].upper()
+    named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
+    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN", "CYX"):
+        return named
+    if named == "CYM":
+        return "CYX"
+    template = residue.template
+    if template is None or template.name not in ("HIS", "ASP", "GLU", "LYS"):
+        return None
+    near: dict[int, int] = dict.fromkeys(residue.heavy.values(), 0)
+    for i, j in bonds.tolist():
+        for a, b in ((i, j), (j, i)):
+            if a in near and atoms[b].element == "H":
+                near[a] += 1
+    count = {a: near[i] for a, i in residue.heavy.items()}
+    if template.name == "HIS":
+        return {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}.get((count.get("ND1", 0), count.get("NE2", 0)))
+    if template.name == "LYS":
+        return {2: "LYN", 3: "LYS"}.get(count.get("NZ", 0))
+    ends = sum(count.get(a, 0) for a in ("OD1", "OD2", "OE1", "OE2"))
+    if ends:
+        return "ASH" if template.name == "ASP" else "GLH"
+    return template.name if not residue.lacks_hydrogens else None
+
+
+def _chains(bonding: Bonding) -> list[list[Residue]]:
+    """Residues as peptide bonds join them, from first to last, whatever their order in the file."""
+    of_atom = {i: k for k, r in enumerate(bonding.residues) for i in r.atoms}
+    following = {of_atom[c]: of_atom[n] for c, n in bonding.peptide_bonds}
+    chains: list[list[Residue]] = []
+    for start in range(len(bonding.residues)):
+        if start in following.values():
+            continue
+        chain, k = [], start
+        while k >= 0:
+            chain.append(bonding.residues[k])
+            k = following.get(k, -1)
+        chains.append(chain)
+    if sum(map(len, chains)) != len(bonding.residues):
+        raise PreparationError("a cyclic peptide lacks atoms, which is not repaired; give it with all hydrogens.")
+    return chains
+
+
+def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Residue]]) -> str:
+    lines: list[str] = []
+    number = 0
+    for k, chain in enumerate(chains):
+        letter = _CHAIN_LETTERS[k % len(_CHAIN_LETTERS)]
+        for residue in chain:
+            number += 1
+            name_of = {i: a for a, i in residue.heavy.items()}
+            residue_name = residue.template.name if residue.template is not None else residue.key[2]
+            for i in residue.atoms:
+                atom = atoms[i]
+                if atom.element == "H":
+                    continue
+                name = name_of.get(i, atom.name)
+                padded = name[:4] if len(name) >= 4 or len(atom.element) == 2 else f" {name}"
+                head = f"ATOM  {len(lines) % 100000:5d} {padded:<4s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
+                x, y, z = atom.position_angstrom
+                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {atom.element.upper():>2s}")
+        lines.append("TER")
+    return "\n".join([*lines, "END", ""])
+
+
+def _refuse_lost_bonds(
+    records: Sequence[AtomRecord],
+    bonds: npt.NDArray[np.int64],
+    atoms: Sequence[AtomRecord],
+    bonding: Bonding,
+) -> None:
+    """Every heavy-atom bond of the file must be there after the repair: cross-links other than disulfides are not."""
+    name_of = {i: (r.key, a) for r in bonding.residues for a, i in r.heavy.items()}
+    made = {frozenset((a.residue_key, a.name) for a in (records[i], records[j])) for i, j in bonds.tolist()}
+    for i, j in bonding.bonds.tolist():
+        if i in name_of and j in name_of and frozenset((name_of[i], name_of[j])) not in made:
+            raise PreparationError(
+                f"atoms are missing, and the bond {atom_label(atoms[i])} - {atom_label(atoms[j])} would be lost in "
+                "adding them; give the structure with all hydrogens."
+            )
+
+
+def _keep_hydrogens(
+    records: list[AtomRecord], bonds: npt.NDArray[np.int64], atoms: Sequence[AtomRecord], bonding: Bonding
+) -> list[AtomRecord]:
+    """Put the file's hydrogens back where a heavy atom has as many as before."""
+    from dataclasses import replace
+
+    whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
+    old_at: dict[int, list[int]] = {}
+    for i, j in bonding.bonds.tolist():
+        for a, b in ((i, j), (j, i)):
+            if atoms[b].element == "H":
+                old_at.setdefault(a, []).append(b)
+    new_at: dict[int, list[int]] = {}
+    for i, j in bonds.tolist():
+        for a, b in ((i, j), (j, i)):
+            if records[b].element == "H":
+                new_at.setdefault(a, []).append(b)
+    out = list(records)
+    for parent, new in new_at.items():
+        residue = whole.get(records[parent].residue_key)
+        old = old_at.get(residue.heavy.get(records[parent].name, -1), []) if residue is not None else []
+        if len(old) != len(new):
+            continue
+        chosen = min(permutations(old), key=lambda p: _distance(p, new, atoms, records))
+        for a, b in zip(new, chosen, strict=True):
+            out[a] = replace(records[a], position_angstrom=atoms[b].position_angstrom)
+    return out
+
+
+def _distance(old: Sequence[int], new: Sequence[int], atoms: Sequence[AtomRecord], records: list[AtomRecord]) -> float:
+    gaps = [
+        np.subtract(atoms[i].position_angstrom, records[j].position_angstrom) for i, j in zip(old, new, strict=True)
+    ]
+    return float(np.square(gaps).sum())
+
+
+def _account(residues: Sequence[Residue], records: Sequence[AtomRecord]) -> list[str]:
+    notes = []
+    for residue in residues:
+        if residue.missing:
+            end = " (the chain ends here, as a carboxylate)" if "OXT" in residue.missing else ""
+            notes.append(f"{residue.label}: added {' '.join(residue.missing)}{end}")
+    short = [r.label for r in residues if r.lacks_hydrogens]
+    if short:
+        of_short = {r.key for r in residues if r.lacks_hydrogens}
+        n = sum(a.element == "H" and a.residue_key in of_short for a in records)
+        which = ", ".join(short[:6]) + (f" and {len(short) - 6} more residues" if len(short) > 6 else "")
+        notes.append(f"hydrogens placed on {which}: {n}")
+    return notes
