@@ -241,15 +241,18 @@ def train(
         return out
     paths = find_trajectories(references)
 
-    from surrogate.data.frames import collect_frames, is_windows_file, load_frames
+    from surrogate.data.frames import collect_frames, load_frames
+    from surrogate.describe import is_windows
     from surrogate.models.lam_slide.config import LamSlideConfig
     from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 
     model_config = LamSlideConfig() if config is None else LamSlideConfig.from_toml(config)
-    in_windows = [is_windows_file(path) for path in paths]
+    in_windows = [is_windows(path) for path in paths]
     if any(in_windows) and len(paths) > 1:
         raise InputError("give either trajectories or one windows file to train on.")
     frames = load_frames(paths[0]) if any(in_windows) else collect_frames(paths, canonical=model_config.canonical)
+    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+        frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
     first = None if steps is None else max(1, round(steps * STAGE_ONE_SHARE))
     settings = TrainingConfig(
         budget_s=budget_s,

@@ -374,9 +374,10 @@ def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
         if isinstance(value, dict):
             typer.echo(f"{margin}{key}")
             _print_pairs(value, indent + 2)
-        elif isinstance(value, (list, tuple)) and any(isinstance(v, str) and " " in v for v in value):
+        elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
             typer.echo(f"{margin}{key}")
-            for line in value:
+            for entry in value:
+                line = ", ".join(f"{k} {_plain(v)}" for k, v in entry.items()) if isinstance(entry, dict) else entry
                 typer.echo(f"{margin}  {line}")
         else:
             text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
@@ -413,6 +414,8 @@ def _print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet:
             typer.echo(f"  {row.metric[:44]:<44} {numbers} {row.unit:<8} {row.verdict}")
         if judgement.speed_ratio is not None:
             typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
+        for note in judgement.notes:
+            typer.echo(f"  note: {note}")
     for note in () if quiet else result.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"report: {report}")

@@ -18,7 +18,7 @@ def describe_file(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".safetensors":
         return _weights(path)
-    if path.suffix.lower() in (".h5", ".hdf5") and _is_windows(path):
+    if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path):
         return _windows(path)
     return _trajectory(path)
 
@@ -55,10 +55,14 @@ def _trajectory(path: Path) -> dict[str, Any]:
     }
 
 
-def _is_windows(path: Path) -> bool:
+def is_windows(path: Path) -> bool:
+    """True for a windows file; a damaged file is none, so that opening it as a trajectory says what is wrong."""
     from surrogate.data.frames import is_windows_file
 
-    return is_windows_file(path)
+    try:
+        return is_windows_file(path)
+    except OSError:
+        return False
 
 
 def _windows(path: Path) -> dict[str, Any]:

@@ -36,20 +36,25 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
         TimeRemainingColumn(compact=True),
         TextColumn("left"),
     )
+    bar = Progress(*columns, console=Console(stderr=True))
     first: tuple[int, float] | None = None
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(label, total=None, note="")
+    task = bar.add_task(label, total=None, note="")
 
-        def advance(done: int, total: int, note: str | None = None) -> None:
-            nonlocal first
-            now = time.monotonic()
-            if first is None:
-                first = (done, now)
-            rate = (done - first[0]) / (now - first[1]) if now > first[1] else 0.0
-            text = _note(done, total, rate, ps_per_frame) if note is None else note
-            bar.update(task, completed=done, total=total, note=text)
+    def advance(done: int, total: int, note: str | None = None) -> None:
+        nonlocal first
+        now = time.monotonic()
+        if first is None:
+            first = (done, now)
+            bar.start()  # only now, so that input refused by the verb leaves no empty bar behind
+        rate = (done - first[0]) / (now - first[1]) if now > first[1] else 0.0
+        text = _note(done, total, rate, ps_per_frame) if note is None else note
+        bar.update(task, completed=done, total=total, note=text)
 
+    try:
         yield advance
+    finally:
+        if first is not None:
+            bar.stop()
 
 
 def _note(done: int, total: int, per_s: float, ps_per_frame: float | None) -> str:

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typer.testing import CliRunner
 
 from surrogate import api
 from surrogate.cli import app
+from systems.errors import SurromdError
 
 COMMANDS = ["demo", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli"]
@@ -49,9 +49,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A reference trajectory of 20 frames, made once through the command line."""
+    """A reference trajectory of 200 frames, made once through the command line."""
     path = tmp_path_factory.mktemp("short") / "ref.h5"
-    result = run("reference", "alanine-dipeptide", "--time", "2ps", "--save-every", "100fs", "-o", str(path))
+    result = run("reference", "alanine-dipeptide", "--time", "20ps", "--save-every", "100fs", "-o", str(path))
     assert result.exit_code == 0, result.stderr
     return path
 
@@ -226,12 +226,12 @@ def test_plan_says_what_is_skipped() -> None:
 
 def test_reference_to_json_and_info(short_run: Path) -> None:
     found = json.loads(run("info", str(short_run), "--json").stdout)
-    assert found["n_frames"] == 20
+    assert found["n_frames"] == 200
     assert found["n_atoms"] == 22
     assert found["save_every_ps"] == pytest.approx(0.1)
     assert found["record"]["force_field"] == "ff14SB"
     text = run("info", str(short_run))
-    assert "20 frames of 22 atoms" in text.stdout
+    assert "200 frames of 22 atoms" in text.stdout
 
 
 def test_replicas_are_numbered_and_differ(here: Path) -> None:
@@ -267,14 +267,21 @@ def test_compare_writes_both_reports(here: Path, tmp_path_factory: pytest.TempPa
     )
 
 
+def _n_frames(path: Path) -> int:
+    """Frames in a file that another process may be writing; 0 while there is none to read."""
+    try:
+        return int(api.info(path)["n_frames"])
+    except SurromdError:
+        return 0
+
+
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
-    arguments = ["reference", "alanine-dipeptide", "--time", "200ns", "--save-every", "1ps", "-o", "x.h5", "--quiet"]
+    arguments = ["reference", "alanine-dipeptide", "--time", "20ns", "--save-every", "100fs", "-o", "x.h5", "--quiet"]
     with subprocess.Popen([*SURROMD, *arguments], stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and not (here / "x.h5").exists():
-            time.sleep(0.1)
-        time.sleep(1.0)
+        while time.monotonic() < deadline and not _n_frames(here / "x.h5"):
+            time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -285,7 +292,103 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
     assert f"{kept['n_frames']} frames" in stderr
 
 
-def test_windows_train_and_rollout(here: Path, short_run: Path) -> None:
-    shutil.copy(short_run, here / "ref.h5")
-    assert run("windows", "ref.h5", "-o", "w.h5", "--quiet").exit_code == 0
-    assert json.loads(run("info", "w.h5", "--json").stdout)["type"] == "windows"
+TINY = """
+[autoencoder]
+n_latents = 1
+latent_dim = 8
+width = 16
+n_heads = 2
+head_dim = 8
+identifier_dim = 8
+
+[approximator]
+chunk_frames = 8
+width = 16
+n_layers = 1
+n_heads = 2
+"""
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(short_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a network far too small to be any good, trained for a few steps through the command line."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.toml").write_text(TINY)
+    windows, weights = folder / "windows.h5", folder / "tiny.safetensors"
+    made = run("windows", str(short_run), "-o", str(windows), "--quiet")
+    assert made.exit_code == 0, made.stderr
+    trained = run(
+        *["train", str(windows), "--config", str(folder / "tiny.toml"), "--steps", "6", "--quiet"],
+        *["-o", str(weights)],
+    )
+    assert trained.exit_code == 0, trained.stderr
+    return weights
+
+
+def test_windows_and_weights_say_what_they_are(tiny_weights: Path) -> None:
+    windows = json.loads(run("info", str(tiny_weights.with_name("windows.h5")), "--json").stdout)
+    assert windows["type"] == "windows"
+    assert windows["n_frames"] == 200
+    weights = json.loads(run("info", str(tiny_weights), "--json").stdout)
+    assert weights["type"] == "weights"
+    assert weights["config"]["approximator"]["chunk_frames"] == 8
+    assert weights["conditions"]["force_field"] == "ff14SB"
+    assert weights["lag_ps"] == pytest.approx(0.1)
+
+
+def test_training_twice_needs_overwrite(here: Path, tiny_weights: Path, short_run: Path) -> None:
+    before = tiny_weights.read_bytes()
+    assert "--overwrite" in refused(run("train", str(short_run), "--steps", "6", "-o", str(tiny_weights)))
+    assert tiny_weights.read_bytes() == before
+
+
+def test_a_reference_too_short_to_train_on_leaves_nothing(here: Path, short_run: Path) -> None:
+    (here / "long.toml").write_text("[approximator]\nchunk_frames = 64\n")
+    message = refused(run("train", str(short_run), "--config", "long.toml", "--steps", "6", "-o", "w.safetensors"))
+    assert "64 frames" in message
+    assert [p.name for p in here.iterdir()] == ["long.toml"]
+
+
+def test_an_unknown_setting_is_named_with_its_nearest(here: Path, short_run: Path) -> None:
+    (here / "typo.toml").write_text("[approximator]\nchunk_frame = 64\n")
+    message = refused(run("train", str(short_run), "--config", "typo.toml", "--steps", "6", "-o", "w.safetensors"))
+    assert "Did you mean 'chunk_frames'?" in message
+
+
+def test_damaged_weights_are_refused(here: Path, tiny_weights: Path) -> None:
+    whole = tiny_weights.read_bytes()
+    (here / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
+    assert "cut.safetensors" in refused(run("info", "cut.safetensors"))
+    message = refused(
+        run("rollout", "alanine-dipeptide", "--weights", "cut.safetensors", "--time", "1ns", "-o", "x.h5")
+    )
+    assert "cut.safetensors" in message
+    assert [p.name for p in here.iterdir()] == ["cut.safetensors"]
+
+
+def test_rollout_streams_replicas_and_marks_chunks(here: Path, tiny_weights: Path) -> None:
+    result = run(
+        *["rollout", "alanine-dipeptide", "--weights", str(tiny_weights), "--time", "2ps", "--replicas", "2"],
+        *["-o", "x.h5", "--json", "--quiet"],
+    )
+    assert result.exit_code == 0, result.stderr
+    records = json.loads(result.stdout)
+    assert [Path(r["file"]).name for r in records] == ["x_r0.h5", "x_r1.h5"]
+    assert [r["n_frames"] for r in records] == [20, 20]
+    assert all(r["type"] == "rollout trajectory" and r["invalid_frames"] is not None for r in records)
+
+
+def test_rollout_is_the_same_under_one_seed_and_differs_under_another(here: Path, tiny_weights: Path) -> None:
+    from systems.trajectory import open_trajectory
+
+    frames = []
+    for name, seed in (("a.h5", "1"), ("b.h5", "1"), ("c.h5", "2")):
+        result = run(
+            *["rollout", "alanine-dipeptide", "--weights", str(tiny_weights), "--time", "2ps", "--seed", seed],
+            *["-o", name, "--quiet"],
+        )
+        assert result.exit_code == 0, result.stderr
+        with open_trajectory(name) as reader:
+            frames.append(reader.read())
+    assert (frames[0] == frames[1]).all()
+    assert abs(frames[0] - frames[2]).max() > 1e-3
