@@ -40,9 +40,9 @@ class AtomicFile:
     data which never arrived, and then the whole file is lost. Given to h5py as its file object, this class collects the
     writes of one append and puts them out in an order in which every prefix is a readable file: first what lies beyond
     the old end of the file (nothing refers to it yet; if the disk fills here, the file is cut back and is byte for byte
-    what it was), then the superblock (end of file), then index nodes from the root down, then data inside old chunks and
-    the object headers, which hold the lengths, and names last. No space is needed after the first step. A transaction
-    that shortens the file (`shrinks`) goes the other way: lengths first.
+    what it was), then the superblock (end of file), then index nodes from the root down, then data inside old chunks
+    and the object headers, which hold the lengths, and names last. No space is needed after the first step. A
+    transaction that shortens the file (`shrinks`) goes the other way: lengths first.
 
     One writer at a time: an advisory POSIX lock, which leaves HDF5 readers of the running file alone.
     Raises TrajectoryError when another process writes the file, StorageError when it cannot be opened for writing.

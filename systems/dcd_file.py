@@ -22,6 +22,7 @@ from systems.frame_store import (
     add_column,
     consistent_length,
     create_store,
+    damage_reported,
     get_json,
     open_hdf5,
     refuse_existing,
@@ -161,13 +162,13 @@ class DcdReader(TrajectoryReader):
         self.n_atoms = layout.n_atoms
         pdb, meta = companions(path)
         if meta.exists():
-            with open_hdf5(meta) as file:
+            with open_hdf5(meta) as file, damage_reported(meta):
                 if "surromd" not in file:
                     raise TrajectoryError(f"{meta} is not the record of {path.name}; move it to read the DCD alone.")
                 self.n_frames = consistent_length(file, meta)
                 self.time_ps, self.flags, self.chunk_idx, self.scalars = read_columns(file, meta, self.n_frames)
-                self.record = get_json(file, "surromd/record", meta)
-                self.scene = Scene.from_dict(get_json(file, "surromd/scene", meta))
+                self.record = get_json(file, "surromd/record")
+                self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
                 in_flight = int(file["surromd"].attrs["largest_append"])
             _check_against_meta(path, layout, self.n_frames, in_flight)
             if top is not None:
@@ -254,7 +255,8 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
         if n_atoms < 1:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        interval_ps = float(delta) * AKMA_PS * max(int(fields[2]), 1)
+        # The time step is float32: digits beyond its seventh are noise.
+        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
         if not (np.isfinite(interval_ps) and interval_ps > 0):
             interval_ps = 1.0
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)

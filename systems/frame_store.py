@@ -11,7 +11,8 @@ import io
 import json
 import os
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -78,12 +79,19 @@ def set_text(group: h5py.Group, name: str, text: str, capacity: int = 0) -> None
     group[name][()] = np.bytes_(data)
 
 
-def get_json(file: h5py.File, name: str, path: Path) -> Any:
-    """Return the JSON value of a text dataset. Raises TrajectoryError when it is missing or damaged."""
+@contextmanager
+def damage_reported(path: Path) -> Iterator[None]:
+    """Turn whatever HDF5 and NumPy raise on a damaged file into a TrajectoryError of one line."""
     try:
-        return json.loads(file[name][()])
-    except (KeyError, ValueError, TypeError, OSError, RuntimeError) as error:
-        raise TrajectoryError(f"{path} is damaged: its {name} cannot be read ({error}).") from error
+        yield
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise TrajectoryError(f"{path} is damaged ({reason}); restore it from a whole copy.") from error
+
+
+def get_json(file: h5py.File, name: str) -> Any:
+    """Return the JSON value of a text dataset. Raises KeyError or ValueError when it is missing or damaged."""
+    return json.loads(file[name][()])
 
 
 def create_store(
@@ -161,21 +169,16 @@ def consistent_length(file: h5py.File, path: Path) -> int:
     Columns may differ by one append in flight (a writer that was killed); the frames behind the shortest are not
     counted. Raises TrajectoryError for any other difference and for blocks of data that are missing.
     """
-    try:
-        columns = {name: file[name] for name in column_names(file)}
-        lengths = {name: int(column.shape[0]) for name, column in columns.items()}
-        in_flight = int(file["surromd"].attrs["largest_append"]) if "surromd" in file else 0
-        shortest, longest = min(lengths.values()), max(lengths.values())
-        if longest - shortest > in_flight:
-            listed = ", ".join(f"/{name} {n}" for name, n in lengths.items())
-            raise TrajectoryError(f"{path} is damaged: its columns differ in length ({listed} frames).")
-        for name, column in columns.items():
-            if column.chunks and "surromd" in file:
-                stored = column.id.get_num_chunks()
-                if stored < -(-shortest // column.chunks[0]):
-                    raise TrajectoryError(f"{path} is damaged: blocks of /{name} are missing.")
-    except (KeyError, ValueError, OSError, RuntimeError, AttributeError, IndexError) as error:
-        raise TrajectoryError(f"{path} is damaged: {str(error).splitlines()[0]}.") from error
+    columns = {name: file[name] for name in column_names(file)}
+    lengths = {name: int(column.shape[0]) for name, column in columns.items()}
+    in_flight = int(file["surromd"].attrs["largest_append"]) if "surromd" in file else 0
+    shortest, longest = min(lengths.values()), max(lengths.values())
+    if longest - shortest > in_flight:
+        listed = ", ".join(f"/{name} {n}" for name, n in lengths.items())
+        raise TrajectoryError(f"{path} is damaged: its columns differ in length ({listed} frames).")
+    for name, column in columns.items():
+        if column.chunks and "surromd" in file and column.id.get_num_chunks() < -(-shortest // column.chunks[0]):
+            raise TrajectoryError(f"{path} is damaged: blocks of /{name} are missing.")
     return shortest
 
 
@@ -198,18 +201,24 @@ class FrameStore:
         # At exit too: HDF5 must not call into a file object that the interpreter has already taken apart.
         self._close = weakref.finalize(self, _close, self.file, self._atomic)
         try:
-            if "surromd" not in self.file:
-                raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
-            self.scene = Scene.from_dict(get_json(self.file, "surromd/scene", path))
-            self.record: dict[str, Any] = get_json(self.file, "surromd/record", path)
-            self.n_frames = consistent_length(self.file, path)
-            self.largest_append = int(self.file["surromd"].attrs["largest_append"])
-            self._columns.update({name: self.file[name] for name in column_names(self.file)})
+            with damage_reported(path):
+                self._read_headers()
             if any(len(column) != self.n_frames for column in self._columns.values()):
                 self.truncate(self.n_frames)  # what a crash left behind the last whole append
         except BaseException:
             self.close()
             raise
+
+    def _read_headers(self) -> None:
+        if "surromd" not in self.file:
+            raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
+        self.scene = Scene.from_dict(get_json(self.file, "surromd/scene"))
+        self.record: dict[str, Any] = get_json(self.file, "surromd/record")
+        self.n_frames = consistent_length(self.file, self.path)
+        self.largest_append = int(self.file["surromd"].attrs["largest_append"])
+        self._columns.update({name: self.file[name] for name in column_names(self.file)})
+        if not {"time", "surromd/chunk_idx"} <= set(self._columns):
+            raise TrajectoryError(f"{self.path} is damaged: it lacks columns.")
 
     @property
     def last_time_ps(self) -> float | None:

@@ -21,6 +21,7 @@ from systems.frame_store import (
     add_column,
     consistent_length,
     create_store,
+    damage_reported,
     get_json,
     open_hdf5,
     program_version,
@@ -93,27 +94,31 @@ class Hdf5Reader(TrajectoryReader):
         self.path = path
         self._file = open_hdf5(path)
         try:
-            if "coordinates" not in self._file:
-                raise TrajectoryError(f"{path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
-            self.n_frames = consistent_length(self._file, path)
-            self._coordinates = self._file["coordinates"]
-            if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
-                raise TrajectoryError(f"{path}: /coordinates has shape {self._coordinates.shape}, not (n, n_atoms, 3).")
-            self._scale = _nm_per_unit(self._coordinates, path)
-            self.n_atoms = int(self._coordinates.shape[1])
-            columns = read_columns(self._file, path, self.n_frames)
-            self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
-            self.record = get_json(self._file, "surromd/record", path) if "surromd" in self._file else {}
-            self.scene = self._read_scene()
-            if self.scene is not None and self.scene.n_atoms != self.n_atoms:
-                raise TrajectoryError(f"{path}: {self.n_atoms} atoms in its frames, {self.scene.n_atoms} in its scene.")
+            with damage_reported(path):
+                self._read_headers()
         except BaseException:
             self._file.close()
             raise
 
+    def _read_headers(self) -> None:
+        if "coordinates" not in self._file:
+            raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
+        self.n_frames = consistent_length(self._file, self.path)
+        self._coordinates = self._file["coordinates"]
+        if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
+        self._scale = _nm_per_unit(self._coordinates, self.path)
+        self.n_atoms = int(self._coordinates.shape[1])
+        columns = read_columns(self._file, self.path, self.n_frames)
+        self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
+        self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
+        self.scene = self._read_scene()
+        if self.scene is not None and self.scene.n_atoms != self.n_atoms:
+            raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
+
     def _read_scene(self) -> Scene | None:
         if "surromd" in self._file:
-            return Scene.from_dict(get_json(self._file, "surromd/scene", self.path))
+            return Scene.from_dict(get_json(self._file, "surromd/scene"))
         if "topology" not in self._file or self.n_frames == 0:
             return None
         from systems.from_mdtraj import scene_from_topology_json
@@ -142,17 +147,14 @@ class Hdf5Reader(TrajectoryReader):
 
 def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, Any, dict[str, Any]]:
     """Return `(time_ps, flags, chunk_idx, scalars)` of the first `n_frames` frames; None for what is not there."""
-    try:
-        if "time" in file:
-            time_ps = file["time"][:n_frames].astype(np.float64)
-        else:
-            time_ps = np.arange(n_frames, dtype=np.float64)
-        flags = file["surromd/flags"][:n_frames] if "surromd/flags" in file else None
-        chunk_idx = file["surromd/chunk_idx"][:n_frames] if "surromd/chunk_idx" in file else None
-        group = file.get("surromd/scalars", {})
-        scalars = {name: group[name][:n_frames] for name in group}
-    except (OSError, RuntimeError, KeyError) as error:
-        raise TrajectoryError(f"{path} is damaged: {str(error).splitlines()[0]}.") from error
+    if "surromd" in file or "time" in file:
+        time_ps = file["time"][:n_frames].astype(np.float64)
+    else:
+        time_ps = np.arange(n_frames, dtype=np.float64)
+    flags = file["surromd/flags"][:n_frames] if "surromd/flags" in file else None
+    chunk_idx = file["surromd/chunk_idx"][:n_frames] if "surromd/chunk_idx" in file else None
+    group = file.get("surromd/scalars", {})
+    scalars = {name: group[name][:n_frames] for name in group}
     if not np.isfinite(time_ps).all():
         raise TrajectoryError(f"{path} is damaged: some frames have no time.")
     return time_ps, flags, chunk_idx, scalars
