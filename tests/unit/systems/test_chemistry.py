@@ -1,0 +1,299 @@
+"""Keys, stereo, torsions and matching, each with a molecule that must be told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from time import perf_counter
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from systems.bond_orders import ValenceError, perceive
+from systems.chemistry import (
+    atom_classes,
+    backbone_torsions,
+    bonded_graph,
+    exclusions,
+    match_atoms,
+    molecule_key,
+    ring_bonds,
+    rotatable_torsions,
+    stereocentres,
+)
+from systems.errors import OutOfDomainError
+from systems.geometry import signed_volumes, superpose, torsion
+from systems.library import load
+from systems.scene import Scene
+
+ALA2 = load("alanine-dipeptide")
+MAKE = Callable[..., Scene]
+
+SYMMETRIC = [
+    "CC(C)(C)C",
+    "C1CCCCC1",
+    "CC(C)C[C@H](NC(C)=O)C(=O)N[C@@H](C(C)C)C(=O)NC",
+    "CCO",
+    "CC",
+    "C",
+    "O",
+    "[NH4+]",
+    "NC(=[NH2+])NCC",
+    "CN(C)C=O",
+    "CC(=O)Nc1ccc(O)cc1",
+    "c1ccc2ccccc2c1",
+    "C12C3C4C1C5C2C3C45",
+    "CC#N",
+]
+
+
+def _inverted_groups(scene: Scene, template: Scene, order: np.ndarray) -> int:
+    graph = bonded_graph(template)
+    rows = [[i, *sorted(graph[i])[:3]] for i in graph if graph.degree(i) == 4]
+    if not rows:
+        return 0
+    ours = signed_volumes(scene.positions_nm[order], rows)
+    return int((np.sign(ours) != np.sign(signed_volumes(template.positions_nm, rows))).sum())
+
+
+def _is_isomorphism(scene: Scene, template: Scene, order: np.ndarray) -> bool:
+    ours = {tuple(sorted(b)) for b in scene.bonds.tolist()}
+    image = {tuple(sorted(order[list(b)].tolist())) for b in template.bonds.tolist()}
+    same = all(scene.elements[i] == e for i, e in zip(order, template.elements, strict=True))
+    return same and image == ours and sorted(order.tolist()) == list(range(scene.n_atoms))
+
+
+# ---- keys and stereo ----------------------------------------------------------------------------------------------
+
+
+@given(order=st.permutations(range(22)), seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_key_and_match_survive_permutation_rotation_and_renaming(order: list[int], seed: int) -> None:
+    where = np.argsort(order)
+    turned = ALA2.positions_nm @ Rotation.random(random_state=seed).as_matrix().T + 3.0
+    other = Scene(
+        name="other",
+        atom_names=tuple(f"Q{i}" for i in order),
+        elements=tuple(ALA2.elements[i] for i in order),
+        residue_of_atom=np.zeros(22, dtype=np.int64),
+        residue_names=("UNL",),
+        residue_ids=("7",),
+        chain_of_residue=("Z",),
+        bonds=where[ALA2.bonds],
+        bond_orders=np.zeros(len(ALA2.bonds)),
+        formal_charges=np.zeros(22, dtype=np.int64),
+        masses_da=ALA2.masses_da[order],
+        positions_nm=turned[order],
+    )
+    assert other.molecule_key == ALA2.molecule_key
+    found = match_atoms(other, ALA2)
+    assert np.array(order)[found].tolist() == list(range(22))
+
+
+def test_mirror_image_has_another_key_and_is_refused_by_name(mirrored: MAKE) -> None:
+    d_alanine = mirrored(ALA2)
+    assert d_alanine.molecule_key != ALA2.molecule_key
+    with pytest.raises(OutOfDomainError, match="enantiomer"):
+        match_atoms(d_alanine, ALA2)
+    rows = stereocentres(ALA2)
+    assert rows.shape == (1, 4)
+    assert rows[0, 0] == 8
+    assert 9 not in rows  # the hydrogen is left out
+    assert (stereocentres(d_alanine) == rows).all()
+    assert signed_volumes(ALA2.positions_nm, rows) * signed_volumes(d_alanine.positions_nm, rows) < 0
+
+
+def test_achiral_molecules_equal_their_mirror_image(from_smiles: MAKE, mirrored: MAKE) -> None:
+    for smiles in ("CCO", "C[C@H](O)[C@H](O)C", "C[C@H]1CC[C@H](C)CC1", "c1ccccc1"):
+        scene = from_smiles(smiles)
+        assert molecule_key(scene) == molecule_key(mirrored(scene)), smiles
+        assert _inverted_groups(mirrored(scene), scene, match_atoms(mirrored(scene), scene)) == 0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("C[C@H](O)[C@@H](O)C", "C[C@H](O)[C@H](O)C"),
+        ("C[C@H]1CC[C@H](C)CC1", "C[C@H]1CC[C@@H](C)CC1"),
+        ("C/C=C/C", "C/C=C\\C"),
+        ("C1CCC(C1)C1CCCC1", "C1CCC2CCCCC2C1"),
+        ("CCCO", "CCOC"),
+        ("C[S@](=O)CC", "C[S@@](=O)CC"),
+        ("CC(=O)O", "CC(=O)[O-]"),
+    ],
+    ids=["meso", "ring-cis-trans", "E-Z", "decalin", "constitution", "sulfoxide", "protonation"],
+)
+def test_isomers_have_different_keys_and_do_not_match(from_smiles: MAKE, one: str, other: str) -> None:
+    a, b = from_smiles(one), from_smiles(other)
+    assert molecule_key(a) == molecule_key(from_smiles(one, seed=5))
+    assert molecule_key(a) != molecule_key(b)
+    with pytest.raises(OutOfDomainError):
+        match_atoms(b, a)
+
+
+def test_refusals_say_why(from_smiles: MAKE) -> None:
+    with pytest.raises(OutOfDomainError, match="C2H6O"):
+        match_atoms(from_smiles("CCO"), ALA2)
+    with pytest.raises(OutOfDomainError, match="other bonds"):
+        match_atoms(from_smiles("COC"), from_smiles("CCO"))
+    with pytest.raises(OutOfDomainError, match="stereoisomer"):
+        match_atoms(from_smiles("C/C=C/C"), from_smiles("C/C=C\\C"))
+    charged = replace(ALA2, formal_charges=np.eye(22, dtype=np.int64)[0])
+    with pytest.raises(OutOfDomainError, match=r"charge \+1"):
+        match_atoms(charged, ALA2)
+
+
+def test_classes_count_equivalent_atoms(from_smiles: MAKE) -> None:
+    assert len(set(atom_classes(from_smiles("c1ccccc1")).tolist())) == 2
+    assert len(set(atom_classes(from_smiles("CC(C)(C)C")).tolist())) == 3
+    assert len(set(atom_classes(ALA2).tolist())) == 16
+
+
+# ---- matching -----------------------------------------------------------------------------------------------------
+
+
+def test_swapped_methyl_hydrogens_are_put_right(reordered: MAKE) -> None:
+    order = np.arange(22)
+    order[[11, 12]] = [12, 11]
+    swapped = reordered(ALA2, order)
+    assert _inverted_groups(swapped, ALA2, np.arange(22)) == 1  # taken as they stand, the methyl is inverted
+    found = match_atoms(swapped, ALA2)
+    assert found.tolist() == order.tolist()
+    moved = superpose(swapped.positions_nm[found], ALA2.positions_nm)
+    assert np.abs(moved - ALA2.positions_nm).max() < 1e-9
+
+
+def test_another_conformation_matches_without_inverted_groups(reordered: MAKE) -> None:
+    rng = np.random.default_rng(3)
+    x = ALA2.positions_nm.copy()
+    for b, c, tail in ((8, 14, range(15, 22)), (6, 8, range(9, 22)), (8, 10, range(11, 14))):
+        axis = (x[c] - x[b]) / np.linalg.norm(x[c] - x[b])
+        turn = Rotation.from_rotvec(axis * rng.uniform(1, 5)).as_matrix()
+        x[list(tail)] = (x[list(tail)] - x[c]) @ turn.T + x[c]
+    other = reordered(ALA2.with_positions(x), rng.permutation(22))
+    found = match_atoms(other, ALA2)
+    assert _is_isomorphism(other, ALA2, found)
+    assert _inverted_groups(other, ALA2, found) == 0
+
+
+@pytest.mark.parametrize("smiles", SYMMETRIC)
+def test_symmetric_molecules_match_fast_and_keep_hands(from_smiles: MAKE, reordered: MAKE, smiles: str) -> None:
+    template = from_smiles(smiles)
+    rng = np.random.default_rng(0)
+    for seed in range(2, 5):
+        scene = reordered(from_smiles(smiles, seed=seed), rng.permutation(template.n_atoms))
+        start = perf_counter()
+        order = match_atoms(scene, template)
+        assert perf_counter() - start < 2.0
+        assert _is_isomorphism(scene, template, order)
+        assert _inverted_groups(scene, template, order) == 0
+
+
+def test_planar_nh2_is_matched_by_torsion(from_smiles: MAKE, reordered: MAKE) -> None:
+    amide = from_smiles("CC(N)=O")
+    n = amide.elements.index("N")
+    h1, h2 = (j for j in sorted(bonded_graph(amide)[n]) if amide.elements[j] == "H")
+    order = np.arange(amide.n_atoms)
+    order[[h1, h2]] = [h2, h1]
+    assert match_atoms(reordered(amide, order), amide).tolist() == order.tolist()
+
+
+def test_rigid_methyls_of_dimethylformamide_keep_cis_and_trans(from_smiles: MAKE, reordered: MAKE) -> None:
+    dmf = from_smiles("CN(C)C=O")
+    carbons = [0, 2]
+    for seed in range(5):
+        order = np.random.default_rng(seed).permutation(dmf.n_atoms)
+        found = match_atoms(reordered(dmf, order), dmf)
+        assert order[found][carbons].tolist() == carbons
+
+
+# ---- graph --------------------------------------------------------------------------------------------------------
+
+
+def test_backbone_torsions_of_alanine_dipeptide() -> None:
+    found = backbone_torsions(ALA2)
+    assert found["phi"].tolist() == [[4, 6, 8, 14]]
+    assert found["psi"].tolist() == [[6, 8, 14, 16]]
+    assert found["omega"].tolist() == [[1, 4, 6, 8], [8, 14, 16, 18]]
+
+
+def test_backbone_torsions_run_along_the_chain_whatever_the_order(from_smiles: MAKE, reordered: MAKE) -> None:
+    side = ["C", "CC(N)=O", "CCC(=O)O", "CO", "C(C)C"]
+    smiles = "CC(=O)" + "".join(f"N[C@@H]({s})C(=O)" for s in side) + "N1CCC[C@H]1C(=O)NC"
+    scene = from_smiles(smiles)
+    order = np.random.default_rng(1).permutation(scene.n_atoms)
+    straight, shuffled = backbone_torsions(scene), backbone_torsions(reordered(scene, order))
+    for key, n in (("phi", 6), ("psi", 6), ("omega", 7)):
+        assert straight[key].shape == (n, 4)
+        if key != "omega":
+            assert order[shuffled[key]].tolist() == straight[key].tolist()
+    assert all(a[3] == b[2] for a, b in zip(straight["phi"], straight["psi"], strict=True))
+    assert all(p[3] == f[1] for p, (_, f) in zip(straight["psi"][:-1], pairwise(straight["phi"]), strict=True))
+    assert {tuple(r) for r in order[shuffled["omega"]].tolist()} == {tuple(r) for r in straight["omega"].tolist()}
+    assert np.abs(np.cos(torsion(scene.positions_nm, straight["omega"]))).min() > 0.8
+
+
+def test_molecules_without_peptides_have_no_backbone(from_smiles: MAKE) -> None:
+    for smiles in ("CCO", "CC(N)=O", "CC(=O)OC"):
+        assert all(len(rows) == 0 for rows in backbone_torsions(from_smiles(smiles)).values())
+
+
+def test_exclusions_are_the_short_paths() -> None:
+    graph = bonded_graph(ALA2)
+    lengths = dict(nx.all_pairs_shortest_path_length(graph))
+    for depth in (1, 2, 3):
+        expected = {(i, j) for i in graph for j in graph if i < j and lengths[i][j] <= depth}
+        assert {tuple(r) for r in exclusions(ALA2, depth).tolist()} == expected
+    assert len(exclusions(ALA2, 1)) == len(ALA2.bonds)
+
+
+def test_rotatable_torsions_and_rings(from_smiles: MAKE) -> None:
+    middle = {tuple(sorted(r[1:3])) for r in rotatable_torsions(ALA2).tolist()}
+    assert middle == {(6, 8), (8, 14)}
+    assert len(rotatable_torsions(ALA2, rotors=True)) == 5
+    assert len(rotatable_torsions(from_smiles("C1CCCCC1"))) == 0
+    assert len(rotatable_torsions(from_smiles("C=CC=C"))) == 1
+    assert len(ring_bonds(from_smiles("C1CCCCC1CC"))) == 6
+    assert len(ring_bonds(ALA2)) == 0
+
+
+# ---- bond orders --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "smiles",
+    [
+        "CC(=O)[O-]",
+        "NC(=[NH2+])NCC",
+        "Cc1c[nH]c[nH+]1",
+        "C[N+](=O)[O-]",
+        "CS(=O)(=O)C",
+        "C[S@](=O)CC",
+        "CC#N",
+        "[O-]P(=O)([O-])OC",
+        "c1ccc2ccccc2c1",
+        "Cn1cnc2c1c(=O)n(C)c(=O)n2C",
+        "C[NH3+]",
+        "CC(=O)Oc1ccccc1C(=O)O",
+    ],
+)
+def test_perceived_orders_and_charges_equal_rdkit(from_smiles: MAKE, smiles: str) -> None:
+    scene = from_smiles(smiles)
+    orders, charges = perceive(scene.elements, scene.bonds)
+    assert sorted(orders) == sorted(scene.bond_orders)
+    assert charges.sum() == scene.formal_charges.sum()
+    assert sorted(charges) == sorted(scene.formal_charges)
+
+
+def test_missing_hydrogen_is_named(from_smiles: MAKE) -> None:
+    scene = from_smiles("CCC")
+    hydrogen = scene.n_atoms - 1
+    bonds = scene.bonds[(scene.bonds != hydrogen).all(axis=1)]
+    with pytest.raises(ValenceError) as caught:
+        perceive(scene.elements[:hydrogen], bonds)
+    assert len(caught.value.atoms) == 1
