@@ -16,12 +16,16 @@ import numpy as np
 from md_reference.engine import Engine
 from md_reference.forcefield import ForceFieldSpec
 from systems.errors import InputError, SimulationError, StorageError
+from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 from systems.trajectory import open_writer
 from systems.units import format_time_ps, whole_steps
 
 # (frames done, frames in all) -> None, called after each block that is on disk.
 ProgressFn = Callable[[int, int], None]
+
+# Python sees Ctrl-C only between calls of OpenMM.
+_STEPS_BETWEEN_SIGNALS = 500
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,8 @@ def simulate(
     """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
 
     A `kill -9` loses at most the frames since the last checkpoint (`checkpoint_every_s` of wall time); `resume=True`
-    cuts the file back to that checkpoint and goes on with the same random stream. Raises SimulationError when
+    cuts the file back to that checkpoint and goes on with the same random stream. Ctrl-C and SIGTERM stop between two
+    frames, with a checkpoint: KeyboardInterrupt. Raises SimulationError when
     coordinates stop being finite: the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
@@ -94,20 +99,36 @@ def simulate(
             done, spent_s = 0, 0.0
             engine.minimise()
             engine.thermalise()
-            engine.step(max(1, round(config.equilibrate_ps / config.timestep_ps)))
+            to_equilibrate = max(1, round(config.equilibrate_ps / config.timestep_ps))
+            for start in range(0, to_equilibrate, _STEPS_BETWEEN_SIGNALS):
+                engine.step(min(_STEPS_BETWEEN_SIGNALS, to_equilibrate - start))
             engine.reset_clock()
-        with open_writer(out, scene, record, append=resuming, overwrite=overwrite) as writer:
+
+        def save_checkpoint(wall_s: float) -> None:
+            header = {"config": asdict(config), "n_frames": done, "wall_s": wall_s}
+            _write_checkpoint(chk, header, engine.checkpoint())
+
+        with (
+            open_writer(out, scene, record, append=resuming, overwrite=overwrite) as writer,
+            deferred_interrupt() as asked_to_stop,
+        ):
             if resuming:
                 writer.truncate(done)
+            else:
+                # At once, so that a run killed in its first seconds can be resumed like any other.
+                save_checkpoint(spent_s + time.monotonic() - started)
             last_saved = time.monotonic()
-            # A block is what is held in memory and flushed together: about a quarter of a second of work.
-            block = max(1, min(1000, n_frames // 200 or 1))
+            # A block is what is held in memory and flushed together: about half a second of work, found as we go.
+            block = 1
             while done < n_frames:
                 size = min(block, n_frames - done)
+                block_began = time.monotonic()
                 frames = np.empty((size, scene.n_atoms, 3), dtype=np.float32)
                 scalars = {name: np.empty(size) for name in ("potential_kj_mol", "temperature_k")}
                 filled, failure = 0, ""
                 for k in range(size):
+                    if asked_to_stop():
+                        break
                     try:
                         engine.step(steps_per_frame)
                     except SimulationError as error:
@@ -133,10 +154,15 @@ def simulate(
                     )
                 if progress is not None:
                     progress(done, n_frames)
+                if asked_to_stop() and done < n_frames:
+                    save_checkpoint(wall_s)
+                    writer.update_record({"cost": _cost(wall_s, done, config)})
+                    raise KeyboardInterrupt
                 if time.monotonic() - last_saved > checkpoint_every_s and done < n_frames:
-                    header = {"config": asdict(config), "n_frames": done, "wall_s": wall_s}
-                    _write_checkpoint(chk, header, engine.checkpoint())
+                    save_checkpoint(wall_s)
                     last_saved = time.monotonic()
+                per_frame_s = max((time.monotonic() - block_began) / size, 1e-6)
+                block = min(max(1, round(0.5 / per_frame_s)), 1000, 2 * block)
             wall_s = spent_s + time.monotonic() - started
             writer.update_record({"completed": True, "cost": _cost(wall_s, done, config)})
     chk.unlink(missing_ok=True)

@@ -1,0 +1,91 @@
+"""Stage one: a cross-attention encoder into a few latent vectors and a decoder queried by identifier (section 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from surrogate.models.layers import CrossAttentionBlock, fourier_features
+from surrogate.models.lam_slide.config import AutoencoderConfig
+
+MAX_ATOMIC_NUMBER = 54
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Positions `(b, n_atoms, 3)` in scaled units and, when asked for, element logits `(b, n_atoms, elements)`."""
+
+    positions: Tensor
+    element_logits: Tensor | None
+
+
+def draw_identifiers(n_atoms: int, pool: int, batch: int, generator: torch.Generator | None) -> Tensor:
+    """Algorithm 1: for each batch row, `n_atoms` different identifiers from the pool: `(batch, n_atoms)` int64."""
+    if n_atoms > pool:
+        raise ValueError(f"{n_atoms} atoms need an identifier pool of at least that size, not {pool}")
+    device = generator.device if generator is not None else None
+    return torch.rand(batch, pool, generator=generator, device=device).argsort(dim=1)[:, :n_atoms]
+
+
+class Autoencoder(nn.Module):
+    """Encoder [x, m, u] -> Z (Algorithm 2) and decoder Z, u -> x, m (Algorithm 3)."""
+
+    def __init__(self, config: AutoencoderConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        self.identifiers = nn.Embedding(c.identifier_pool, c.identifier_dim)
+        self.elements = nn.Embedding(MAX_ATOMIC_NUMBER + 1, 16)
+        coordinate_dim = 3 * (1 + 2 * c.n_octaves)
+        self.embed = nn.Sequential(
+            nn.Linear(coordinate_dim + 16 + c.identifier_dim, c.width),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(c.width, c.width),
+        )
+        self.queries = nn.Parameter(torch.randn(c.n_latents, c.width) * 0.5)
+        self.encoder = nn.ModuleList(
+            CrossAttentionBlock(c.width, c.width, c.n_heads, c.head_dim) for _ in range(c.n_encoder_layers)
+        )
+        self.to_latent = nn.Linear(c.width, c.latent_dim)
+        self.query = nn.Linear(c.identifier_dim, c.width)
+        self.decoder = nn.ModuleList(
+            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim) for _ in range(c.n_decoder_layers)
+        )
+        self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
+        self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))
+
+    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
+        tokens = torch.cat(
+            [fourier_features(x, self.config.n_octaves), self.elements(elements), self.identifiers(identifiers)], dim=-1
+        )
+        tokens = self.embed(tokens)
+        latents = self.queries.expand(x.shape[0], -1, -1)
+        for block in self.encoder:
+            latents = block(latents, tokens, mask)
+        z = self.to_latent(latents).float()
+        return F.layer_norm(z, (self.config.latent_dim,))
+
+    def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
+        """Latents `(b, n_latents, dim)`, identifiers `(b, n)` -> positions `(b, n, 3)` (scaled), element logits."""
+        context = F.layer_norm(latents, (self.config.latent_dim,))
+        h = self.query(self.identifiers(identifiers))
+        for block in self.decoder:
+            h = block(h, context)
+        logits = self.to_element(h).float() if with_elements else None
+        return Decoded(self.to_position(h).float(), logits)
+
+
+def pair_distances(x: Tensor) -> Tensor:
+    """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
+    difference = x.unsqueeze(-2) - x.unsqueeze(-3)
+    return (difference.square().sum(-1) + 1e-12).sqrt()
+
+
+def reconstruction_losses(x: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the position loss (eq. 13) and the inter-distance loss (eq. 14), in scaled units squared."""
+    position = (x - decoded).square().sum(-1).mean()
+    distance = (pair_distances(x) - pair_distances(decoded)).square().mean()
+    return position, distance

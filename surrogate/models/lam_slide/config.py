@@ -1,0 +1,99 @@
+"""LaM-SLidE's settings as frozen dataclasses, readable from TOML; unknown keys are refused with a suggestion."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from systems.errors import InputError, nearest
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """Stage one (Tables 8 to 12; small sizes). `latent_noise` is the standard deviation added to latents in training:
+    with LayerNorm bounding their power it makes the encoder spend latent variance where positions need it."""
+
+    n_latents: int = 1
+    latent_dim: int = 96
+    width: int = 128
+    n_heads: int = 4
+    head_dim: int = 32
+    identifier_dim: int = 64
+    identifier_pool: int = 32
+    n_octaves: int = 4
+    n_encoder_layers: int = 1
+    n_decoder_layers: int = 2
+    latent_noise: float = 0.05
+    position_weight: float = 1.0
+    distance_weight: float = 1.0
+    type_weight: float = 0.01
+    # Share of stage-one steps that draw identifiers at random (Algorithm 1); the others use the canonical assignment.
+    random_identifiers: float = 0.5
+
+
+@dataclass(frozen=True)
+class ApproximatorConfig:
+    """Stage two. `interpolant` 'linear' or 'gvp' (eq. 7, 8). `precondition` scales skip and output of the data
+    prediction by the flow time so that its error vanishes with the noise (Karras 2022, for this path)."""
+
+    chunk_frames: int = 32
+    n_conditioning: int = 1
+    width: int = 256
+    n_layers: int = 7
+    n_heads: int = 4
+    interpolant: str = "linear"
+    precondition: bool = True
+    # Flow times are logit-normal: a positive location draws more of them near the data end.
+    tau_location: float = 0.5
+    tau_scale: float = 1.4
+    position_weight: float = 0.25
+    distance_weight: float = 0.25
+    auxiliary_frames: int = 4
+
+
+@dataclass(frozen=True)
+class LamSlideConfig:
+    """The whole model. `canonical`: frames are superposed on the template by heavy atoms (exact SE(3) equivariance);
+    without it, training rotates at random instead (the paper's augmentation)."""
+
+    canonical: bool = True
+    position_scale_nm: float = 0.2
+    autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
+    approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> LamSlideConfig:
+        """Raises InputError for an unknown key, naming the nearest."""
+        record = dict(record)
+        sub = {
+            "autoencoder": build(AutoencoderConfig, record.pop("autoencoder", {}), "autoencoder."),
+            "approximator": build(ApproximatorConfig, record.pop("approximator", {}), "approximator."),
+        }
+        return build(LamSlideConfig, {**record, **sub}, "")
+
+    @staticmethod
+    def from_toml(path: str | Path) -> LamSlideConfig:
+        """Read a TOML file. Raises InputError when it is missing, malformed or has unknown keys."""
+        try:
+            with open(path, "rb") as handle:
+                return LamSlideConfig.from_dict(tomllib.load(handle))
+        except FileNotFoundError:
+            raise InputError(f"configuration {path} does not exist.") from None
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"configuration {path} is not valid TOML: {error}") from error
+
+
+def build(cls: type[T], record: dict[str, Any], prefix: str) -> T:
+    """Return cls(**record), refusing (InputError) unknown keys with the nearest known one."""
+    known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+    for key in record:
+        if key not in known:
+            raise InputError(f"unknown setting {prefix}{key}; known: {', '.join(known)}.{nearest(key, known)}")
+    return cls(**record)

@@ -1,0 +1,62 @@
+"""Stochastic interpolants with data prediction, and the solvers that integrate them (section 3.3, appendix C)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+# (o_tau (b, ...), tau (b,)) -> prediction of the data o_1 (b, ...)
+DataPrediction = Callable[[Tensor, Tensor], Tensor]
+
+
+def coefficients(tau: Tensor, interpolant: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return alpha, sigma and their derivatives at flow time tau: linear (eq. 7) or gvp (eq. 8)."""
+    if interpolant == "linear":
+        one = torch.ones_like(tau)
+        return tau, 1.0 - tau, one, -one
+    if interpolant == "gvp":
+        angle = 0.5 * math.pi * tau
+        return angle.sin(), angle.cos(), 0.5 * math.pi * angle.cos(), -0.5 * math.pi * angle.sin()
+    raise ValueError(f"unknown interpolant {interpolant!r}; known: linear, gvp")
+
+
+def velocity(o: Tensor, prediction: Tensor, tau: Tensor, interpolant: str) -> Tensor:
+    """Velocity from a data prediction (eq. 10 and 11, simplified).
+
+    Eliminating the score gives v = alpha' o1 + sigma' (o - alpha o1) / sigma, the same expression without the
+    division by alpha that is singular at tau = 0.
+    """
+    alpha, sigma, d_alpha, d_sigma = (expand(c, o) for c in coefficients(tau, interpolant))
+    return d_alpha * prediction + d_sigma * (o - alpha * prediction) / sigma
+
+
+def preconditioning(tau: Tensor, interpolant: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Return c_skip, c_out and c_in for data of unit variance: o1 = c_skip o + c_out F(c_in o, tau).
+
+    c_skip is the best linear denoiser alpha / (alpha^2 + sigma^2), c_out its error's standard deviation, so that F has
+    unit variance at every flow time (Karras 2022, Table 1, for these interpolants).
+    """
+    alpha, sigma, _, _ = coefficients(tau, interpolant)
+    power = alpha.square() + sigma.square()
+    return alpha / power, sigma / power.sqrt(), power.rsqrt()
+
+
+def expand(value: Tensor, like: Tensor) -> Tensor:
+    """Reshape `(b,)` so that it broadcasts over `(b, ...)`."""
+    return value.reshape(-1, *([1] * (like.ndim - 1)))
+
+
+def euler(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
+    """Integrate from noise (tau = 0) to data (tau = 1) in `n_steps` evaluations; the last step lands on o_hat."""
+    o = noise
+    grid = torch.linspace(0.0, 1.0, n_steps + 1).tolist()
+    for start, end in zip(grid[:-1], grid[1:], strict=True):
+        tau = torch.full((o.shape[0],), start, device=o.device, dtype=torch.float32)
+        prediction = predict(o, tau)
+        if end == 1.0:
+            return prediction
+        o = o + (end - start) * velocity(o, prediction, tau, interpolant)
+    raise ValueError(f"n_steps must be at least 1, not {n_steps}")

@@ -1,0 +1,79 @@
+"""LaM-SLidE, both stages joined: frames -> latents -> next latents -> frames."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.approximator import Approximator
+from surrogate.models.lam_slide.autoencoder import Autoencoder
+from surrogate.models.lam_slide.config import LamSlideConfig
+
+
+class LamSlide(nn.Module):
+    """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.interface`.
+
+    Latents are used as (z - mean) / scale with a mean per latent component and one common scale, both measured on the
+    training frames: LayerNorm bounds their power but leaves constant offsets that carry no information.
+    """
+
+    latent_mean: Tensor
+    latent_scale: Tensor
+
+    def __init__(self, config: LamSlideConfig) -> None:
+        super().__init__()
+        self.config = config
+        ae = config.autoencoder
+        self.autoencoder = Autoencoder(ae)
+        self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim)
+        self.register_buffer("latent_mean", torch.zeros(ae.n_latents, ae.latent_dim))
+        self.register_buffer("latent_scale", torch.ones(()))
+
+    @property
+    def canonical(self) -> bool:
+        return self.config.canonical
+
+    @property
+    def n_conditioning(self) -> int:
+        return self.config.approximator.n_conditioning
+
+    @property
+    def n_new(self) -> int:
+        return self.config.approximator.chunk_frames - self.n_conditioning
+
+    def identifiers(self, n_atoms: int) -> Tensor:
+        """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k. Permuting a scene's atoms
+        permutes identifiers with them, because scenes are matched to the template before they get here."""
+        return torch.arange(n_atoms, device=self.latent_mean.device)
+
+    def encode(self, frames_nm: Tensor, elements: Tensor) -> Tensor:
+        """Frames `(..., n_atoms, 3)` nm -> latents `(..., n_latents, latent_dim)`."""
+        lead, n_atoms = frames_nm.shape[:-2], frames_nm.shape[-2]
+        x = frames_nm.reshape(-1, n_atoms, 3).float() / self.config.position_scale_nm
+        rows = x.shape[0]
+        z = self.autoencoder.encode(
+            x, elements.expand(rows, n_atoms), self.identifiers(n_atoms).expand(rows, n_atoms)
+        )
+        return ((z - self.latent_mean) / self.latent_scale).unflatten(0, lead)
+
+    def decode(self, latents: Tensor, n_atoms: int) -> Tensor:
+        """Latents `(..., n_latents, latent_dim)` -> frames `(..., n_atoms, 3)` nm."""
+        lead = latents.shape[:-2]
+        z = latents.reshape(-1, *latents.shape[-2:]) * self.latent_scale + self.latent_mean
+        decoded = self.autoencoder.decode(z, self.identifiers(n_atoms).expand(z.shape[0], n_atoms))
+        return (decoded.positions * self.config.position_scale_nm).unflatten(0, lead)
+
+    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
+        ae = self.config.autoencoder
+        return (self.config.approximator.chunk_frames, ae.n_latents, ae.latent_dim)
+
+    def next_chunk(self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int) -> Tensor:
+        """See `Surrogate.next_chunk`."""
+        known = self.encode(last_frames_nm, elements)
+
+        def predict(o: Tensor, tau: Tensor) -> Tensor:
+            return self.approximator(o, tau, known)
+
+        latents = flow.euler(predict, noise, solver_steps, self.config.approximator.interpolant)
+        return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])

@@ -1,0 +1,114 @@
+"""Attention blocks, positional encodings and Fourier features shared by the surrogates."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def fourier_features(x: Tensor, n_octaves: int) -> Tensor:
+    """Return x with sin and cos of 2^k pi x, k = 0..n_octaves-1: `(..., d)` -> `(..., d * (1 + 2 * n_octaves))`.
+
+    Always float32: in bf16 the fifth octave is already noise.
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        x = x.float()
+        scale = math.pi * 2.0 ** torch.arange(n_octaves, device=x.device, dtype=torch.float32)
+        angles = (x.unsqueeze(-1) * scale).flatten(-2)
+        return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
+
+
+def rotary_angles(length: int, head_dim: int, *, base: float = 10_000.0) -> Tensor:
+    """Return RoPE rotation angles `(length, head_dim / 2)` (Su 2021)."""
+    frequency = base ** (-torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim)
+    return torch.arange(length, dtype=torch.float32)[:, None] * frequency[None, :]
+
+
+def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Apply RoPE to `(..., length, head_dim)` with cos and sin `(length, head_dim / 2)`."""
+    a, b = x.chunk(2, dim=-1)
+    cos, sin = cos.to(x.dtype), sin.to(x.dtype)
+    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
+
+
+class TimeEmbedding(nn.Module):
+    """Sinusoidal embedding of the flow time in [0, 1] followed by a two-layer MLP: `(batch,)` -> `(batch, width)`."""
+
+    def __init__(self, width: int, n_frequencies: int = 64) -> None:
+        super().__init__()
+        self.register_buffer("frequency", torch.exp(torch.linspace(0.0, math.log(1000.0), n_frequencies)))
+        self.net = nn.Sequential(nn.Linear(2 * n_frequencies, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, tau: Tensor) -> Tensor:
+        angles = tau.float()[:, None] * self.frequency
+        return self.net(torch.cat([angles.sin(), angles.cos()], dim=-1))
+
+
+class ParallelBlock(nn.Module):
+    """Attention and MLP in parallel from one adaLN-modulated input (Dehghani 2023; LaM-SLidE, Figure 6).
+
+    One fused input projection gives queries, keys, values and the MLP's hidden layer. QK-normalisation and RoPE. The
+    modulation is shared by all layers but for a learned offset (adaLN-single, Chen 2023), which keeps shipped weights
+    small; the gate's offset starts at zero, so a fresh block is the identity.
+    """
+
+    def __init__(self, width: int, n_heads: int, mlp_ratio: int = 4) -> None:
+        super().__init__()
+        if width % n_heads or (width // n_heads) % 2:
+            raise ValueError(f"width {width} does not split into {n_heads} heads of even size")
+        self.n_heads, self.width, self.hidden = n_heads, width, mlp_ratio * width
+        self.proj_in = nn.Linear(width, 3 * width + self.hidden)
+        self.attention_out = nn.Linear(width, width, bias=False)
+        self.mlp_out = nn.Linear(self.hidden, width)
+        self.offset = nn.Parameter(torch.zeros(3, width))
+
+    def forward(self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None) -> Tensor:
+        """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width): shift, scale, gate."""
+        shift, scale, gate = (modulation + self.offset)[:, None, None].unbind(-2)
+        h = F.layer_norm(x, (self.width,)) * (1.0 + scale) + shift
+        q, k, v, hidden = self.proj_in(h).split([self.width] * 3 + [self.hidden], dim=-1)
+        batch, groups, length, _ = x.shape
+        q, k, v = (t.reshape(batch * groups, length, self.n_heads, -1).transpose(1, 2) for t in (q, k, v))
+        q, k = normalise(q), normalise(k)
+        if rope is not None:
+            q, k = rotate(q, *rope), rotate(k, *rope)
+        attended = F.scaled_dot_product_attention(q, k, v)
+        attended = attended.transpose(1, 2).reshape(batch, groups, length, self.width)
+        update = self.attention_out(attended) + self.mlp_out(F.gelu(hidden, approximate="tanh"))
+        return x + gate * update
+
+
+def normalise(x: Tensor) -> Tensor:
+    """RMS-normalise the last dimension, in the input's dtype."""
+    return x * (x.square().mean(-1, keepdim=True) + 1e-6).rsqrt()
+
+
+class CrossAttentionBlock(nn.Module):
+    """Pre-norm cross-attention and feed-forward: queries `(b, n, width)` read from a context `(b, m, context)`."""
+
+    def __init__(self, width: int, context: int, n_heads: int, head_dim: int, mlp_ratio: int = 4) -> None:
+        super().__init__()
+        self.n_heads = n_heads
+        self.norm = nn.LayerNorm(width)
+        self.q = nn.Linear(width, n_heads * head_dim)
+        self.kv = nn.Linear(context, 2 * n_heads * head_dim)
+        self.out = nn.Linear(n_heads * head_dim, width)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.Linear(width, mlp_ratio * width),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(mlp_ratio * width, width),
+        )
+
+    def forward(self, x: Tensor, context: Tensor, key_mask: Tensor | None = None) -> Tensor:
+        """`key_mask` (b, m) is True where the context holds a real entity."""
+        split = lambda t: t.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # noqa: E731
+        q = split(self.q(self.norm(x)))
+        k, v = (split(t) for t in self.kv(context).chunk(2, dim=-1))
+        mask = None if key_mask is None else key_mask[:, None, None, :]
+        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        x = x + self.out(attended.transpose(1, 2).flatten(-2))
+        return x + self.mlp(x)

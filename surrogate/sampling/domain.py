@@ -1,0 +1,26 @@
+"""Is this scene what the weights were trained for? Asked before anything is computed."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.training.checkpoint import Weights
+from systems.errors import OutOfDomainError
+from systems.matching import match_atoms
+from systems.scene import Scene
+
+
+def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
+    """Return `order (n_atoms,)`: model atom k is scene atom order[k].
+
+    Raises OutOfDomainError, which says what the weights cover and what to run instead.
+    """
+    try:
+        return match_atoms(scene, weights.domain.scene)
+    except OutOfDomainError as error:
+        reason = str(error).rstrip(".")
+        raise OutOfDomainError(
+            f"{weights.path.name} does not cover {scene.name}: {reason}. These weights cover {weights.domain.describe()}. "
+            f"Run `surromd reference` for this molecule, then `surromd train` on it."
+        ) from error

@@ -1,0 +1,111 @@
+"""Weights files: one safetensors file that carries its configuration, training domain and provenance."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlide
+from systems.errors import InputError, WeightsError
+from systems.scene import Scene
+from systems.whole_file import create_whole
+
+FORMAT = "surromd-weights-1"
+
+
+@dataclass(frozen=True)
+class TrainingDomain:
+    """What the weights were trained for. `scene` is the template: atom k of the model is its atom k, and canonical
+    frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
+    `geometry` is what its frames say of valid ones (systems.validity.Geometry as a dictionary)."""
+
+    scene: Scene
+    lag_ps: float
+    conditions: dict[str, Any]
+    geometry: dict[str, Any]
+
+    def describe(self) -> str:
+        """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
+        c = self.conditions
+        return (
+            f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms), {c.get('force_field')}/"
+            f"{c.get('solvent')}, {c.get('temperature_k')} K, frames {self.lag_ps:g} ps apart"
+        )
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
+
+    model: LamSlide
+    domain: TrainingDomain
+    provenance: dict[str, Any]
+    hash: str
+    path: Path
+
+
+def save_weights(
+    path: str | Path, model: LamSlide, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
+) -> None:
+    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
+    from safetensors.torch import save_file
+
+    header = {
+        "arch": "lam-slide",
+        "config": model.config.to_dict(),
+        "domain": {**vars(domain), "scene": domain.scene.to_dict()},
+        "provenance": provenance,
+    }
+    dtype = torch.float16 if half else torch.float32
+    tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
+    metadata = {"format": FORMAT, "surromd": json.dumps(header)}
+    create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
+
+
+def read_header(path: str | Path) -> dict[str, Any]:
+    """Return a weights file's record without loading it. Raises InputError (missing) or WeightsError (not ours, damaged)."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"weights file {path} does not exist.")
+    try:
+        with safe_open(path, framework="pt") as handle:
+            metadata = handle.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
+            return json.loads(metadata["surromd"])
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+
+
+def load_weights(path: str | Path) -> Weights:
+    """Load a weights file in evaluation mode. Raises InputError, WeightsError (damaged, non-finite, other shapes)."""
+    from safetensors.torch import load
+
+    path = Path(path)
+    header = read_header(path)
+    data = path.read_bytes()
+    model = LamSlide(LamSlideConfig.from_dict(header["config"]))
+    try:
+        state = load(data)
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        raise WeightsError(f"{path} does not fit its own configuration: {str(error).splitlines()[0]}") from error
+    broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
+    if broken:
+        raise WeightsError(f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download.")
+    domain = header["domain"]
+    return Weights(
+        model=model.eval().requires_grad_(False),
+        domain=TrainingDomain(**{**domain, "scene": Scene.from_dict(domain["scene"])}),
+        provenance=header["provenance"],
+        hash=hashlib.sha256(data).hexdigest()[:16],
+        path=path,
+    )

@@ -1,0 +1,222 @@
+"""Train LaM-SLidE: stage one (autoencoder), then stage two (latent flow) on the frozen encoder's latents."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogate.data.frames import TrainingFrames
+from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlide
+from surrogate.training.checkpoint import TrainingDomain, save_weights
+from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
+from systems.elements import ATOMIC_NUMBERS
+from systems.errors import InputError
+from systems.validity import geometry_from_frames
+
+# Share of the whole budget that stage one gets.
+STAGE_ONE_SHARE = 0.15
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Both stages' optimisation (AdamW, EMA 0.999; appendix E.5). Budgets in seconds of training, or steps."""
+
+    budget_s: float | None = None
+    stage_one_steps: int | None = None
+    stage_two_steps: int | None = None
+    stage_one_batch: int = 256
+    stage_two_batch: int = 64
+    stage_one_rate: float = 2e-3
+    stage_two_rate: float = 1e-3
+    seed: int = 0
+    bf16: bool = True
+    device: str = "cpu"
+    validate_every_s: float = 60.0
+    snapshot_every_s: float | None = None
+
+    def stages(self) -> tuple[StageConfig, StageConfig]:
+        share = STAGE_ONE_SHARE
+        budget_one = None if self.budget_s is None else self.budget_s * share
+        budget_two = None if self.budget_s is None else self.budget_s * (1 - share)
+        common: dict[str, Any] = {"bf16": self.bf16, "validate_every_s": self.validate_every_s}
+        one = StageConfig("autoencoder", self.stage_one_batch, self.stage_one_rate, budget_one, self.stage_one_steps,
+                          seed=self.seed, **common)  # fmt: skip
+        two = StageConfig("flow", self.stage_two_batch, self.stage_two_rate, budget_two, self.stage_two_steps,
+                          seed=self.seed + 1, **common)  # fmt: skip
+        return one, two
+
+
+def train_lam_slide(
+    frames: TrainingFrames,
+    out: str | Path,
+    model_config: LamSlideConfig,
+    config: TrainingConfig,
+    *,
+    resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> Path:
+    """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
+
+    Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
+    """
+    out = Path(out)
+    n_atoms = frames.scene.n_atoms
+    if frames.canonical != model_config.canonical:
+        raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
+    if n_atoms > model_config.autoencoder.identifier_pool:
+        raise InputError(
+            f"{n_atoms} atoms need autoencoder.identifier_pool >= {n_atoms}, not "
+            f"{model_config.autoencoder.identifier_pool}."
+        )
+    torch.manual_seed(config.seed)
+    device = torch.device(config.device)
+    model = LamSlide(model_config).to(device)
+    elements = torch.tensor([ATOMIC_NUMBERS[e] for e in frames.scene.elements], device=device)
+    log_path = out.with_suffix(".csv")
+    states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
+    if not resume:
+        for path in (*states, log_path):
+            path.unlink(missing_ok=True)
+    one, two = config.stages()
+    spent_one = _stage_one(model, frames, elements, one, states[0], log_path, resume, progress)
+    normalise_latents(model, frames, elements, config.seed)
+
+    domain = training_domain(frames)
+
+    def write(spent_s: float) -> None:
+        save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s))
+
+    spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config)
+    write(spent_two)
+    for path in states:
+        path.unlink(missing_ok=True)
+    return out
+
+
+def _stage_one(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
+               resume: bool, progress: ProgressFn | None) -> float:  # fmt: skip
+    starts = frames.window_starts(1, validation=False)
+    held = frames.window_starts(1, validation=True)
+    held = held[np.linspace(0, len(held) - 1, min(2048, len(held))).astype(int)]
+    device = elements.device
+
+    def draw(generator: torch.Generator) -> Tensor:
+        idx = torch.randint(len(starts), (stage.batch,), generator=generator).numpy()
+        x = torch.from_numpy(frames.positions_nm(starts[idx]))
+        if not model.canonical:
+            x = torch.einsum("bij,bnj->bni", random_rotations(len(x), generator), x)
+        return x.to(device)
+
+    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        return autoencoder_loss(model, draw(generator), elements, generator)
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        x = torch.from_numpy(frames.positions_nm(held)).to(device)
+        error = model.decode(model.encode(x, elements), frames.scene.n_atoms) - x
+        return {"validation_rmsd_nm": float(error.square().sum(-1).mean().sqrt())}
+
+    return run_stage(model.autoencoder, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+                     device=device, progress=progress)  # fmt: skip
+
+
+@torch.no_grad()
+def normalise_latents(model: LamSlide, frames: TrainingFrames, elements: Tensor, seed: int) -> None:
+    """Measure the latents' means and common scale on training frames and set them in the model."""
+    starts = frames.window_starts(1, validation=False)
+    idx = np.random.default_rng(seed).choice(len(starts), size=min(20_000, len(starts)), replace=False)
+    x = torch.from_numpy(frames.positions_nm(starts[np.sort(idx)])).to(elements.device)
+    model.latent_mean.zero_()
+    model.latent_scale.fill_(1.0)
+    z = model.encode(x, elements)
+    model.latent_mean.copy_(z.mean(0))
+    model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
+
+
+@torch.no_grad()
+def encode_all(model: LamSlide, frames: TrainingFrames, elements: Tensor, block: int = 8192) -> Tensor:
+    """Encode every frame once: `(n_frames, n_latents, latent_dim)` float32 on the CPU."""
+    parts = []
+    for start in range(0, frames.n_frames, block):
+        idx = np.arange(start, min(start + block, frames.n_frames))
+        x = torch.from_numpy(frames.positions_nm(idx)).to(elements.device)
+        parts.append(model.encode(x, elements).cpu())
+    return torch.cat(parts)
+
+
+def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
+               resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig) -> float:  # fmt: skip
+    length = model.config.approximator.chunk_frames
+    n_atoms, device = frames.scene.n_atoms, elements.device
+    starts = torch.from_numpy(frames.window_starts(length, validation=False))
+    held = torch.from_numpy(frames.window_starts(length, validation=True))
+    held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
+    offsets = torch.arange(length)
+    model.autoencoder.requires_grad_(False)
+    cache = encode_all(model, frames, elements).to(device) if model.canonical else None
+
+    def windows(first: Tensor, generator: torch.Generator) -> Tensor:
+        idx = first[:, None] + offsets
+        if cache is not None:
+            return cache[idx.to(device)]
+        x = torch.from_numpy(frames.positions_nm(idx.numpy()))
+        x = torch.einsum("bij,btnj->btni", random_rotations(len(x), generator), x)
+        with torch.no_grad():
+            return model.encode(x.to(device), elements)
+
+    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
+        tau = draw_flow_times(model, stage.batch, generator).to(device)
+        return flow_loss(model, windows(first, generator), n_atoms, tau, generator)
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        # The same noise and flow times each time, so that the curve shows the model and not the draw.
+        generator = torch.Generator().manual_seed(0)
+        tau = draw_flow_times(model, len(held), generator).to(device)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
+            _, terms = flow_loss(model, windows(held, generator), n_atoms, tau, generator)
+        return {f"validation_{k}": float(v) for k, v in terms.items()}
+
+    next_snapshot = [config.snapshot_every_s or float("inf")]
+
+    def on_save(spent_s: float) -> None:
+        write(spent_s)
+        if spent_s >= next_snapshot[0]:
+            out = state.with_name(state.name.replace(".flow.train.safetensors", ".safetensors"))
+            shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
+            next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
+
+    return run_stage(model.approximator, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+                     device=device, progress=progress, on_save=on_save)  # fmt: skip
+
+
+def training_domain(frames: TrainingFrames, n_geometry_frames: int = 20_000) -> TrainingDomain:
+    """Return the domain of weights trained on `frames`; the geometry is measured on evenly spaced training frames."""
+    starts = frames.window_starts(1, validation=False)
+    picked = starts[np.linspace(0, len(starts) - 1, min(n_geometry_frames, len(starts))).astype(int)]
+    geometry = geometry_from_frames(frames.scene, frames.positions_nm(picked))
+    return TrainingDomain(frames.scene, frames.lag_ps, frames.conditions, geometry.to_dict())
+
+
+def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float) -> dict[str, Any]:
+    return {
+        "trained": datetime.now(UTC).isoformat(timespec="seconds"),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        "reference_ns": frames.total_ps * 1e-3,
+        "sources": list(frames.sources),
+        "seed": config.seed,
+        "stage_one_s": round(spent_one, 1),
+        "stage_two_s": round(spent_two, 1),
+    }

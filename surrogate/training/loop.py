@@ -1,0 +1,225 @@
+"""One optimisation loop for every stage: budget in seconds or steps, warm-up and cosine, EMA, clipping, exact resume."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from systems.errors import InputError, SimulationError
+from systems.whole_file import create_whole
+
+# (stage, share of the budget done, latest metrics) -> None
+ProgressFn = Callable[[str, float, dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One stage's optimisation. Ends at `budget_s` of training time (summed over resumes) or at `steps`, whichever is
+    first; the learning rate follows the share of that budget which is spent."""
+
+    name: str
+    batch: int
+    learning_rate: float
+    budget_s: float | None = None
+    steps: int | None = None
+    warmup_steps: int = 200
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    ema_decay: float = 0.999
+    seed: int = 0
+    bf16: bool = True
+    validate_every_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if self.budget_s is None and self.steps is None:
+            raise InputError(f"training stage {self.name!r} needs a --budget or a number of steps.")
+
+    def share_done(self, step: int, spent_s: float) -> float:
+        shares = [0.0]
+        if self.steps is not None:
+            shares.append(step / self.steps)
+        if self.budget_s is not None:
+            shares.append(spent_s / self.budget_s)
+        return min(1.0, max(shares))
+
+
+def learning_rate_factor(step: int, share: float, warmup_steps: int) -> float:
+    """Linear warm-up times a cosine from one to one hundredth over the budget."""
+    return min(1.0, (step + 1) / warmup_steps) * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * share)))
+
+
+class Ema:
+    """Exponential moving average of parameters, decay warmed up as min(decay, (1 + n) / (10 + n))."""
+
+    def __init__(self, module: nn.Module, decay: float) -> None:
+        self.decay = decay
+        self.shadow = {name: p.detach().clone() for name, p in module.named_parameters()}
+
+    @torch.no_grad()
+    def update(self, module: nn.Module, step: int) -> None:
+        decay = min(self.decay, (1 + step) / (10 + step))
+        parameters = dict(module.named_parameters())
+        torch._foreach_lerp_(list(self.shadow.values()), [parameters[k].detach() for k in self.shadow], 1.0 - decay)
+
+    @contextmanager
+    def swapped(self, module: nn.Module) -> Iterator[None]:
+        """Inside, the module holds the averaged parameters."""
+        parameters = dict(module.named_parameters())
+        kept = {name: p.detach().clone() for name, p in parameters.items()}
+        self.copy_to(module)
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                for name, p in parameters.items():
+                    p.copy_(kept[name])
+
+    @torch.no_grad()
+    def copy_to(self, module: nn.Module) -> None:
+        for name, p in module.named_parameters():
+            p.copy_(self.shadow[name])
+
+
+def run_stage(
+    module: nn.Module,
+    config: StageConfig,
+    loss_fn: Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]],
+    validate_fn: Callable[[], dict[str, float]],
+    *,
+    state_path: Path,
+    log_path: Path,
+    resume: bool,
+    device: torch.device,
+    progress: ProgressFn | None = None,
+    on_save: Callable[[float], None] | None = None,
+) -> float:
+    """Train `module` in place and leave it holding its EMA weights; return the seconds of training spent.
+
+    `loss_fn(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
+    would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
+    Raises SimulationError when the loss stops being finite; the last saved state stays.
+    """
+    decay, plain = [], []
+    for p in (p for p in module.parameters() if p.requires_grad):
+        (decay if p.ndim >= 2 else plain).append(p)
+    optimiser = torch.optim.AdamW(
+        [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+        lr=config.learning_rate,
+        betas=(0.9, 0.99),
+    )
+    ema = Ema(module, config.ema_decay)
+    generator = torch.Generator().manual_seed(config.seed)
+    step, spent_s = 0, 0.0
+    if resume and state_path.exists():
+        step, spent_s = load_state(state_path, module, ema, optimiser, generator, config)
+    last = time.monotonic()
+    next_validation = spent_s + config.validate_every_s
+    sums: dict[str, Tensor] = {}
+    n_summed = 0
+    while (share := config.share_done(step, spent_s)) < 1.0:
+        factor = learning_rate_factor(step, share, config.warmup_steps)
+        for group in optimiser.param_groups:
+            group["lr"] = config.learning_rate * factor
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=config.bf16):
+            loss, terms = loss_fn(generator)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
+        if not torch.isfinite(norm):
+            raise SimulationError(
+                f"training stage {config.name!r}: loss or gradient is not finite at step {step}; lower the learning "
+                f"rate (now {config.learning_rate:g}). The last good state is {state_path}."
+            )
+        optimiser.step()
+        ema.update(module, step)
+        for key, value in {**terms, "gradient_norm": norm.detach()}.items():
+            sums[key] = sums.get(key, torch.zeros(())) + value.float().cpu()
+        n_summed += 1
+        step += 1
+        now = time.monotonic()
+        spent_s, last = spent_s + now - last, now
+        ended = config.share_done(step, spent_s) >= 1.0
+        if spent_s >= next_validation or ended:
+            with ema.swapped(module):
+                metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | validate_fn()
+                if on_save is not None:
+                    on_save(spent_s)
+            sums, n_summed = {}, 0
+            append_row(log_path, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
+                                  "learning_rate": config.learning_rate * factor, **metrics})  # fmt: skip
+            save_state(state_path, module, ema, optimiser, generator, step, spent_s, config)
+            if progress is not None:
+                progress(config.name, config.share_done(step, spent_s), metrics)
+            # Validation is not training: it is left out of the budget.
+            last = time.monotonic()
+            next_validation = spent_s + config.validate_every_s
+        elif progress is not None and step % 10 == 0:
+            progress(config.name, config.share_done(step, spent_s), {})
+    ema.copy_to(module)
+    return spent_s
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Append a row to a CSV whose columns are those of its first row."""
+    new = not path.exists()
+    columns = list(row) if new else next(csv.reader(path.open()))
+    with path.open("a", newline="") as handle:
+        writer = csv.DictWriter(handle, columns, extrasaction="ignore", restval="")
+        if new:
+            writer.writeheader()
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
+               step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
+    """Write the training state (safetensors, JSON in its metadata) whole or not at all."""
+    from safetensors.torch import save_file
+
+    tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
+    tensors |= {f"ema.{k}": v.cpu().contiguous() for k, v in ema.shadow.items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
+    tensors["generator"] = generator.get_state()
+    header = {"step": step, "spent_s": spent_s, "stage": config.name, "seed": config.seed, "batch": config.batch}
+    metadata = {"surromd_training": json.dumps(header)}
+    create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
+
+
+def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
+               config: StageConfig) -> tuple[int, float]:  # fmt: skip
+    """Put a saved state back; return (step, spent_s). Raises InputError when it is of another run."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as handle:
+            header = json.loads(handle.metadata()["surromd_training"])
+            tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"training state {path} cannot be read ({error}); train again without --resume.") from error
+    for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch)):
+        if header[key] != expected:
+            raise InputError(f"training state {path} has {key} {header[key]!r}, this run {expected!r}.")
+    sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
+    try:
+        module.load_state_dict(sub("model."))
+    except RuntimeError as error:
+        raise InputError(f"training state {path} is of another configuration: {str(error).splitlines()[0]}") from error
+    for name, tensor in sub("ema.").items():
+        ema.shadow[name].copy_(tensor)
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in sub("optimiser.").items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = tensor
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    generator.set_state(tensors["generator"])
+    return int(header["step"]), float(header["spent_s"])

@@ -1,0 +1,93 @@
+"""The two stages' losses: reconstruction (stage one) and data-prediction flow matching (stage two)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
+from surrogate.models.lam_slide.model import LamSlide
+
+# The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
+TAU_MAX = 0.995
+
+
+def random_rotations(n: int, generator: torch.Generator) -> Tensor:
+    """Return `(n, 3, 3)` rotations, uniform over SO(3): normalised Gaussian quaternions."""
+    w, x, y, z = F.normalize(torch.randn(n, 4, generator=generator), dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(n, 3, 3)
+
+
+def autoencoder_loss(
+    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1."""
+    c = model.config.autoencoder
+    batch, n_atoms, _ = frames_nm.shape
+    x = frames_nm / model.config.position_scale_nm
+    identifiers = model.identifiers(n_atoms).expand(batch, n_atoms)
+    if c.random_identifiers > 0:
+        drawn = draw_identifiers(n_atoms, c.identifier_pool, batch, generator).to(x.device)
+        pick = torch.rand(batch, 1, generator=generator).to(x.device) < c.random_identifiers
+        identifiers = torch.where(pick, drawn, identifiers)
+    numbers = elements.expand(batch, n_atoms)
+    latents = model.autoencoder.encode(x, numbers, identifiers)
+    noise = torch.randn(latents.shape, generator=generator).to(x.device)
+    decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_elements=c.type_weight > 0)
+    position, distance = reconstruction_losses(x, decoded.positions)
+    loss = c.position_weight * position + c.distance_weight * distance
+    terms = {"position": position, "distance": distance}
+    if decoded.element_logits is not None:
+        terms["type"] = F.cross_entropy(decoded.element_logits.flatten(0, 1), numbers.flatten())
+        loss = loss + c.type_weight * terms["type"]
+    return loss, {k: v.detach() for k, v in terms.items()}
+
+
+def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> Tensor:
+    """Return logit-normal flow times `(batch,)` in (0, TAU_MAX]."""
+    c = model.config.approximator
+    draws = torch.randn(batch, generator=generator) * c.tau_scale + c.tau_location
+    return torch.sigmoid(draws).clamp(max=TAU_MAX)
+
+
+def flow_loss(
+    model: LamSlide, latents: Tensor, n_atoms: int, tau: Tensor, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames, plus decoded position and distance.
+
+    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
+    without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
+    decoder's own error is not charged to the approximator.
+    """
+    c = model.config.approximator
+    known = latents[:, : c.n_conditioning]
+    noise = torch.randn(latents.shape, generator=generator).to(latents.device)
+    alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
+    prediction = model.approximator(alpha * latents + sigma * noise, tau, known)[:, c.n_conditioning :]
+    target = latents[:, c.n_conditioning :]
+    weight = torch.ones_like(tau)
+    if c.precondition:
+        weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
+    loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
+    terms = {"flow": loss.detach()}
+    if c.auxiliary_frames and (c.position_weight or c.distance_weight):
+        pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
+        scale = model.config.position_scale_nm
+        decoded = model.decode(prediction[:, pick], n_atoms) / scale
+        with torch.no_grad():
+            clean = model.decode(target[:, pick], n_atoms) / scale
+        w = weight.reshape(-1, 1, 1, 1).sqrt()
+        position = ((decoded - clean) * w).square().sum(-1).mean()
+        i, j = torch.triu_indices(n_atoms, n_atoms, 1)
+        span = lambda x: ((x[..., i, :] - x[..., j, :]).square().sum(-1) + 1e-12).sqrt()  # noqa: E731
+        distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
+        loss = loss + c.position_weight * position + c.distance_weight * distance
+        terms |= {"position": position.detach(), "distance": distance.detach()}
+    return loss, terms
