@@ -13,6 +13,7 @@ from systems.errors import InputError
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
+_FARTHEST_ANGSTROM = 9_999.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,11 @@ def read_structure(path: Path) -> StructureFile:
             raise InputError(
                 f"{path}: atom {atom.serial} ({atom.name}) has a position that is not a number; "
                 "write the structure again from the program that made it."
+            )
+        if any(abs(x) > _FARTHEST_ANGSTROM for x in atom.position_angstrom):
+            raise InputError(
+                f"{path}: atom {atom.serial} ({atom.name}) lies beyond {_FARTHEST_ANGSTROM:,.0f} Å; "
+                "centre the structure, or correct the coordinate."
             )
     return found
 

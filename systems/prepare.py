@@ -145,6 +145,8 @@ def _refuse_gaps(bonding: Bonding, atoms: Sequence[AtomRecord], chain_ends: set[
 
 def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
     for residue in bonding.residues:
+        if all(atoms[i].element == "H" for i in residue.atoms):
+            raise PreparationError(f"{residue.label} has only hydrogens; give its other atoms, or number it correctly.")
         if residue.template is None or not residue.heavy:
             if len(residue.atoms) == 1 and atoms[residue.atoms[0]].element != "C":
                 continue

@@ -129,7 +129,7 @@ def test_superposition_refuses_what_does_not_fit(alanine_dipeptide: Scene) -> No
         superpose(x, x[:5])
     with pytest.raises(InputError, match="weights"):
         superpose(x, x, weights=-np.ones(22))
-    with pytest.raises(InputError, match="No|no atom"):
+    with pytest.raises(InputError, match="no atom"):
         superpose(x, x, idx=[])
 
 

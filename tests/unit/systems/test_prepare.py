@@ -25,13 +25,14 @@ RESIDUES = [ALA2.residue_names[r] for r in ALA2.residue_of_atom]
 NUMBERS = [int(ALA2.residue_ids[r]) for r in ALA2.residue_of_atom]
 
 # Names of the library's 22 atoms in other programs' files.
-NAMES = {
-    "amber": [*ALA2.atom_names],
-    "old-amber": ["HH31", "CH3", "HH32", "HH33", "C", "O", "N", "H", "CA", "HA", "CB", "HB1", "HB2", "HB3", "C", "O", "N", "H", "CH3", "HH31", "HH32", "HH33"],
-    "charmm": ["HY1", "CAY", "HY2", "HY3", "CY", "OY", "N", "HN", "CA", "HA", "CB", "HB1", "HB2", "HB3", "C", "O", "NT", "HNT", "CAT", "HT1", "HT2", "HT3"],
-    "pdb-v2": ["1HH3", "CH3", "2HH3", "3HH3", "C", "O", "N", "H", "CA", "HA", "CB", "1HB", "2HB", "3HB", "C", "O", "N", "H", "CH3", "1HH3", "2HH3", "3HH3"],
-    "obabel": list("HCHHCONHCHCHHHCONHCHHH"),
+STYLES = {
+    "amber": " ".join(ALA2.atom_names),
+    "old-amber": "HH31 CH3 HH32 HH33 C O N H CA HA CB HB1 HB2 HB3 C O N H CH3 HH31 HH32 HH33",
+    "charmm": "HY1 CAY HY2 HY3 CY OY N HN CA HA CB HB1 HB2 HB3 C O NT HNT CAT HT1 HT2 HT3",
+    "pdb-v2": "1HH3 CH3 2HH3 3HH3 C O N H CA HA CB 1HB 2HB 3HB C O N H CH3 1HH3 2HH3 3HH3",
+    "obabel": "H C H H C O N H C H C H H H C O N H C H H H",
 }
+NAMES = {style: names.split() for style, names in STYLES.items()}
 
 
 def _pdb(
@@ -233,7 +234,7 @@ def test_alternate_locations_keep_the_most_occupied(tmp_path: Path) -> None:
         )  # fmt: skip
         scene = prepare(str(path))
         assert scene.n_atoms == 22
-        first = [i for i, n in enumerate(scene.atom_names) if n == "HB1"][0]
+        first = next(i for i, n in enumerate(scene.atom_names) if n == "HB1")
         assert scene.positions_nm[first] == pytest.approx(expected, abs=1e-4)
         assert "alternate locations in 1 residues" in scene.provenance["repairs"][0]
 
@@ -311,6 +312,11 @@ def test_structures_beyond_repair_are_refused(tmp_path: Path) -> None:
     broken = ALA2.positions_nm.copy()
     broken[16:] += 0.5
     assert "OXT" in str(prepare(str(_pdb(tmp_path / "cap.pdb", broken[:16], order=range(16)))).provenance["repairs"])
+    bare = _pdb(tmp_path / "bare.pdb", numbers=[*NUMBERS[:13], 9, *NUMBERS[14:]], order=_subset(lambda i: i != 12))
+    assert "only hydrogens" in _refusal(bare)
+    huge = ALA2.positions_nm * 1.0
+    huge[3] = 2e3
+    assert "beyond" in _refusal(_pdb(tmp_path / "huge.pdb", huge))
     residues = ["ACE"] * 6 + ["ALA"] * 10
     gap = _pdb(
         tmp_path / "gap.pdb", np.concatenate([ALA2.positions_nm[:16], broken[6:16] + 1.0]),
