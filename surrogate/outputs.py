@@ -106,7 +106,7 @@ def find_trajectories(spec: str | Path | Sequence[str | Path]) -> list[Path]:
     if any(c in text for c in "*?["):
         import glob
 
-        found = [Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")]  # noqa: PTH207 - any root
+        found = [Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")]
         if found:
             return found
         raise InputError(f"{text}: no file matches.")

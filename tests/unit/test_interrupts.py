@@ -1,0 +1,54 @@
+"""Ctrl-C waits for the caller to look, and the old handlers come back."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+import pytest
+
+from systems import interrupts
+from systems.interrupts import deferred_interrupt
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_noted_and_interrupts_nothing(number: signal.Signals) -> None:
+    with deferred_interrupt() as asked_to_stop:
+        assert not asked_to_stop()
+        signal.raise_signal(number)
+        assert asked_to_stop()
+
+
+def test_without_it_ctrl_c_interrupts_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_handlers_come_back_after_an_exception_too() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(ZeroDivisionError), deferred_interrupt():
+        assert signal.getsignal(signal.SIGINT) is not before[0]
+        raise ZeroDivisionError
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_a_second_ctrl_c_means_now_but_not_one_that_follows_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    with deferred_interrupt():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        monkeypatch.setattr(interrupts, "_PATIENCE_S", -1.0)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_outside_the_main_thread_nothing_is_deferred() -> None:
+    seen: list[bool] = []
+
+    def work() -> None:
+        with deferred_interrupt() as asked_to_stop:
+            seen.append(asked_to_stop())
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [False]
