@@ -87,11 +87,18 @@ def normalise(x: Tensor) -> Tensor:
 
 
 class CrossAttentionBlock(nn.Module):
-    """Pre-norm cross-attention and feed-forward: queries `(b, n, width)` read from a context `(b, m, context)`."""
+    """Pre-norm cross-attention and feed-forward: queries `(b, n, width)` read from a context `(b, m, context)`.
 
-    def __init__(self, width: int, context: int, n_heads: int, head_dim: int, mlp_ratio: int = 4) -> None:
+    With `gated`, what a query reads is multiplied by a gate computed from the query. Softmax attention selects among
+    context vectors; when there are few of them, only a gate lets each query read its own components of one vector.
+    """
+
+    def __init__(
+        self, width: int, context: int, n_heads: int, head_dim: int, mlp_ratio: int = 4, *, gated: bool = False
+    ) -> None:
         super().__init__()
         self.n_heads = n_heads
+        self.gate = nn.Linear(width, n_heads * head_dim) if gated else None
         self.norm = nn.LayerNorm(width)
         self.q = nn.Linear(width, n_heads * head_dim)
         self.kv = nn.Linear(context, 2 * n_heads * head_dim)
@@ -105,10 +112,16 @@ class CrossAttentionBlock(nn.Module):
 
     def forward(self, x: Tensor, context: Tensor, key_mask: Tensor | None = None) -> Tensor:
         """`key_mask` (b, m) is True where the context holds a real entity."""
-        split = lambda t: t.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # noqa: E731
-        q = split(self.q(self.norm(x)))
-        k, v = (split(t) for t in self.kv(context).chunk(2, dim=-1))
-        mask = None if key_mask is None else key_mask[:, None, None, :]
-        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        x = x + self.out(attended.transpose(1, 2).flatten(-2))
+        normed = self.norm(x)
+        k, v = self.kv(context).chunk(2, dim=-1)
+        if context.shape[-2] == 1 and key_mask is None:
+            attended = v  # attention over a single key returns its value
+        else:
+            split = lambda t: t.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # noqa: E731
+            mask = None if key_mask is None else key_mask[:, None, None, :]
+            attended = F.scaled_dot_product_attention(split(self.q(normed)), split(k), split(v), attn_mask=mask)
+            attended = attended.transpose(1, 2).flatten(-2)
+        if self.gate is not None:
+            attended = attended * self.gate(normed)
+        x = x + self.out(attended)
         return x + self.mlp(x)

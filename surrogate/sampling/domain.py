@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.training.checkpoint import Weights
 from systems.errors import OutOfDomainError
 from systems.matching import match_atoms
 from systems.scene import Scene
+
+if TYPE_CHECKING:
+    # Sampling and training know nothing of each other at run time: the api hands the weights over.
+    from surrogate.data.weights import Weights
 
 
 def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,6 @@ import torch
 
 from surrogate.models.interface import draw_noise
 from surrogate.sampling.domain import match_scene
-from surrogate.training.checkpoint import Weights
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
 from systems.scene import Scene
@@ -29,6 +28,9 @@ from systems.trajectory_types import TrajectoryWriter
 from systems.units import format_time_ps, whole_steps
 from systems.validity import INVALID, Geometry, check_frames
 from systems.whole_file import create_whole
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
 
 # (frames done, frames in all) of one replica -> None
 ProgressFn = Callable[[int, int], None]

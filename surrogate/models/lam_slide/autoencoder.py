@@ -39,10 +39,11 @@ class Autoencoder(nn.Module):
         self.identifiers = nn.Embedding(c.identifier_pool, c.identifier_dim)
         self.elements = nn.Embedding(MAX_ATOMIC_NUMBER + 1, 16)
         coordinate_dim = 3 * (1 + 2 * c.n_octaves)
+        # Identifiers bind to coordinates by a product, so that a sum over atoms can be taken apart again.
+        self.embed_coordinates = nn.Linear(coordinate_dim, c.width)
+        self.embed_entity = nn.Linear(16 + c.identifier_dim, 2 * c.width)
         self.embed = nn.Sequential(
-            nn.Linear(coordinate_dim + 16 + c.identifier_dim, c.width),
-            nn.GELU(approximate="tanh"),
-            nn.Linear(c.width, c.width),
+            nn.Linear(c.width, c.width), nn.GELU(approximate="tanh"), nn.Linear(c.width, c.width)
         )
         self.queries = nn.Parameter(torch.randn(c.n_latents, c.width) * 0.5)
         self.encoder = nn.ModuleList(
@@ -51,17 +52,17 @@ class Autoencoder(nn.Module):
         self.to_latent = nn.Linear(c.width, c.latent_dim)
         self.query = nn.Linear(c.identifier_dim, c.width)
         self.decoder = nn.ModuleList(
-            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim) for _ in range(c.n_decoder_layers)
+            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim, gated=True) for _ in range(c.n_decoder_layers)
         )
         self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
         self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))
 
     def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
         """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
-        tokens = torch.cat(
-            [fourier_features(x, self.config.n_octaves), self.elements(elements), self.identifiers(identifiers)], dim=-1
-        )
-        tokens = self.embed(tokens)
+        entity = self.embed_entity(torch.cat([self.elements(elements), self.identifiers(identifiers)], dim=-1))
+        scale, shift = entity.chunk(2, dim=-1)
+        tokens = self.embed_coordinates(fourier_features(x, self.config.n_octaves)) * scale + shift
+        tokens = tokens + self.embed(tokens)
         latents = self.queries.expand(x.shape[0], -1, -1)
         for block in self.encoder:
             latents = block(latents, tokens, mask)
