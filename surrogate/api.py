@@ -7,7 +7,9 @@ the command line takes: a library name, a path, or `sequence:ACE-ALA-NME`. Every
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,13 +62,16 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
     return record
 
 
-def prepare(scene: str | Scene) -> Scene:
-    """Return a Scene for what a user may write: a Scene itself, a library name, a path, or `sequence:...`."""
+def _prepare(scene: str | Scene, *, quiet: bool) -> Scene:
+    """Return a Scene for what a user may write; what had to be repaired is said on stderr."""
     if not isinstance(scene, str):
         return scene
-    from systems.prepare import prepare as prepare_spec
+    from systems.prepare import prepare
 
-    return prepare_spec(scene)
+    prepared = prepare(scene)
+    for line in [] if quiet else prepared.provenance.get("repairs", []):
+        sys.stderr.write(f"{scene}: {line}\n")
+    return prepared
 
 
 def reference(
@@ -112,7 +117,7 @@ def reference(
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything is prepared
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
-    molecule = prepare(scene)
+    molecule = _prepare(scene, quiet=quiet)
     label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
     with (
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
@@ -130,6 +135,81 @@ def _force(force_field: str, solvent: str, hydrogen_mass_da: float | None) -> Fo
 def _check_ensemble(ensemble: str) -> None:
     if ensemble.lower() != "nvt":
         raise InputError(f"ensemble {ensemble!r} is not available; only nvt (Langevin) is, so far.")
+
+
+def rollout(
+    scene: str | Scene,
+    weights: PathLike,
+    out: PathLike,
+    *,
+    time_ps: float,
+    save_every_ps: float | None = None,
+    replicas: int = 1,
+    seed: int = 0,
+    solver_steps: int | None = None,
+    precision: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+) -> list[Path]:
+    """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
+
+    `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
+    the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
+    run in one batch and are named as by `reference`. `precision`: 'fp32', 'bf16' or 'auto'.
+    Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError,
+    StorageError.
+    """
+    from md_reference.replicas import replica_paths
+
+    outs = replica_paths(Path(out), replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
+    file = weights_path(weights)
+    molecule = _prepare(scene, quiet=quiet)
+
+    from surrogate.sampling.rollout import RolloutConfig
+    from surrogate.sampling.rollout import rollout as roll
+    from surrogate.data.weights import load_weights
+
+    config = RolloutConfig(time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, precision=precision)
+    if solver_steps is not None:
+        config = replace(config, solver_steps=solver_steps)
+    loaded = load_weights(file)
+    label = f"surrogate {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
+    saved_ps = loaded.domain.lag_ps if save_every_ps is None else save_every_ps
+    with (
+        guarded_outputs(outs, resumable="the same command with --resume goes on"),
+        # The bar counts one replica's frames; all of them advance together.
+        progress_bar(label, quiet=quiet, ps_per_frame=saved_ps) as progress,
+    ):
+        return roll(molecule, loaded, outs, config, resume=resume, overwrite=overwrite, progress=progress)
+
+
+def demo(
+    out_dir: PathLike = "surromd-demo",
+    *,
+    reference_ps: float = 3_000.0,
+    rollout_ps: float = 20_000.0,
+    seed: int = 0,
+    quiet: bool = False,
+) -> Comparison:
+    """The whole way on alanine dipeptide: two OpenMM runs, a longer rollout with shipped weights, the comparison.
+
+    Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate.h5, report.html and report.json into `out_dir`,
+    replacing those of an earlier demo.
+    """
+    folder = Path(out_dir)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(f"{folder} is a file; name a folder with --out.") from None
+    name = "alanine-dipeptide"
+    weights_path(name)  # missing weights are noticed before anything is simulated
+    truth, replicate = reference(
+        name, folder / "reference.h5", time_ps=reference_ps, replicas=2, seed=seed, overwrite=True, quiet=quiet
+    )
+    (rolled,) = rollout(name, name, folder / "surrogate.h5", time_ps=rollout_ps, seed=seed, overwrite=True, quiet=quiet)
+    return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"])
 
 
 def compare(

@@ -284,9 +284,6 @@ def rollout(
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Run outside the domain of the weights, at your risk.")
-    ] = False,
     quiet: QuietOpt = False,
     as_json: JsonOpt = False,
 ) -> None:
@@ -305,7 +302,6 @@ def rollout(
         precision=precision.value,
         resume=resume,
         overwrite=overwrite,
-        force=force,
         quiet=quiet,
     )
     _print_written(written, as_json, quiet)

@@ -22,6 +22,7 @@ from surrogate.models.interface import draw_noise
 from surrogate.sampling.domain import match_scene
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
+from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
 from systems.trajectory_types import TrajectoryWriter
@@ -82,7 +83,8 @@ def rollout(
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
     marked with its chunk and its validity flags (systems.validity) against the geometry of the training reference.
     Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a replica does not depend on how many
-    run beside it, and a resumed rollout continues as if it had not stopped.
+    run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C and SIGTERM stop between two chunks,
+    with everything on disk: KeyboardInterrupt.
     Raises OutOfDomainError, InputError, StorageError; SimulationError when a chunk ends in a frame that is not finite
     (it is in the file, marked).
     """
@@ -112,6 +114,7 @@ def rollout(
     started = time.monotonic() - state.wall_s
     buffers: list[list[tuple[Float32Array, Any, Any, Any]]] = [[] for _ in outs]
     with ExitStack() as stack:
+        asked_to_stop = stack.enter_context(deferred_interrupt())
         writers = []
         for k, path in enumerate(outs):
             record = _record(weights, config, settings, save_every_ps, replica=k)
@@ -135,8 +138,8 @@ def rollout(
             state.chunks += 1
             state.wall_s = time.monotonic() - started
             broken = [k for k in range(len(outs)) if not np.isfinite(state.last_frames[k]).all()]
-            ended = state.steps >= n_frames * stride or bool(broken)
-            if ended or time.monotonic() - last_flush > flush_every_s:
+            complete, stopping = state.steps >= n_frames * stride, asked_to_stop()
+            if complete or broken or stopping or time.monotonic() - last_flush > flush_every_s:
                 for writer, buffer in zip(writers, buffers, strict=True):
                     _flush(writer, buffer)
                 _write_state(state_path, state, settings)
@@ -150,6 +153,8 @@ def rollout(
                     f"{format_time_ps(state.steps * lag_ps)}; they are marked in {outs[broken[0]]}. Try --precision fp32 "
                     "or other weights."
                 )
+            if stopping and not complete:
+                raise KeyboardInterrupt
         state.wall_s = time.monotonic() - started
         for writer in writers:
             writer.update_record({"completed": True, "cost": _cost(state, config, len(outs), n_frames, save_every_ps)})

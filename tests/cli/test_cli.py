@@ -166,11 +166,12 @@ def test_truncated_hdf5_is_refused_not_read_as_far_as_it_goes(here: Path, short_
     assert [p.name for p in here.iterdir()] == ["cut.h5"]
 
 
-def test_a_molecule_the_weights_do_not_cover(here: Path) -> None:
+def test_a_molecule_the_weights_do_not_cover(here: Path, tiny_weights: Path) -> None:
     message = refused(
-        run("rollout", "sequence:ACE-GLY-NME", "--weights", "alanine-dipeptide", "--time", "1ns", "-o", "x.h5")
+        run("rollout", "sequence:ACE-GLY-NME", "--weights", str(tiny_weights), "--time", "1ns", "-o", "x.h5")
     )
-    assert "surromd reference" in message or "surromd train" in message, "it says what to run instead"
+    assert "alanine-dipeptide (C6H12N2O2, 22 atoms)" in message, "it says what they cover"
+    assert "surromd reference" in message and "surromd train" in message, "and what to run instead"
     assert not list(here.iterdir())
 
 
