@@ -87,7 +87,7 @@ def _windows(path: Path) -> dict[str, Any]:
 
 
 def _weights(path: Path) -> dict[str, Any]:
-    from surrogate.training.checkpoint import load_weights
+    from surrogate.data.weights import load_weights
 
     weights = load_weights(path)
     n_parameters = sum(p.numel() for p in weights.model.parameters())
