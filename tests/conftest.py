@@ -60,3 +60,42 @@ def alanine_dipeptide() -> Scene:
     from systems.library import load
 
     return load("alanine-dipeptide")
+
+
+@pytest.fixture(scope="session")
+def harmonic_frames(alanine_dipeptide):
+    """Synthetic training frames: correlated Gaussian motion about the library geometry, two runs of 400 frames."""
+    import numpy as np
+
+    from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+
+    scene = alanine_dipeptide
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(800, scene.n_atoms, 3))
+    for t in range(1, 800):
+        noise[t] = 0.8 * noise[t - 1] + 0.6 * noise[t]
+    positions = canonicalise(scene.positions_nm + 0.004 * noise, scene)
+    conditions = {"force_field": "none", "solvent": "none", "temperature_k": 300.0}
+    return TrainingFrames(scene, quantise(positions), np.array([0, 400, 800]), 1.0, True, conditions, ())
+
+
+@pytest.fixture(scope="session")
+def small_model_config():
+    """A model small enough to train in a second."""
+    from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+
+    return LamSlideConfig(
+        autoencoder=AutoencoderConfig(latent_dim=12, width=64, head_dim=16, random_identifiers=0.0),
+        approximator=ApproximatorConfig(chunk_frames=8, width=64, n_layers=2, n_heads=2, auxiliary_frames=2),
+    )
+
+
+@pytest.fixture(scope="session")
+def small_weights(tmp_path_factory, harmonic_frames, small_model_config):
+    """Weights trained for a second on the synthetic frames: good for plumbing, not for chemistry."""
+    from surrogate.data.weights import load_weights
+    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+
+    out = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    config = TrainingConfig(stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False)
+    return load_weights(train_lam_slide(harmonic_frames, out, small_model_config, config))

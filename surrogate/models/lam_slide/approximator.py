@@ -9,6 +9,7 @@ from torch.nn import functional as F
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.config import ApproximatorConfig
+from systems.errors import InputError
 
 
 Rope = tuple[Tensor, Tensor]
@@ -36,6 +37,9 @@ class Approximator(nn.Module):
     def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int) -> None:
         super().__init__()
         self.config = c = config
+        if n_latents % c.latents_per_token:
+            raise InputError(f"latents_per_token = {c.latents_per_token} does not divide {n_latents} latents.")
+        n_latents, latent_dim = n_latents // c.latents_per_token, latent_dim * c.latents_per_token
         self.embed_noisy = nn.Linear(latent_dim, c.width)
         self.embed_conditioning = nn.Linear(latent_dim, c.width)
         self.embed_mask = nn.Embedding(2, c.width)
@@ -68,6 +72,9 @@ class Approximator(nn.Module):
         return self._network(o, tau, conditioning)
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Tensor) -> Tensor:
+        shape, per_token = o.shape, self.config.latents_per_token
+        if per_token > 1:
+            o, conditioning = (t.unflatten(2, (-1, per_token)).flatten(-2) for t in (o, conditioning))
         n_known, n_frames = conditioning.shape[1], o.shape[1]
         known = torch.zeros(n_frames, dtype=torch.long, device=o.device)
         known[:n_known] = 1
@@ -84,4 +91,4 @@ class Approximator(nn.Module):
             h = layer(h, modulation, rope_latent, rope_time)
         shift, scale = self.final_modulation(time)[:, None, None, :].chunk(2, dim=-1)
         h = F.layer_norm(h.transpose(1, 2), h.shape[-1:]) * (1.0 + scale) + shift
-        return self.final(h).float()
+        return self.final(h).float().reshape(shape)

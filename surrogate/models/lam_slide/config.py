@@ -17,8 +17,8 @@ class AutoencoderConfig:
     """Stage one (Tables 8 to 12; small sizes). `latent_noise` is the standard deviation added to latents in training:
     with LayerNorm bounding their power it makes the encoder spend latent variance where positions need it."""
 
-    n_latents: int = 1
-    latent_dim: int = 96
+    n_latents: int = 4
+    latent_dim: int = 24
     width: int = 128
     n_heads: int = 4
     head_dim: int = 32
@@ -42,6 +42,8 @@ class ApproximatorConfig:
 
     chunk_frames: int = 32
     n_conditioning: int = 1
+    # Latent vectors joined into one token of the transformer: 1 as in the paper, more for fewer and wider tokens.
+    latents_per_token: int = 4
     width: int = 256
     n_layers: int = 7
     n_heads: int = 4
