@@ -74,6 +74,37 @@ def _prepare(scene: str | Scene, *, quiet: bool) -> Scene:
     return prepared
 
 
+def plan(
+    scene: str | Scene,
+    *,
+    force_field: str = "ff14SB",
+    solvent: str = "obc2",
+    temperature_k: float = 300.0,
+    friction_per_ps: float = 1.0,
+    timestep_ps: float = 0.004,
+    hydrogen_mass_da: float | None = 3.0,
+    ensemble: str = "nvt",
+    replicas: int = 1,
+    platform: str = "auto",
+) -> dict[str, Any]:
+    """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
+
+    Steps are timed for about a second. Raises what `reference` raises for settings that cannot be.
+    """
+    from md_reference.plan import make_plan
+
+    _check_ensemble(ensemble)
+    return make_plan(
+        _prepare(scene, quiet=False),
+        _force(force_field, solvent, hydrogen_mass_da),
+        temperature_k=temperature_k,
+        friction_per_ps=friction_per_ps,
+        timestep_ps=timestep_ps,
+        platform=platform,
+        replicas=replicas,
+    ).to_dict()
+
+
 def reference(
     scene: str | Scene,
     out: PathLike,
@@ -167,9 +198,9 @@ def rollout(
     file = weights_path(weights)
     molecule = _prepare(scene, quiet=quiet)
 
+    from surrogate.data.weights import load_weights
     from surrogate.sampling.rollout import RolloutConfig
     from surrogate.sampling.rollout import rollout as roll
-    from surrogate.data.weights import load_weights
 
     config = RolloutConfig(time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, precision=precision)
     if solver_steps is not None:

@@ -363,7 +363,7 @@ def _print_json(value: Any) -> None:
 
 def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
     """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
-    shown = {k: v for k, v in record.items() if v is not None}
+    shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
     width = max((len(k) for k in shown), default=0)
     for key, value in shown.items():
         margin = " " * indent
@@ -373,11 +373,19 @@ def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
         elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
             typer.echo(f"{margin}{key}")
             for entry in value:
-                line = ", ".join(f"{k} {_plain(v)}" for k, v in entry.items()) if isinstance(entry, dict) else entry
-                typer.echo(f"{margin}  {line}")
+                typer.echo(f"{margin}  {_one_line(entry)}")
         else:
             text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
             typer.echo(f"{margin}{key:<{width}}  {text}")
+
+
+def _one_line(entry: Any) -> str:
+    if not isinstance(entry, dict):
+        return str(entry)
+    if "what" in entry:
+        saves = f" ({entry['saves']})" if entry.get("saves") else ""
+        return f"{entry['what']}: {entry['why']}{saves}"
+    return ", ".join(f"{key} {_plain(value)}" for key, value in entry.items())
 
 
 def _plain(value: Any, digits: int = 6) -> str:

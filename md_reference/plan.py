@@ -1,0 +1,195 @@
+"""What a reference run of a scene will compute, what it leaves out, why, and what that saves on this machine."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from md_reference.engine import Engine, choose_platform
+from md_reference.forcefield import ForceFieldSpec, build_system
+from md_reference.replicas import available_cores
+from systems.scene import Scene
+
+# Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
+_LONGEST_NATURAL_STEP_PS = 0.0025
+_STEPS_AT_ONCE = 50
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Something a general MD program would do and this run does not: why that is exact, and what it saves."""
+
+    what: str
+    why: str
+    saves: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run before it starts. `terms` counts the interactions of each force; `us_per_step` is None if not measured."""
+
+    scene: str
+    formula: str
+    n_atoms: int
+    force_field: str
+    solvent: str
+    integrator: str
+    platform: str
+    platform_reason: str
+    parallel: str
+    constraints: str
+    terms: dict[str, int]
+    us_per_step: float | None
+    ns_per_day: float | None
+    skipped: tuple[Skip, ...]
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return asdict(self)
+
+
+def make_plan(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    *,
+    temperature_k: float = 300.0,
+    friction_per_ps: float = 1.0,
+    timestep_ps: float = 0.004,
+    platform: str = "auto",
+    replicas: int = 1,
+    measure_s: float = 0.3,
+) -> Plan:
+    """Return the plan of a run with these settings (units as in `simulate.MDConfig`).
+
+    For `measure_s` of wall time each, steps are timed as planned and as OpenMM would do it unasked; 0 times nothing.
+    Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
+    """
+    chosen, reason = choose_platform(scene.n_atoms, platform)
+    system = build_system(scene, spec)
+    n_constraints = int(system.getNumConstraints())
+    cores = available_cores()
+    planned = default = None
+    if measure_s > 0:
+        bath = (temperature_k, friction_per_ps, timestep_ps)
+        planned = _time_step_s(scene, spec, bath, measure_s, platform=platform, native_gb=True)
+        default = _time_step_s(scene, spec, bath, measure_s, platform="CPU", native_gb=False)
+    return Plan(
+        scene=scene.name,
+        formula=scene.formula,
+        n_atoms=scene.n_atoms,
+        force_field=spec.force_field,
+        solvent=spec.solvent,
+        integrator=f"Langevin middle, {timestep_ps * 1000:g} fs, {temperature_k:g} K, {friction_per_ps:g}/ps",
+        platform=chosen,
+        platform_reason=reason,
+        parallel=_parallel(replicas, cores),
+        constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+        terms=_terms(system),
+        us_per_step=None if planned is None else planned * 1e6,
+        ns_per_day=None if planned is None else timestep_ps * 1e-3 * 86_400.0 / planned,
+        skipped=_skips(scene, spec, n_constraints, planned, default),
+        warnings=_warnings(scene, spec, timestep_ps),
+    )
+
+
+def _time_step_s(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    bath: tuple[float, float, float],
+    wall_s: float,
+    *,
+    platform: str,
+    native_gb: bool,
+) -> float:
+    """Return the wall seconds of one step on one thread: the fastest of all batches, so that other work counts little.
+
+    `bath`: temperature in K, friction in 1/ps, time step in ps.
+    """
+    temperature_k, friction_per_ps, timestep_ps = bath
+    with Engine(
+        scene,
+        spec,
+        temperature_k=temperature_k,
+        friction_per_ps=friction_per_ps,
+        timestep_ps=timestep_ps,
+        platform=platform,
+        native_gb=native_gb,
+    ) as engine:
+        engine.minimise(max_iterations=100)
+        engine.thermalise()
+        engine.step(_STEPS_AT_ONCE)
+        fastest = math.inf
+        began = time.perf_counter()
+        while math.isinf(fastest) or time.perf_counter() - began < wall_s:
+            start = time.perf_counter()
+            engine.step(_STEPS_AT_ONCE)
+            fastest = min(fastest, (time.perf_counter() - start) / _STEPS_AT_ONCE)
+        return fastest
+
+
+def _parallel(replicas: int, cores: int) -> str:
+    if replicas == 1:
+        return "one replica, one thread"
+    side_by_side = min(replicas, cores)
+    return f"{replicas} replicas, {side_by_side} side by side, one process and one thread each"
+
+
+def _terms(system: Any) -> dict[str, int]:
+    counters = {
+        "HarmonicBondForce": "getNumBonds",
+        "HarmonicAngleForce": "getNumAngles",
+        "PeriodicTorsionForce": "getNumTorsions",
+        "CMAPTorsionForce": "getNumTorsions",
+        "NonbondedForce": "getNumParticles",
+        "GBSAOBCForce": "getNumParticles",
+    }
+    found = {}
+    for force in system.getForces():
+        name = force.getName()
+        found[name] = int(getattr(force, counters[name])()) if name in counters else 1
+    return found
+
+
+def _skips(
+    scene: Scene, spec: ForceFieldSpec, n_constraints: int, planned: float | None, default: float | None
+) -> tuple[Skip, ...]:
+    skips = [
+        Skip("periodic box, PME, neighbour lists", "the scene has no periodic cell; all pairs are computed exactly"),
+        Skip("barostat", "there is no volume to control"),
+        Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"),
+        Skip("velocities on disk", "neither the surrogate nor the judge reads them", "half of the file"),
+        Skip("energies and copies between saved frames", "nobody keeps them"),
+    ]
+    if spec.solvent == "vacuum":
+        skips.append(Skip("generalised Born term", "the solvent is vacuum"))
+    elif spec.solvent == "obc2":
+        skips.append(
+            Skip("CustomGBForce of implicit/obc2.xml", "the native GBSAOBCForce has the same energies and forces")
+        )
+    if n_constraints == 0:
+        why = "there is no hydrogen" if "H" not in scene.elements else "bonds to hydrogen move freely here"
+        skips.append(Skip("constraints", why))
+    if planned is not None and default is not None:
+        skips.append(
+            Skip(
+                "OpenMM's own choice of platform and forces (CPU)",
+                "timed here, on one thread",
+                f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step ({default / planned:.1f} times faster)",
+            )
+        )
+    return tuple(skips)
+
+
+def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[str, ...]:
+    found = []
+    natural = spec.hydrogen_mass_da is None or spec.hydrogen_mass_da < 1.5
+    if timestep_ps > _LONGEST_NATURAL_STEP_PS and natural and "H" in scene.elements:
+        found.append(
+            f"{timestep_ps * 1000:g} fs is long for hydrogens of natural mass; use --hydrogen-mass 3Da or 2fs."
+        )
+    if timestep_ps > 0.001 and not spec.constrain_hydrogens and "H" in scene.elements:
+        found.append(f"{timestep_ps * 1000:g} fs is long for unconstrained bonds to hydrogen; use at most 1fs.")
+    return tuple(found)

@@ -1,0 +1,54 @@
+"""The plan says what will run and what will not, and is right about it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from md_reference.forcefield import ForceFieldSpec
+from md_reference.plan import make_plan
+from systems.errors import UnknownNameError
+from systems.scene import Scene
+
+
+def skipped(scene: Scene, spec: ForceFieldSpec) -> set[str]:
+    return {skip.what for skip in make_plan(scene, spec, measure_s=0.0).skipped}
+
+
+def test_terms_and_constraints_are_those_of_the_molecule(alanine_dipeptide: Scene) -> None:
+    plan = make_plan(alanine_dipeptide, ForceFieldSpec(), measure_s=0.0)
+    n_hydrogen = alanine_dipeptide.elements.count("H")
+    assert plan.constraints == f"{n_hydrogen} bonds to hydrogen"
+    assert plan.terms["NonbondedForce"] == plan.terms["GBSAOBCForce"] == 22
+    assert plan.platform == "Reference"
+    assert plan.us_per_step is None
+    json.dumps(plan.to_dict())
+
+
+def test_vacuum_has_no_born_term_and_obc2_no_custom_one(alanine_dipeptide: Scene) -> None:
+    in_vacuum = make_plan(alanine_dipeptide, ForceFieldSpec(solvent="vacuum"), measure_s=0.0)
+    assert "GBSAOBCForce" not in in_vacuum.terms
+    assert "generalised Born term" in skipped(alanine_dipeptide, ForceFieldSpec(solvent="vacuum"))
+    assert "generalised Born term" not in skipped(alanine_dipeptide, ForceFieldSpec())
+    assert "CustomGBForce of implicit/obc2.xml" in skipped(alanine_dipeptide, ForceFieldSpec())
+
+
+def test_a_long_step_with_natural_hydrogens_is_warned_of(alanine_dipeptide: Scene) -> None:
+    natural = ForceFieldSpec(hydrogen_mass_da=None)
+    assert make_plan(alanine_dipeptide, natural, timestep_ps=0.004, measure_s=0.0).warnings
+    assert not make_plan(alanine_dipeptide, natural, timestep_ps=0.002, measure_s=0.0).warnings
+    assert not make_plan(alanine_dipeptide, ForceFieldSpec(), timestep_ps=0.004, measure_s=0.0).warnings
+
+
+def test_the_platform_asked_for_is_kept_or_refused(alanine_dipeptide: Scene) -> None:
+    assert make_plan(alanine_dipeptide, ForceFieldSpec(), platform="CPU", measure_s=0.0).platform == "CPU"
+    with pytest.raises(UnknownNameError, match="Reference"):
+        make_plan(alanine_dipeptide, ForceFieldSpec(), platform="Referense", measure_s=0.0)
+
+
+def test_steps_are_timed_and_the_saving_is_stated(alanine_dipeptide: Scene) -> None:
+    plan = make_plan(alanine_dipeptide, ForceFieldSpec(), measure_s=0.1)
+    assert plan.us_per_step is not None and plan.ns_per_day is not None
+    assert plan.ns_per_day == pytest.approx(0.004e-3 * 86_400.0 / (plan.us_per_step * 1e-6))
+    assert "times faster" in plan.skipped[-1].saves
