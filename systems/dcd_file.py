@@ -1,14 +1,11 @@
 """DCD trajectories (CHARMM's layout) with a PDB and a record beside them, and plain DCD files of other programs.
 
 `NAME.dcd` holds positions in Å, `NAME.pdb` the topology, `NAME.meta.h5` our record, exact times, flags and scalars.
-Layout: blocks of bytes between 32-bit lengths; a header of 4 + 80 bytes (`CORD`, number of frames, first step, steps
-between frames, ..., time step in AKMA units as float32), a title, the number of atoms; then x, y and z of each frame.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.atomic_file import storage_error, write_whole
+from systems.dcd_layout import DcdLayout, header_bytes, step_fields, title_bytes
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.frame_store import (
     FrameStore,
@@ -33,8 +31,6 @@ from systems.pdb_text import pdb_text
 from systems.scene import Scene
 from systems.trajectory_types import Float32Array, FrameBlock, TrajectoryReader, TrajectoryWriter, check_same_topology
 
-AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
-_HEADER_BYTES = 92
 _OUR_PDB = b"REMARK   1 surromd scene"
 
 
@@ -88,7 +84,7 @@ class DcdWriter(TrajectoryWriter):
             made.append(self._meta)
             write_new(self._pdb, topology)
             made.append(self._pdb)
-            write_new(self.path, _header(0, 0, 1, 0.0) + _title(self.scene.n_atoms))
+            write_new(self.path, header_bytes(0, 0, 1, 0.0) + title_bytes(self.scene.n_atoms))
         except SurromdError:
             for file in made:
                 file.unlink(missing_ok=True)
@@ -120,8 +116,8 @@ class DcdWriter(TrajectoryWriter):
         """Make header and file size say `n_frames`. The header is one small write, which is atomic."""
         first, nsavc, timestep_ps = 0, 1, 0.0
         if len(self._first_times):
-            first, nsavc, timestep_ps = _step_fields(self._first_times, self._store.record)
-        write_whole(self._fd, _header(n_frames, first, nsavc, timestep_ps), 0)
+            first, nsavc, timestep_ps = step_fields(self._first_times, self._store.record)
+        write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps), 0)
         os.ftruncate(self._fd, self._layout.offset(n_frames))
 
     def truncate(self, n_frames: int) -> None:
@@ -203,96 +199,6 @@ class DcdReader(TrajectoryReader):
         self._frames = None
 
 
-@dataclass(frozen=True)
-class DcdLayout:
-    """Where the frames of a DCD lie, and what its header says. Sizes in bytes."""
-
-    n_atoms: int
-    first_frame_at: int
-    byte_order: str = "<"
-    has_cell: bool = False
-    n_frames_in_header: int = 0
-    first_time_ps: float = 0.0
-    interval_ps: float = 0.0
-    file_bytes: int = 0
-    path: Path = Path()
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, DcdLayout):
-            return NotImplemented
-        mine = (self.n_atoms, self.first_frame_at, self.byte_order, self.has_cell)
-        return mine == (other.n_atoms, other.first_frame_at, other.byte_order, other.has_cell)
-
-    @staticmethod
-    def ours(n_atoms: int, first_frame_at: int) -> DcdLayout:
-        """Return the layout we write."""
-        return DcdLayout(n_atoms, first_frame_at)
-
-    @staticmethod
-    def read(path: Path) -> DcdLayout:
-        """Read the header. Raises TrajectoryError when it is damaged or of a kind that is not supported."""
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEADER_BYTES)
-                size = os.fstat(file.fileno()).st_size
-                order = next((o for o in "<>" if np.frombuffer(head[:4], f"{o}i4")[:1] == 84), "")
-                if len(head) < _HEADER_BYTES or not order or head[4:8] != b"CORD":
-                    what = "is empty" if size == 0 else "is not a DCD file of the 32-bit kind"
-                    raise TrajectoryError(f"{path} {what}.")
-                fields = np.frombuffer(head[8:88], f"{order}i4")
-                charmm = fields[19] != 0
-                delta = np.frombuffer(head[44:52], f"{order}f4" if charmm else f"{order}f8")[0]
-                if fields[8] != 0 or (charmm and fields[11] != 0):
-                    raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
-                title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
-                file.seek(title + 4, os.SEEK_CUR)
-                _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
-                first_frame_at = file.tell()
-        except OSError as error:
-            reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-            raise TrajectoryError(f"{path} {reason}.") from error
-        except (ValueError, IndexError) as error:
-            raise TrajectoryError(f"{path} is cut short inside its header.") from error
-        if n_atoms < 1:
-            raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        # The time step is float32: digits beyond its seventh are noise.
-        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
-        if not (np.isfinite(interval_ps) and interval_ps > 0):
-            interval_ps = 1.0
-        first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
-        return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
-                         first_time_ps, interval_ps, size, path)  # fmt: skip
-
-    @property
-    def frame_dtype(self) -> np.dtype[Any]:
-        """The NumPy record of one frame, block lengths included."""
-        o = self.byte_order
-        cell = [("cell", f"{o}i4", (14,))] if self.has_cell else []
-        axes = [
-            entry
-            for k in range(3)
-            for entry in ((f"before{k}", f"{o}i4"), (f"x{k}", f"{o}f4", (self.n_atoms,)), (f"after{k}", f"{o}i4"))
-        ]
-        return np.dtype(cell + axes)
-
-    def offset(self, frame: int) -> int:
-        return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
-
-    def times_ps(self, n_frames: int) -> npt.NDArray[np.float64]:
-        return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
-
-    def whole_frames(self) -> int:
-        """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some."""
-        n, rest = divmod(self.file_bytes - self.first_frame_at, int(self.frame_dtype.itemsize))
-        # Some programs never update the count, which then stays 0.
-        if rest or (self.n_frames_in_header not in (0, n)):
-            raise TrajectoryError(
-                f"{self.path} is cut short or damaged: its header states {self.n_frames_in_header} frames, "
-                f"{n} are whole; restore it from a whole copy."
-            )
-        return n
-
-
 def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, in_flight: int) -> None:
     """Raise TrajectoryError unless the DCD holds the recorded frames and at most one append in flight more."""
     extra = layout.file_bytes - layout.offset(n_frames)
@@ -313,47 +219,9 @@ def _is_ours(pdb: Path) -> bool:
 
 
 def _scene_from_top(top: Path, path: Path, n_atoms: int) -> Scene:
-    from systems.from_mdtraj import load_topology, scene_from_mdtraj_topology
+    from systems.from_mdtraj import scene_from_structure
 
-    topology, positions_nm = load_topology(top)
-    if topology.n_atoms != n_atoms:
-        raise InputError(f"{top} has {topology.n_atoms} atoms, {path} has {n_atoms}; give the matching structure.")
-    return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=top.name)
-
-
-def _step_fields(times_ps: npt.NDArray[np.float64], record: dict[str, Any]) -> tuple[int, int, float]:
-    """Return `(first step, steps between frames, time step in ps)` for the header.
-
-    In units of the integration step where the record states one that divides the times, else of the interval.
-    """
-    stated = record.get("save_every_ps")
-    if len(times_ps) > 1:
-        interval = float(times_ps[1] - times_ps[0])
-    else:
-        interval = float(stated) if isinstance(stated, int | float) and stated > 0 else 1.0
-    timestep = record.get("timestep_ps")
-    for unit in (timestep, interval):
-        if not isinstance(unit, int | float) or unit <= 0:
-            continue
-        nsavc, first = round(interval / unit), round(float(times_ps[0]) / unit)
-        fits = abs(nsavc * unit - interval) < 1e-6 * interval and abs(first * unit - times_ps[0]) < 1e-3 * interval
-        if fits and nsavc >= 1 and 0 <= first < 2**31:
-            return first, nsavc, float(unit)
-    return 0, 1, interval
-
-
-def _header(n_frames: int, first_step: int, nsavc: int, timestep_ps: float) -> bytes:
-    fields = np.zeros(20, dtype="<i4")
-    fields[:3] = n_frames, first_step, nsavc
-    fields[3] = min(n_frames * nsavc, 2**31 - 1)
-    fields[9:10] = np.array([timestep_ps / AKMA_PS], dtype="<f4").view("<i4")
-    fields[19] = 24  # CHARMM's version: float32 time step, no unit cell (field 10), three dimensions (field 11)
-    mark = np.array([84], dtype="<i4").tobytes()
-    return mark + b"CORD" + fields.tobytes() + mark
-
-
-def _title(n_atoms: int) -> bytes:
-    line = b"Written by surromd; record and exact times in NAME.meta.h5".ljust(80)
-    mark = np.array([84], dtype="<i4").tobytes()
-    title = mark + np.array([1], dtype="<i4").tobytes() + line + mark
-    return title + np.array([4, n_atoms, 4], dtype="<i4").tobytes()
+    scene = scene_from_structure(top, name=path.stem)
+    if scene.n_atoms != n_atoms:
+        raise InputError(f"{top} has {scene.n_atoms} atoms, {path} has {n_atoms}; give the matching structure.")
+    return scene

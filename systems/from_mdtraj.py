@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from systems.bond_orders import ValenceError, perceive
+from systems.element_data import atomic_weight_da
 from systems.errors import InputError, TrajectoryError
+from systems.pdb_records import read_structure
 from systems.scene import Scene
 from systems.trajectory_types import Float32Array, TrajectoryReader
 
 
 def scene_from_mdtraj_topology(
-    topology: Any, positions_nm: npt.ArrayLike, *, name: str = "trajectory", source: str = ""
+    topology: Any,
+    positions_nm: npt.ArrayLike,
+    *,
+    name: str = "trajectory",
+    source: str = "",
+    elements: Sequence[str] | None = None,
 ) -> Scene:
     """Return a Scene with the atoms, bonds and bond orders of an `mdtraj.Topology`, at positions `(n_atoms, 3)` nm.
 
-    Bond orders that the topology does not state are 0, formal charges 0. Raises InputError when the numbers of atoms
-    differ.
+    `elements` replaces the topology's. Where no bond order is stated, orders and charges are perceived; they stay 0
+    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ.
     """
     positions = np.array(positions_nm, dtype=np.float64)
     if positions.shape != (topology.n_atoms, 3):
         raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
     atoms, residues = list(topology.atoms), list(topology.residues)
-    bonds = sorted(
+    rows = sorted(
         (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), _order(b)) for b in topology.bonds
     )
-    symbols = [a.element.symbol if a.element is not None else "VS" for a in atoms]
+    symbols = list(elements) if elements is not None else [a.element.symbol if a.element else "VS" for a in atoms]
+    bonds = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
+    orders = np.array([row[2] for row in rows], dtype=np.float64)
+    charges = np.array([getattr(a, "formal_charge", None) or 0 for a in atoms], dtype=np.int64)
+    if not orders.any():
+        with contextlib.suppress(ValenceError):
+            orders, charges = perceive(symbols, bonds)
     return Scene(
         name=name,
         atom_names=tuple(a.name for a in atoms),
@@ -38,10 +54,10 @@ def scene_from_mdtraj_topology(
         residue_names=tuple(r.name for r in residues),
         residue_ids=tuple(str(r.resSeq) for r in residues),
         chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
-        bonds=np.array([b[:2] for b in bonds], dtype=np.int64).reshape(-1, 2),
-        bond_orders=np.array([b[2] for b in bonds], dtype=np.float64),
-        formal_charges=np.array([getattr(a, "formal_charge", None) or 0 for a in atoms], dtype=np.int64),
-        masses_da=np.array([a.element.mass if a.element is not None else 0.0 for a in atoms], dtype=np.float64),
+        bonds=bonds,
+        bond_orders=orders,
+        formal_charges=charges,
+        masses_da=np.array([_mass_da(s, a) for s, a in zip(symbols, atoms, strict=True)], dtype=np.float64),
         positions_nm=positions,
         provenance={"source": source} if source else {},
     )
@@ -73,15 +89,27 @@ def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, pat
     return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
 
 
-def load_topology(top: Path) -> tuple[Any, Float32Array]:
-    """Return `(mdtraj.Topology, positions (n_atoms, 3) nm)` of a structure file. Raises InputError."""
+def scene_from_structure(top: Path, *, name: str) -> Scene:
+    """Return the Scene of a structure file that stands beside a trajectory. Raises InputError when it is unreadable.
+
+    Bonds are MDTraj's (its residue templates and CONECT records). Elements of PDB and mmCIF files are read here: where
+    the element column is empty MDTraj takes CA for calcium and HG for mercury.
+    """
     import mdtraj
 
     try:
         structure = mdtraj.load(str(top))
     except Exception as error:  # each MDTraj reader raises its own kinds
         raise InputError(f"{top} cannot be read as a structure: {_first_line(error)}.") from error
-    return structure.topology, structure.xyz[0]
+    topology = structure.topology
+    elements = None
+    with contextlib.suppress(InputError):
+        records = read_structure(top).atoms
+        # MDTraj renames atoms, so that only positions tell whether both readers kept the same ones.
+        read_nm = np.array([r.position_angstrom for r in records]) / 10.0
+        if read_nm.shape == structure.xyz[0].shape and np.allclose(read_nm, structure.xyz[0], atol=1e-4):
+            elements = [r.element for r in records]
+    return scene_from_mdtraj_topology(topology, structure.xyz[0], name=name, source=top.name, elements=elements)
 
 
 class MdtrajReader(TrajectoryReader):
@@ -102,7 +130,9 @@ class MdtrajReader(TrajectoryReader):
         self.time_ps = np.asarray(frames.time, dtype=np.float64)
         self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
         self.scene = None
-        if self.n_frames:
+        if self.n_frames and top is not None:
+            self.scene = scene_from_structure(top, name=path.stem).with_positions(self._positions_nm[0])
+        elif self.n_frames:
             self.scene = scene_from_mdtraj_topology(
                 frames.topology, self._positions_nm[0], name=path.stem, source=path.name
             )
@@ -112,6 +142,13 @@ class MdtrajReader(TrajectoryReader):
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def _mass_da(symbol: str, atom: Any) -> float:
+    try:
+        return atomic_weight_da(symbol)
+    except KeyError:  # an element without a table entry, or a virtual site
+        return float(atom.element.mass) if atom.element is not None else 0.0
 
 
 def _order(bond: Any) -> float:

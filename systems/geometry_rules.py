@@ -162,19 +162,34 @@ def _flat_ring_torsions(scene: Scene, mean_cosine: Any) -> IntArray:
 
     `mean_cosine(quads)` gives the mean cosine of each torsion; a ring is planar when none lies beyond 20°.
     """
-    import networkx as nx
-
-    from systems.chemistry import bonded_graph
-
-    graph = bonded_graph(scene)
     rows: list[tuple[int, ...]] = []
-    for members in nx.minimum_cycle_basis(graph):
-        if not 4 <= len(members) <= 7 or any(graph.degree(i) > 3 for i in members):
-            continue
-        cycle = [edge[0] for edge in nx.find_cycle(graph.subgraph(members))]
-        if len(cycle) != len(members):
-            continue
+    for cycle in _small_rings(scene):
         torsions = [tuple(cycle[(k + m) % len(cycle)] for m in range(4)) for k in range(len(cycle))]
         if (mean_cosine(np.array(torsions, dtype=np.int64)) > _RING_PLANAR_COSINE).all():
             rows.extend(torsions)
     return np.array(rows, dtype=np.int64).reshape(-1, 4)
+
+
+def _small_rings(scene: Scene) -> list[list[int]]:
+    """Rings of 4 to 7 atoms with at most three neighbours each, atoms in order: the smallest ring of each bond."""
+    from systems.chemistry import bonded_graph, ring_bonds
+
+    graph = bonded_graph(scene)
+    rings: dict[frozenset[int], list[int]] = {}
+    for i, j in ring_bonds(scene).tolist():
+        before = {i: i}
+        layer = [i]
+        for _ in range(6):  # breadth first from i to j without the bond itself
+            layer = [
+                step
+                for atom in layer
+                for step in graph[atom]
+                if {atom, step} != {i, j} and step not in before and before.setdefault(step, atom) == atom
+            ]
+        if j in before:
+            ring = [j]
+            while ring[-1] != i:
+                ring.append(before[ring[-1]])
+            if 4 <= len(ring) <= 7 and all(graph.degree(atom) <= 3 for atom in ring):
+                rings.setdefault(frozenset(ring), ring)
+    return list(rings.values())

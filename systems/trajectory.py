@@ -49,6 +49,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
 
     `top` names a structure file for formats without topology; a DCD of ours finds its companions itself. A file
     without our record has `record == {}` and `flags is None`.
+    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds.
     Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
     InputError when a topology is needed, or does not fit.
     """

@@ -279,15 +279,23 @@ def test_other_peoples_dcd(shared_data: Path) -> None:
     with open_trajectory(path) as reader:
         assert reader.scene is None
     with pytest.raises(InputError, match="22"):
-        open_trajectory(path, top=_other_pdb(shared_data))
+        open_trajectory(path, top=shared_data / "adk" / "adk_open.pdb")
 
 
-def _other_pdb(shared_data: Path) -> Path:
-    mdtraj = pytest.importorskip("mdtraj")
-    for path in sorted((shared_data / "adk").iterdir()):
-        if path.suffix in (".pdb", ".gro") and mdtraj.load(str(path)).n_atoms != 22:
-            return path
-    pytest.skip("no other structure")
+def test_a_run_that_stopped_early_is_read_with_a_warning(shared_data: Path, tmp_path: Path) -> None:
+    """CHARMM states the frames it intends: the header of this published file says 500, it holds 98."""
+    folder = shared_data / "adk"
+    with pytest.warns(UserWarning, match="states 500 frames, the file holds 98"):
+        reader = open_trajectory(folder / "adk_dims.dcd", top=folder / "adk_open.pdb")
+    assert (reader.n_frames, reader.n_atoms) == (98, 3341)
+    assert reader.scene is not None  # the file has no element column, and CA is no calcium
+    assert set(reader.scene.elements) == {"H", "C", "N", "O", "S"}
+    assert 2.0 in reader.scene.bond_orders
+    reader.close()
+    data = (folder / "adk_dims.dcd").read_bytes()
+    (tmp_path / "cut.dcd").write_bytes(data[:-1000])
+    with pytest.raises(TrajectoryError, match="cut short"):
+        open_trajectory(tmp_path / "cut.dcd")
 
 
 def test_xtc_through_mdtraj(tmp_path: Path, alanine_dipeptide: Scene) -> None:
