@@ -53,8 +53,8 @@ class TrajectoryWriter(ABC):
         """Append frames `(n, n_atoms, 3)` nm at times `(n,)` ps, later than all before, and flush them to disk.
 
         `flags` `(n,)` are validity bits (systems.validity), given for all frames of a file or for none; `chunk_idx` is
-        the surrogate's chunk these frames came from, one number or `(n,)` (-1: none); `scalars` are further `(n,)` series by name, NaN in
-        frames where they are not given.
+        the surrogate's chunk these frames came from, one number or `(n,)` (-1: none); `scalars` are further `(n,)`
+        series by name, NaN in frames where they are not given.
         Raises InputError for frames that do not fit the scene, the times or what was appended before; StorageError
         when the disk is full (what was complete stays readable, the writer is then closed to further frames).
         """
@@ -114,7 +114,10 @@ class TrajectoryWriter(ABC):
         for name, values in series.items():
             if values.shape != (n,) or "/" in name or not name:
                 raise InputError(f"{where}: scalar {name!r} must have shape ({n},) and no slash in its name.")
-        chunk = np.asarray(-1 if chunk_idx is None else chunk_idx, dtype=np.int32)
+        chunk = np.asarray(-1 if chunk_idx is None else chunk_idx)
+        if chunk.shape not in ((), (n,)) or chunk.dtype.kind not in "ui":
+            raise InputError(f"{where}: chunk_idx must be one integer or {n}, not {chunk.dtype} of {chunk.shape}.")
+        chunk = np.broadcast_to(chunk, (n,)).astype(np.int32)
         if chunk.shape not in ((), (n,)):
             raise InputError(f"{where}: chunk_idx must be one number or {n} of them, not of shape {chunk.shape}.")
         chunk = np.broadcast_to(chunk, (n,))

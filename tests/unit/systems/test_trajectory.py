@@ -135,11 +135,13 @@ def test_record_scalars_and_absent_flags(tmp_path: Path, suffix: str) -> None:
     with open_writer(path, chain(5), RECORD) as writer:
         writer.append(frames(2), [1.0, 2.0])
         writer.append(frames(2), [3.0, 4.0], scalars={"late": [5.0, 6.0]}, chunk_idx=None)
+        writer.append(frames(2), [5.0, 6.0], scalars={"late": [7.0, 8.0]}, chunk_idx=[3, 4])
         writer.update_record({"cost": {"wall_s": np.float64(1.5), "steps": np.arange(2)}, "completed": True})
         writer.update_record({"long": "x" * 20_000})
     with open_trajectory(path) as reader:
         assert reader.flags is None
-        np.testing.assert_array_equal(reader.scalars["late"], [np.nan, np.nan, 5.0, 6.0])
+        np.testing.assert_array_equal(reader.scalars["late"], [np.nan, np.nan, 5.0, 6.0, 7.0, 8.0])
+        np.testing.assert_array_equal(reader.chunk_idx, [-1, -1, -1, -1, 3, 4])
         assert reader.record == RECORD | {
             "cost": {"wall_s": 1.5, "steps": [0, 1]}, "completed": True, "long": "x" * 20_000
         }  # fmt: skip
@@ -391,6 +393,8 @@ def test_usage_errors(tmp_path: Path) -> None:
         (frames(2), [3.0, np.nan], {}),
         (frames(2), [3.0, 4.0], {"flags": [0, 0]}),
         (frames(2), [3.0, 4.0], {"flags": [0.5, 0.5]}),
+        (frames(2), [3.0, 4.0], {"chunk_idx": [0, 1, 2]}),
+        (frames(2), [3.0, 4.0], {"chunk_idx": 0.5}),
         (frames(2), [3.0, 4.0], {"scalars": {"e": [1.0]}}),
         (frames(2), [3.0, 4.0], {"scalars": {"a/b": [1.0, 2.0]}}),
     ],
