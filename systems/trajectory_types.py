@@ -118,9 +118,6 @@ class TrajectoryWriter(ABC):
         if chunk.shape not in ((), (n,)) or chunk.dtype.kind not in "ui":
             raise InputError(f"{where}: chunk_idx must be one integer or {n}, not {chunk.dtype} of {chunk.shape}.")
         chunk = np.broadcast_to(chunk, (n,)).astype(np.int32)
-        if chunk.shape not in ((), (n,)):
-            raise InputError(f"{where}: chunk_idx must be one number or {n} of them, not of shape {chunk.shape}.")
-        chunk = np.broadcast_to(chunk, (n,))
         return FrameBlock(positions, times, None if flags is None else flags.astype(np.uint16), chunk, series)
 
 
