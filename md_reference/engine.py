@@ -9,12 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forcefield import ForceFieldSpec, build_system
-from systems.errors import SimulationError, UnknownNameError, nearest
+from md_reference.platforms import choose_platform
+from systems.errors import SimulationError
 from systems.scene import FloatArray, Scene
-
-# Measured (see DESIGN facts and `tests/physics`): one-thread Reference wins up to about this many atoms.
-REFERENCE_PLATFORM_MAX_ATOMS = 60
-
 
 @dataclass(frozen=True)
 class State:
@@ -25,26 +22,6 @@ class State:
     kinetic_kj_mol: float
     time_ps: float
     temperature_k: float
-
-
-def choose_platform(n_atoms: int, requested: str = "auto") -> tuple[str, str]:
-    """Return (platform name, the reason) for a scene of `n_atoms`; an explicit request is checked and kept."""
-    import openmm
-
-    available = [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
-    if requested != "auto":
-        if requested not in available:
-            raise UnknownNameError(
-                f"platform {requested!r} is not available here; there are: {', '.join(available)}."
-                + nearest(requested, available)
-            )
-        return requested, "asked for"
-    if n_atoms <= REFERENCE_PLATFORM_MAX_ATOMS:
-        return "Reference", f"{n_atoms} atoms: one thread without neighbour lists beats the CPU platform"
-    for gpu in ("CUDA", "HIP", "OpenCL"):
-        if gpu in available and n_atoms > 500:
-            return gpu, f"{n_atoms} atoms and a {gpu} device"
-    return "CPU", f"{n_atoms} atoms: vectorised CPU kernels win above {REFERENCE_PLATFORM_MAX_ATOMS}"
 
 
 class Engine:
@@ -60,21 +37,22 @@ class Engine:
         timestep_ps: float = 0.004,
         seed: int = 0,
         platform: str = "auto",
-        threads: int = 1,
+        threads: int | None = None,
         native_gb: bool = True,
     ) -> None:
         import openmm
 
         self.scene = scene
         self.spec = spec
-        self.platform_name, self.platform_reason = choose_platform(scene.n_atoms, platform)
+        choice = choose_platform(scene.n_atoms, platform)
+        self.platform_name = choice.name
         self._system = build_system(scene, spec, native_gb=native_gb)
         self._integrator = openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
         # OpenMM reads a seed of 0 as "choose one from the clock".
         self._seed = seed % (2**31 - 1) + 1
         self._integrator.setRandomNumberSeed(self._seed)
         self._temperature_k = temperature_k
-        properties = {"Threads": str(threads)} if self.platform_name == "CPU" else {}
+        properties = {"Threads": str(threads or choice.threads)} if choice.name == "CPU" else {}
         try:
             self._context: Any = openmm.Context(
                 self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties

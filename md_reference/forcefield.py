@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from systems.errors import PreparationError, UnknownNameError, nearest
+from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.scene import Scene
 
 # OpenMM's own file names, in order of preference.
@@ -49,18 +49,48 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
 
     With `native_gb` the OBC2 term is OpenMM's GBSAOBCForce; without it, the CustomGBForce of implicit/obc2.xml, which
     gives the same energies (a test holds them together) and is several times slower on small scenes.
+    Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
+    tried (`regrouping`): the particles are in the scene's order either way.
     Raises PreparationError when the force field has no parameters for a residue.
     """
-    from openmm import CMMotionRemover, app, unit
+    from md_reference.regrouping import permuted, regroup
+
+    try:
+        return _build(scene, spec, native_gb)
+    except PreparationError:
+        raise
+    except (_Unmatched, InputError):
+        regrouped, order = regroup(scene)
+    try:
+        return permuted(_build(regrouped, spec, native_gb), order)
+    except _Unmatched as error:
+        raise PreparationError(
+            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}; covered so far are "
+            "peptides of the standard amino acids with the caps ACE and NME, every hydrogen in place."
+        ) from error
+
+
+class _Unmatched(Exception):
+    """No template of the force field has the bonds of this residue."""
+
+    def __init__(self, residue: str) -> None:
+        super().__init__(residue)
+        self.residue = residue
+
+
+def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
+    """Return the System of a scene whose residues the force field knows; raises _Unmatched for one it does not."""
+    from openmm import app, unit
 
     topology = scene.to_openmm_topology()
     files = [FORCE_FIELD_FILES[spec.force_field]]
-    custom_gb = spec.solvent == "obc2" and not native_gb
     if spec.solvent == "amber99-obc":
         files.append("amber99_obc.xml")
-    elif custom_gb:
+    elif spec.solvent == "obc2" and not native_gb:
         files.append("implicit/obc2.xml")
     force_field = app.ForceField(*files)
+    for residue in force_field.getUnmatchedResidues(topology):
+        raise _Unmatched(_describe(scene, residue.index))
     try:
         system = force_field.createSystem(
             topology,
@@ -71,15 +101,18 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
             hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
         )
     except (ValueError, KeyError) as error:
-        first = str(error).splitlines()[0]
-        raise PreparationError(
-            f"{spec.force_field} has no parameters for scene {scene.name!r}: {first} "
-            "Only peptides of standard residues are covered so far."
-        ) from error
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
     if spec.solvent == "obc2" and native_gb:
         system.addForce(_native_obc2(topology, system))
-    assert not any(isinstance(f, CMMotionRemover) for f in system.getForces())
     return system
+
+
+def _describe(scene: Scene, residue: int) -> str:
+    """`residue UNL 1 (C9 H8 O4)`, for messages."""
+    symbols = [e for e, r in zip(scene.elements, scene.residue_of_atom, strict=True) if r == residue]
+    formula = " ".join(f"{e}{symbols.count(e) if symbols.count(e) > 1 else ''}" for e in sorted(set(symbols)))
+    return f"residue {scene.residue_names[residue]} {scene.residue_ids[residue]} ({formula})"
 
 
 def _native_obc2(topology: Any, system: Any) -> Any:

@@ -7,8 +7,9 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from md_reference.engine import Engine, choose_platform
+from md_reference.engine import Engine
 from md_reference.forcefield import ForceFieldSpec, build_system
+from md_reference.platforms import choose_platform
 from md_reference.replicas import available_cores
 from systems.scene import Scene
 
@@ -67,7 +68,7 @@ def make_plan(
     For `measure_s` of wall time each, steps are timed as planned and as OpenMM would do it unasked; 0 times nothing.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    chosen, reason = choose_platform(scene.n_atoms, platform)
+    choice = choose_platform(scene.n_atoms, platform)
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
@@ -83,8 +84,8 @@ def make_plan(
         force_field=spec.force_field,
         solvent=spec.solvent,
         integrator=f"Langevin middle, {timestep_ps * 1000:g} fs, {temperature_k:g} K, {friction_per_ps:g}/ps",
-        platform=chosen,
-        platform_reason=reason,
+        platform=choice.name,
+        platform_reason=choice.reason,
         parallel=_parallel(replicas, cores),
         constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
         terms=_terms(system),
@@ -177,7 +178,7 @@ def _skips(
             Skip(
                 "OpenMM's own choice of platform and forces (CPU)",
                 "timed here, on one thread",
-                f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step ({default / planned:.1f} times faster)",
+                f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step, {default / planned:.1f} times faster",
             )
         )
     return tuple(skips)

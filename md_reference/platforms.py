@@ -1,0 +1,45 @@
+"""Which OpenMM platform wins for a scene of this size, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from systems.errors import UnknownNameError, nearest
+
+# Measured: see `choose_platform`.
+REFERENCE_PLATFORM_MAX_ATOMS = 60
+# Below this a step is too short for a GPU: launching its kernels costs more than the forces.
+GPU_MIN_ATOMS = 500
+
+
+@dataclass(frozen=True)
+class PlatformChoice:
+    """An OpenMM platform, the threads it runs on, and the reason in words."""
+
+    name: str
+    threads: int
+    reason: str
+
+
+def choose_platform(n_atoms: int, requested: str = "auto") -> PlatformChoice:
+    """Return the platform for `n_atoms`; an explicit request is checked and kept.
+
+    One thread in any case: below some hundreds of atoms a second thread slows a step down, and replicas, which run side
+    by side, use the other cores. Raises UnknownNameError (with the nearest name) for a platform that is not here.
+    """
+    import openmm
+
+    available = [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
+    if requested != "auto":
+        if requested not in available:
+            raise UnknownNameError(
+                f"platform {requested!r} is not available here; there are: {', '.join(available)}."
+                + nearest(requested, available)
+            )
+        return PlatformChoice(requested, 1, "asked for")
+    if n_atoms <= REFERENCE_PLATFORM_MAX_ATOMS:
+        return PlatformChoice("Reference", 1, f"{n_atoms} atoms: no neighbour lists and no threads to wait for")
+    for gpu in ("CUDA", "HIP", "OpenCL"):
+        if gpu in available and n_atoms > GPU_MIN_ATOMS:
+            return PlatformChoice(gpu, 1, f"{n_atoms} atoms and a {gpu} device")
+    return PlatformChoice("CPU", 1, f"{n_atoms} atoms: vector instructions win above {REFERENCE_PLATFORM_MAX_ATOMS}")
