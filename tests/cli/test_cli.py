@@ -304,7 +304,6 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
 
 TINY = """
 [autoencoder]
-n_latents = 1
 latent_dim = 8
 width = 16
 n_heads = 2
@@ -402,3 +401,36 @@ def test_rollout_is_the_same_under_one_seed_and_differs_under_another(here: Path
             frames.append(reader.read())
     assert (frames[0] == frames[1]).all()
     assert abs(frames[0] - frames[2]).max() > 1e-3
+
+
+def test_rollout_keeps_the_order_and_names_of_the_pdb(here: Path, tiny_weights: Path, alanine_dipeptide: Any) -> None:
+    import MDAnalysis
+    import mdtraj
+    import numpy as np
+
+    lines = alanine_dipeptide_lines(alanine_dipeptide)
+    (here / "mine.pdb").write_text("\n".join([*lines, "END"]) + "\n")
+    result = run("rollout", "mine.pdb", "--weights", str(tiny_weights), "--time", "2ps", "-o", "out.dcd", "--quiet")
+    assert result.exit_code == 0, result.stderr
+    names = [line[12:16].strip() for line in lines]
+    trajectory = mdtraj.load("out.dcd", top="mine.pdb")
+    universe = MDAnalysis.Universe("mine.pdb", "out.dcd")
+    assert trajectory.xyz.shape == (20, 22, 3)
+    assert [a.name for a in universe.atoms] == names
+    np.testing.assert_allclose(universe.trajectory[5].positions, trajectory.xyz[5] * 10.0, atol=1e-3)
+    written = [line for line in (here / "out.pdb").read_text().splitlines() if line.startswith("ATOM")]
+    assert [line[12:16].strip() for line in written] == names, "the topology beside the DCD has the user's order, too"
+
+
+def alanine_dipeptide_lines(scene: Any) -> list[str]:
+    """The molecule as another program might write it: atoms reversed within residues, other names, no CONECT."""
+    order = sorted(range(scene.n_atoms), key=lambda i: (scene.residue_of_atom[i], -i))
+    lines = []
+    for serial, i in enumerate(order, start=1):
+        x, y, z = 10.0 * scene.positions_nm[i] + [3.0, -2.0, 5.0]
+        element, residue = scene.elements[i], scene.residue_of_atom[i]
+        lines.append(
+            f"ATOM  {serial:5d} {element}{serial:<3d} {scene.residue_names[residue]:>3s} A{residue + 1:4d}    "
+            f"{x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {element:>2s}"
+        )
+    return lines
