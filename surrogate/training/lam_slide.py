@@ -34,9 +34,9 @@ class TrainingConfig:
     budget_s: float | None = None
     stage_one_steps: int | None = None
     stage_two_steps: int | None = None
-    stage_one_batch: int = 256
+    stage_one_batch: int = 128
     stage_two_batch: int = 64
-    stage_one_rate: float = 2e-3
+    stage_one_rate: float = 1e-3
     stage_two_rate: float = 1e-3
     seed: int = 0
     bf16: bool = True

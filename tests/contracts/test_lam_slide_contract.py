@@ -115,7 +115,7 @@ def frames_of(scene: Scene, weights: Weights, out: Path, seed: int = 0) -> np.nd
 def test_rollout_is_equivariant_to_rotation_translation_and_atom_order(
     tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene
 ) -> None:
-    """Exact in real numbers; in float32 the first chunk agrees to 1e-4 nm, and later ones drift apart by chaos alone."""
+    """Exact in real numbers; in float32 the first chunk agrees to 2e-5 nm, and later ones drift apart by chaos alone."""
     base = frames_of(alanine_dipeptide, small_weights, tmp_path / "base.h5")
     rng = np.random.default_rng(0)
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -125,7 +125,7 @@ def test_rollout_is_equivariant_to_rotation_translation_and_atom_order(
     turned = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm @ rotation.T + shift)
     moved = frames_of(turned, small_weights, tmp_path / "moved.h5")
     n = small_weights.model.n_new
-    np.testing.assert_allclose(moved[:n], base[:n] @ rotation.T + shift, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(moved[:n], base[:n] @ rotation.T + shift, rtol=0, atol=2e-5)
     # Negative controls: not moved at all, and another seed.
     assert np.abs(moved[:n] - base[:n]).max() > 0.1
-    assert np.abs(frames_of(alanine_dipeptide, small_weights, tmp_path / "seed.h5", seed=1) - base).max() > 1e-3
+    assert np.abs(frames_of(alanine_dipeptide, small_weights, tmp_path / "seed.h5", seed=1) - base).max() > 2e-4

@@ -1,0 +1,103 @@
+"""Interpolants and solver against cases with known answers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from surrogate.models.lam_slide import flow
+
+MEAN, STD = 1.5, 0.4
+
+
+def gaussian_posterior(interpolant: str):
+    """E[o1 | o_tau] for data N(MEAN, STD^2): the exact data prediction."""
+
+    def predict(o: Tensor, tau: Tensor) -> Tensor:
+        alpha, sigma, _, _ = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
+        gain = alpha * STD**2 / (alpha**2 * STD**2 + sigma**2)
+        return MEAN + gain * (o - alpha * MEAN)
+
+    return predict
+
+
+@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
+def test_paths_start_at_noise_and_end_at_data(interpolant: str) -> None:
+    ends = torch.tensor([0.0, 1.0])
+    alpha, sigma, _, _ = flow.coefficients(ends, interpolant)
+    torch.testing.assert_close(alpha, torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(sigma, torch.tensor([1.0, 0.0]), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
+def test_derivatives_match_finite_differences(interpolant: str) -> None:
+    tau = torch.linspace(0.05, 0.95, 7, dtype=torch.float64)
+    h = 1e-6
+    _, _, d_alpha, d_sigma = flow.coefficients(tau, interpolant)
+    up, down = flow.coefficients(tau + h, interpolant), flow.coefficients(tau - h, interpolant)
+    torch.testing.assert_close(d_alpha, (up[0] - down[0]) / (2 * h), atol=1e-8, rtol=0)
+    torch.testing.assert_close(d_sigma, (up[1] - down[1]) / (2 * h), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
+def test_velocity_equals_equations_10_and_11(interpolant: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    o, data = torch.randn(2, 5, 4, generator=generator, dtype=torch.float64)
+    tau = torch.linspace(0.1, 0.9, 5, dtype=torch.float64)
+    alpha, sigma, d_alpha, d_sigma = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
+    score = -(sigma**-2) * (o - alpha * data)
+    paper = score * (d_alpha * sigma**2 / alpha - sigma * d_sigma) + d_alpha / alpha * o
+    torch.testing.assert_close(flow.velocity(o, data, tau, interpolant), paper)
+
+
+@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
+def test_euler_carries_noise_to_the_data_distribution_and_converges(interpolant: str) -> None:
+    noise = torch.randn(20_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    errors = []
+    for n_steps in (8, 16, 32, 64, 128):
+        sample = flow.euler(gaussian_posterior(interpolant), noise, n_steps, interpolant)
+        errors.append(abs(float(sample.std()) / float(noise.std()) - STD))
+    assert errors[-1] < 0.01
+    assert abs(float(sample.mean()) - MEAN - STD * float(noise.mean())) < 0.01
+    # First order or better: the error shrinks by a factor near two, at least, whenever the step is halved.
+    assert all(fine < 0.7 * coarse for coarse, fine in zip(errors[:-1], errors[1:], strict=True)), errors
+
+
+def test_preconditioning_is_the_best_linear_denoiser_of_unit_data() -> None:
+    generator = torch.Generator().manual_seed(1)
+    data, noise = torch.randn(2, 200_000, generator=generator)
+    for value in (0.1, 0.5, 0.9):
+        tau = torch.tensor([value])
+        alpha, sigma, _, _ = flow.coefficients(tau, "linear")
+        skip, out, scale_in = flow.preconditioning(tau, "linear")
+        noisy = alpha * data + sigma * noise
+        assert float((noisy * scale_in).std()) == pytest.approx(1.0, abs=0.01)
+        residual = data - skip * noisy
+        assert float(residual.std() / out) == pytest.approx(1.0, abs=0.01)
+        # Orthogonal to the input: no other multiple of it would leave less.
+        assert abs(float((residual * noisy).mean())) < 0.01
+
+
+def test_unknown_interpolant_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown interpolant"):
+        flow.coefficients(torch.tensor([0.5]), "cubic")
+    with pytest.raises(ValueError, match="at least 1"):
+        flow.euler(gaussian_posterior("linear"), torch.zeros(1, 1), 0, "linear")
+
+
+def test_rotations_are_uniform_over_so3() -> None:
+    """The wrong density (uniform Euler angles) fails the second moment of a matrix element and the angle's law."""
+    from surrogate.training.objectives import random_rotations
+
+    r = random_rotations(40_000, torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(r @ r.mT, torch.eye(3, dtype=torch.float64).expand_as(r), atol=1e-5, rtol=0)
+    assert torch.det(r).min() > 0.999
+    # Haar: every element has mean 0 and mean square 1/3; the rotation angle has mean cosine -1/2 + 1/... = E[tr] = 0.
+    assert r.mean(0).abs().max() < 0.015
+    assert (r.square().mean(0) - 1 / 3).abs().max() < 0.01
+    angle = torch.arccos(((r.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    expected = math.pi / 2 + 2 / math.pi  # density (1 - cos angle) / pi on [0, pi]
+    assert float(angle.mean()) == pytest.approx(expected, abs=0.01)
