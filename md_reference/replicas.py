@@ -64,7 +64,7 @@ def simulate_replicas(
                 running[k].start()
             time.sleep(0.1)
             if progress is not None:
-                progress(int(sum(done)), config.n_frames * len(outs))
+                progress(int(sum(done[:])), config.n_frames * len(outs))
             for k in [k for k, process in running.items() if not process.is_alive()]:
                 process = running.pop(k)
                 process.join()

@@ -83,7 +83,7 @@ class Scene:
     def formula(self) -> str:
         """Hill-order formula, for people: C6H12N2O2."""
         counts = {e: self.elements.count(e) for e in set(self.elements)}
-        order = [e for e in ("C", "H") if e in counts and "C" in counts]
+        order: list[str] = [e for e in ("C", "H") if e in counts and "C" in counts]
         order += sorted(e for e in counts if e not in order)
         return "".join(f"{e}{counts[e] if counts[e] > 1 else ''}" for e in order)
 

@@ -25,7 +25,7 @@ CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "tim
 class TrainingFrames:
     """Frames of several trajectories of one scene, ready to be cut into windows.
 
-    `coordinates` (n_frames, n_atoms, 3) int16 in units of QUANTUM_NM, centred, and superposed on the scene's positions by
+    `coordinates` (n_frames, n_atoms, 3) int16 in units of QUANTUM_NM, centred, and superposed on the scene by its
     heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames.
     """
 

@@ -69,7 +69,7 @@ def save_weights(
 
 
 def read_header(path: str | Path) -> dict[str, Any]:
-    """Return a weights file's record without loading it. Raises InputError (missing) or WeightsError (not ours, damaged)."""
+    """Return a weights file's record without loading it. Raises InputError (no such file) or WeightsError."""
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
@@ -100,7 +100,9 @@ def load_weights(path: str | Path) -> Weights:
         raise WeightsError(f"{path} does not fit its own configuration: {str(error).splitlines()[0]}") from error
     broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
     if broken:
-        raise WeightsError(f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download.")
+        raise WeightsError(
+            f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download."
+        )
     domain = header["domain"]
     return Weights(
         model=model.eval().requires_grad_(False),

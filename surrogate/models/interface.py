@@ -11,12 +11,15 @@ from torch import Tensor
 class Surrogate(Protocol):
     """A learned simulator of one scene, batched over replicas.
 
-    Frames are in the model's canonical frame when `canonical` is True (the caller superposes), in nm, float32. Randomness
-    enters through `noise` alone: the same noise, frames and settings give the same chunk, row by row, whatever the
+    Frames are in the model's canonical frame when `canonical` is True (the caller superposes), in nm, float32.
+    Randomness enters through `noise` alone: the same noise, frames and settings give the same chunk, row by row, whatever the
     batch they stand in.
     """
 
-    canonical: bool
+    @property
+    def canonical(self) -> bool:
+        """Whether frames must be superposed on the template first."""
+        ...
 
     @property
     def n_conditioning(self) -> int:

@@ -37,6 +37,8 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 class TimeEmbedding(nn.Module):
     """Sinusoidal embedding of the flow time in [0, 1] followed by a two-layer MLP: `(batch,)` -> `(batch, width)`."""
 
+    frequency: Tensor
+
     def __init__(self, width: int, n_frequencies: int = 64) -> None:
         super().__init__()
         self.register_buffer("frequency", torch.exp(torch.linspace(0.0, math.log(1000.0), n_frequencies)))
@@ -66,7 +68,7 @@ class ParallelBlock(nn.Module):
         self.offset = nn.Parameter(torch.zeros(3, width))
 
     def forward(self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None) -> Tensor:
-        """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width): shift, scale, gate."""
+        """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width)."""
         shift, scale, gate = (modulation + self.offset)[:, None, None].unbind(-2)
         h = F.layer_norm(x, (self.width,)) * (1.0 + scale) + shift
         q, k, v, hidden = self.proj_in(h).split([self.width] * 3 + [self.hidden], dim=-1)

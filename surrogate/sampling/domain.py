@@ -26,6 +26,6 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     except OutOfDomainError as error:
         reason = str(error).rstrip(".")
         raise OutOfDomainError(
-            f"{weights.path.name} does not cover {scene.name}: {reason}. These weights cover {weights.domain.describe()}. "
-            f"Run `surromd reference` for this molecule, then `surromd train` on it."
+            f"{weights.path.name} does not cover {scene.name}: {reason}. These weights cover "
+            f"{weights.domain.describe()}. Run `surromd reference` for this molecule, then `surromd train` on it."
         ) from error

@@ -1,4 +1,4 @@
-"""Rollouts in chunks: each conditioned on the end of the last, replicas batched, frames checked, streamed, resumable."""
+"""Rollouts in chunks: each conditioned on the end of the last; replicas batched, frames checked, streamed."""
 
 from __future__ import annotations
 
@@ -150,8 +150,8 @@ def rollout(
                 state_path.unlink(missing_ok=True)
                 raise SimulationError(
                     f"replica {broken[0]}: the model's frames are no longer finite after "
-                    f"{format_time_ps(state.steps * lag_ps)}; they are marked in {outs[broken[0]]}. Try --precision fp32 "
-                    "or other weights."
+                    f"{format_time_ps(state.steps * lag_ps)}; they are marked in {outs[broken[0]]}. Try --precision "
+                    "fp32 or other weights."
                 )
             if stopping and not complete:
                 raise KeyboardInterrupt
@@ -249,7 +249,11 @@ def _write_state(path: Path, state: _Progress, settings: dict[str, Any]) -> None
     header = {"settings": settings, **{k: v for k, v in vars(state).items() if k != "last_frames"}}
     buffer = io.BytesIO()
     np.savez(buffer, last_frames=state.last_frames, header=np.array(json.dumps(header)))
-    create_whole(path, lambda temporary: temporary.write_bytes(buffer.getvalue()) and None)
+    create_whole(path, lambda temporary: _write_bytes(temporary, buffer.getvalue()))
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
 
 
 def _read_state(path: Path, settings: dict[str, Any]) -> _Progress:

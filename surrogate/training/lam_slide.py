@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
+from surrogate.data.weights import TrainingDomain, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.data.weights import TrainingDomain, save_weights
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from systems.elements import ATOMIC_NUMBERS

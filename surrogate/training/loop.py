@@ -1,4 +1,4 @@
-"""One optimisation loop for every stage: budget in seconds or steps, warm-up and cosine, EMA, clipping, exact resume."""
+"""One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume."""
 
 from __future__ import annotations
 
@@ -109,7 +109,8 @@ def run_stage(
     would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
     Raises SimulationError when the loss stops being finite; the last saved state stays.
     """
-    decay, plain = [], []
+    decay: list[nn.Parameter] = []
+    plain: list[nn.Parameter] = []
     for p in (p for p in module.parameters() if p.requires_grad):
         (decay if p.ndim >= 2 else plain).append(p)
     optimiser = torch.optim.AdamW(

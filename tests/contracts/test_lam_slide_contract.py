@@ -25,7 +25,13 @@ def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: s
     config = LamSlideConfig(
         autoencoder=AutoencoderConfig(n_latents=n_latents, latent_dim=16, width=32, head_dim=8),
         approximator=ApproximatorConfig(
-            chunk_frames=6, latents_per_token=1, width=32, n_layers=2, n_heads=2, precondition=precondition, interpolant=interpolant
+            chunk_frames=6,
+            latents_per_token=1,
+            width=32,
+            n_layers=2,
+            n_heads=2,
+            precondition=precondition,
+            interpolant=interpolant,
         ),
     )
     model = LamSlide(config)
@@ -115,7 +121,7 @@ def frames_of(scene: Scene, weights: Weights, out: Path, seed: int = 0) -> np.nd
 def test_rollout_is_equivariant_to_rotation_translation_and_atom_order(
     tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene
 ) -> None:
-    """Exact in real numbers; in float32 the first chunk agrees to 2e-5 nm, and later ones drift apart by chaos alone."""
+    """Exact in real numbers; in float32 the first chunk agrees to 2e-5 nm, later ones drift apart by chaos alone."""
     base = frames_of(alanine_dipeptide, small_weights, tmp_path / "base.h5")
     rng = np.random.default_rng(0)
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))

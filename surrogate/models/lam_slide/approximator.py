@@ -6,11 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.config import ApproximatorConfig
+from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from systems.errors import InputError
-
 
 Rope = tuple[Tensor, Tensor]
 
@@ -33,6 +32,11 @@ class LatentLayer(nn.Module):
 
 class Approximator(nn.Module):
     """Data prediction network: noisy latents of a chunk, flow time, conditioning latents -> clean latents."""
+
+    cos_time: Tensor
+    sin_time: Tensor
+    cos_latent: Tensor
+    sin_latent: Tensor
 
     def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int) -> None:
         super().__init__()

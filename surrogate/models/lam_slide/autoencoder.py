@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.layers import CrossAttentionBlock, fourier_features
 from surrogate.models.lam_slide.config import AutoencoderConfig
+from surrogate.models.layers import CrossAttentionBlock, fourier_features
 
 MAX_ATOMIC_NUMBER = 54
 
@@ -52,7 +52,8 @@ class Autoencoder(nn.Module):
         self.to_latent = nn.Linear(c.width, c.latent_dim)
         self.query = nn.Linear(c.identifier_dim, c.width)
         self.decoder = nn.ModuleList(
-            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim, gated=True) for _ in range(c.n_decoder_layers)
+            CrossAttentionBlock(c.width, c.latent_dim, c.n_heads, c.head_dim, gated=True)
+            for _ in range(c.n_decoder_layers)
         )
         self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
         self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -53,7 +54,7 @@ def euler(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str
     """Integrate from noise (tau = 0) to data (tau = 1) in `n_steps` evaluations; the last step lands on o_hat."""
     o = noise
     grid = torch.linspace(0.0, 1.0, n_steps + 1).tolist()
-    for start, end in zip(grid[:-1], grid[1:], strict=True):
+    for start, end in pairwise(grid):
         tau = torch.full((o.shape[0],), start, device=o.device, dtype=torch.float32)
         prediction = predict(o, tau)
         if end == 1.0:

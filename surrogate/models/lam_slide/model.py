@@ -52,9 +52,7 @@ class LamSlide(nn.Module):
         lead, n_atoms = frames_nm.shape[:-2], frames_nm.shape[-2]
         x = frames_nm.reshape(-1, n_atoms, 3).float() / self.config.position_scale_nm
         rows = x.shape[0]
-        z = self.autoencoder.encode(
-            x, elements.expand(rows, n_atoms), self.identifiers(n_atoms).expand(rows, n_atoms)
-        )
+        z = self.autoencoder.encode(x, elements.expand(rows, n_atoms), self.identifiers(n_atoms).expand(rows, n_atoms))
         return ((z - self.latent_mean) / self.latent_scale).unflatten(0, lead)
 
     def decode(self, latents: Tensor, n_atoms: int) -> Tensor:

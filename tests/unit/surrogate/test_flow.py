@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -63,7 +64,7 @@ def test_euler_carries_noise_to_the_data_distribution_and_converges(interpolant:
     assert errors[-1] < 0.01
     assert abs(float(sample.mean()) - MEAN - STD * float(noise.mean())) < 0.01
     # First order or better: the error shrinks by a factor near two, at least, whenever the step is halved.
-    assert all(fine < 0.7 * coarse for coarse, fine in zip(errors[:-1], errors[1:], strict=True)), errors
+    assert all(fine < 0.7 * coarse for coarse, fine in pairwise(errors)), errors
 
 
 def test_preconditioning_is_the_best_linear_denoiser_of_unit_data() -> None:

@@ -181,7 +181,7 @@ def test_damaged_weights_are_refused_in_one_line(tmp_path: Path, small_weights: 
 def test_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text("[approximator]\nwidht = 128\n")
-    with pytest.raises(InputError, match="widht.*width"):
+    with pytest.raises(InputError, match=r"widht.*width"):
         LamSlideConfig.from_toml(path)
     path.write_text("canonical = false\n[approximator]\nwidth = 128\n")
     config = LamSlideConfig.from_toml(path)
