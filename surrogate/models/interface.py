@@ -12,8 +12,8 @@ class Surrogate(Protocol):
     """A learned simulator of one scene, batched over replicas.
 
     Frames are in the model's canonical frame when `canonical` is True (the caller superposes), in nm, float32.
-    Randomness enters through `noise` alone: the same noise, frames and settings give the same chunk, row by row, whatever the
-    batch they stand in.
+    Randomness enters through `noise` alone: the same noise, frames and settings give the same chunk, row by row,
+    whatever the batch they stand in.
     """
 
     @property

@@ -32,7 +32,7 @@ class AutoencoderConfig:
     distance_weight: float = 1.0
     type_weight: float = 0.01
     # Share of stage-one samples whose identifiers are drawn at random (Algorithm 1; 1.0 is the paper). The others get
-    # the canonical assignment, which is what stage two and rollouts use; one molecule on a small budget learns it faster.
+    # the canonical assignment, which is what stage two and rollouts use; one molecule learns it faster.
     random_identifiers: float = 0.0
 
 

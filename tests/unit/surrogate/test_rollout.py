@@ -1,0 +1,120 @@
+"""Rollouts: resumable, independent replicas, marked frames, other people's atom order, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.weights import Weights
+from surrogate.models.lam_slide.model import LamSlide
+from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.errors import InputError, OutOfDomainError, SimulationError, UnitError
+from systems.scene import Scene
+from systems.trajectory import open_trajectory
+from systems.validity import INVALID, NOT_FINITE
+
+CONFIG = RolloutConfig(time_ps=40.0, solver_steps=2, precision="fp32")
+
+
+def roll(scene: Scene, weights: Weights, *outs: Path, config: RolloutConfig = CONFIG, **switches: bool) -> np.ndarray:
+    """Roll and return the first replica's frames."""
+    rollout(scene, weights, list(outs), config, **switches)
+    with open_trajectory(outs[0]) as reader:
+        assert np.array_equal(reader.time_ps, np.arange(1, reader.n_frames + 1) * reader.time_ps[0])
+        return reader.read()
+
+
+def test_file_says_what_it_is(tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene) -> None:
+    out = tmp_path / "a.h5"
+    roll(alanine_dipeptide, small_weights, out)
+    with open_trajectory(out) as reader:
+        assert reader.n_frames == 40
+        chunk = small_weights.model.n_new
+        assert np.array_equal(reader.chunk_idx, np.arange(40) // chunk)
+        assert reader.flags is not None
+        record = reader.record
+    assert record["kind"] == "rollout"
+    assert record["completed"] is True
+    assert record["weights_hash"] == small_weights.hash
+    assert record["cost"]["network_evaluations"] == -(-40 // chunk) * CONFIG.solver_steps
+    assert not (tmp_path / "a.h5.checkpoint").exists()
+
+
+def test_a_replica_does_not_depend_on_its_batch(tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene) -> None:
+    alone = roll(alanine_dipeptide, small_weights, tmp_path / "a.h5")
+    beside = roll(alanine_dipeptide, small_weights, *(tmp_path / f"b{k}.h5" for k in range(3)))
+    np.testing.assert_allclose(beside, alone, rtol=0, atol=2e-5)
+    with open_trajectory(tmp_path / "b1.h5") as reader:
+        assert np.abs(reader.read() - alone).max() > 1e-4, "replicas must differ from each other"
+
+
+def test_save_interval_picks_frames_of_the_same_rollout(tmp_path: Path, small_weights: Weights,
+                                                        alanine_dipeptide: Scene) -> None:  # fmt: skip
+    every = roll(alanine_dipeptide, small_weights, tmp_path / "a.h5")
+    third = roll(alanine_dipeptide, small_weights, tmp_path / "b.h5",
+                 config=replace(CONFIG, time_ps=39.0, save_every_ps=3.0))  # fmt: skip
+    assert np.array_equal(third, every[2:39:3])
+    with pytest.raises(UnitError, match="whole multiple"):
+        roll(alanine_dipeptide, small_weights, tmp_path / "c.h5", config=replace(CONFIG, save_every_ps=1.5))
+    assert not (tmp_path / "c.h5").exists()
+
+
+def test_an_interrupted_rollout_resumes_bit_for_bit(tmp_path: Path, small_weights: Weights,
+                                                    alanine_dipeptide: Scene) -> None:  # fmt: skip
+    whole = roll(alanine_dipeptide, small_weights, tmp_path / "whole.h5")
+
+    class Killed(BaseException):
+        pass
+
+    def kill(done: int, total: int) -> None:
+        if done > total // 2:
+            raise Killed
+
+    cut = tmp_path / "cut.h5"
+    with pytest.raises(Killed):
+        rollout(alanine_dipeptide, small_weights, [cut], CONFIG, progress=kill, flush_every_s=0.0)
+    with open_trajectory(cut) as reader:
+        assert 0 < reader.n_frames < 40
+        assert reader.record["completed"] is False
+    with pytest.raises(InputError, match="seed"):
+        rollout(alanine_dipeptide, small_weights, [cut], replace(CONFIG, seed=5), resume=True)
+    assert np.array_equal(roll(alanine_dipeptide, small_weights, cut, resume=True), whole)
+    # Asked again, a complete rollout is left as it is.
+    before = cut.stat().st_mtime_ns
+    rollout(alanine_dipeptide, small_weights, [cut], CONFIG, resume=True)
+    assert cut.stat().st_mtime_ns == before
+
+
+def test_frames_that_are_not_finite_are_marked_and_stop_the_rollout(tmp_path: Path, small_weights: Weights,
+                                                                    alanine_dipeptide: Scene) -> None:  # fmt: skip
+    model = LamSlide(small_weights.model.config)
+    model.load_state_dict(small_weights.model.state_dict())
+    with torch.no_grad():
+        model.approximator.final.bias.fill_(float("nan"))
+    broken = replace(small_weights, model=model.eval().requires_grad_(False))
+    out = tmp_path / "a.h5"
+    with pytest.raises(SimulationError, match="no longer finite"):
+        rollout(alanine_dipeptide, broken, [out], CONFIG)
+    with open_trajectory(out) as reader:
+        assert reader.n_frames == model.n_new
+        assert (reader.flags & NOT_FINITE).all(), "not one frame of it passes as valid"
+        assert (reader.flags & INVALID).all()
+
+
+def test_a_molecule_outside_the_domain_is_refused_with_what_to_do(tmp_path: Path, small_weights: Weights) -> None:
+    from systems.prepare import prepare
+
+    with pytest.raises(OutOfDomainError, match=r"cover alanine-dipeptide .*22 atoms.*surromd reference"):
+        rollout(prepare("sequence:ACE-GLY-NME"), small_weights, [tmp_path / "a.h5"], CONFIG)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_mirror_image_is_refused(tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene) -> None:
+    mirrored = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm * [1, 1, -1])
+    with pytest.raises(OutOfDomainError):
+        rollout(mirrored, small_weights, [tmp_path / "a.h5"], CONFIG)
+    assert list(tmp_path.iterdir()) == []
