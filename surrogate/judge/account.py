@@ -48,7 +48,7 @@ def faults_of(sample: Sample) -> Faults:
     """Count the flags of the frames of one sample."""
     features = sample.features
     flags = np.concatenate(list(features.flags))
-    counts = {validity.flag_names(mask)[0]: int(((flags & mask) != 0).sum()) for mask, *_ in metrics.CHECKS}
+    counts = {validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in metrics.CHECKS}
     return Faults(
         features.label,
         len(flags),

@@ -197,7 +197,7 @@ def _judge(
         speed_ratio=speed_ratio(account, reference_account),
         faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
         skipped=(*_skipped(trio), *skipped, *without_tica, *without_seams),
-        notes=tuple(_trimming(trio, reference, candidate, replicate, correlation)),
+        notes=tuple(_trimming(trio, reference, candidate, replicate, correlation) + _unlike(judged, options)),
         curves=Curves(
             ramachandran=curves.ramachandran_maps(trio),
             histograms=(*curves.torsion_histograms(trio), *projected),
@@ -254,9 +254,19 @@ def _trimming(
     return notes
 
 
+def _unlike(rows: Sequence[Row], options: Options) -> list[str]:
+    metrics_off = verdict.replicate_differs(rows, options)
+    if not metrics_off:
+        return []
+    return [
+        f"The replicate itself differs from the reference ({'; '.join(metrics_off)}): the two are not samples of one "
+        "simulation, or too short; trust no verdict on these metrics."
+    ]
+
+
 def _skipped(trio: Trio) -> list[tuple[str, str]]:
     skipped = []
-    done = {check[0] for check in metrics.applicable_checks(trio.geometry)}
+    done = {check.mask for check in metrics.applicable_checks(trio.geometry)}
     for flag, what, why in (
         (validity.BOND_HALF_ANGSTROM, "Bond lengths", "the scene has no bonds"),
         (validity.CLASH, "Clashes", "no two atoms are more than three bonds apart"),

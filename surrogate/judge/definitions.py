@@ -30,7 +30,8 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Distance",
         "Jensen-Shannon distance: the square root of the divergence, natural logarithm; 0 for equal histograms, "
         "0.8326 (the root of ln 2) for histograms without overlap. 100 bins on [-π, π] for one torsion, 50 × 50 "
-        "for φ and ψ together, 100 bins over the reference's range for TIC 0 and bond lengths. Frames beyond the "
+        "for φ and ψ together, 100 bins over the reference's range for TIC 0 (5 % wider) and "
+        "over four standard deviations either way for bond lengths. Frames beyond the "
         "range, and frames that are not finite, have bins of their own, so that a broken frame costs and never helps.",
         "Lin, IEEE Trans. Inf. Theory 37, 145 (1991); Endres and Schindelin, ibid. 49, 1858 (2003); bins as in MDGen "
         "(Jing et al., 2024)",
@@ -77,9 +78,12 @@ DEFINITIONS: tuple[Definition, ...] = (
     ),
     Definition(
         "Significance",
-        "Distances: block permutation test, blocks of candidate and reference dealt at random. Numbers: t test with "
-        "combined standard errors. All p-values are corrected for their number (Holm); the level is 5 % for the whole "
-        "table.",
+        "The candidate is tested against reference and replicate together. Distances: block permutation test, blocks "
+        "dealt at random to the two sides. Numbers: t test with combined standard errors; where reference and "
+        "replicate disagree by more than their errors, that is taken for the error. All p-values are corrected for "
+        "their number (Holm); the level is 5 % for the whole table. Faulty frames: any "
+        "excess over the reference counts, except for what thermal motion can reach (clashes, bonds 20 % off): there "
+        "an exact binomial test, level 1 %.",
         "Holm, Scand. J. Statist. 6, 65 (1979)",
     ),
     Definition(

@@ -59,16 +59,31 @@ TORSION_BINS = Bins(-PI, PI, N_BINS_1D)
 RAMACHANDRAN_BINS = Bins(-PI, PI, N_BINS_2D)
 
 
-def reference_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D, *, tail: float = 0.0) -> Bins:
-    """Return bins that span the finite values of the reference, without the outermost share `tail` on each side."""
+def reference_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D) -> Bins:
+    """Return bins over the finite values of the reference, from its least to its greatest and 5 % beyond.
+
+    Without the margin the reference alone would have nothing outside its range, and any replicate would stand out.
+    """
     values = np.concatenate([np.asarray(s, dtype=np.float64).ravel() for s in segments])
     values = values[np.isfinite(values)]
     if not len(values):
         return Bins(0.0, 1.0, n)
-    low, high = np.quantile(values, [tail, 1.0 - tail]) if tail else (values.min(), values.max())
-    if high <= low:
-        low, high = low - 0.5e-6, high + 0.5e-6
-    return Bins(float(low), float(high), n)
+    low, high = float(values.min()), float(values.max())
+    margin = max(0.05 * (high - low), 1e-9)
+    return Bins(low - margin, high + margin, n)
+
+
+def normal_bins(segments: Sequence[AnyFloat], n: int = N_BINS_1D) -> Bins:
+    """Return bins over four standard deviations on either side of the mean of the reference's finite values.
+
+    For quantities that vibrate about one value: a few outliers in the reference do not widen the bins.
+    """
+    values = np.concatenate([np.asarray(s, dtype=np.float64).ravel() for s in segments])
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return Bins(0.0, 1.0, n)
+    width = max(4.0 * float(values.std()), 1e-9)
+    return Bins(float(values.mean()) - width, float(values.mean()) + width, n)
 
 
 def block_counts(segments: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> FloatArray:
@@ -97,14 +112,13 @@ def divergence(counts_p: FloatArray, counts_q: FloatArray) -> FloatArray:
     D = H((p+q)/2) - (H(p) + H(q))/2 with p, q the normalised counts; 0 for equal, ln 2 for disjoint histograms; NaN
     when one is empty. Source: Lin, IEEE Trans. Inf. Theory 37, 145 (1991), eq. 4.1 with equal weights.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        p = counts_p / counts_p.sum(-1, keepdims=True)
-        q = counts_q / counts_q.sum(-1, keepdims=True)
+    n_p, n_q = counts_p.sum(-1, keepdims=True), counts_q.sum(-1, keepdims=True)
+    p, q = counts_p / np.maximum(n_p, 1e-300), counts_q / np.maximum(n_q, 1e-300)
     m = 0.5 * (p + q)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        terms = np.where(p > 0, p * np.log(p / m), 0.0) + np.where(q > 0, q * np.log(q / m), 0.0)
-    out = 0.5 * terms.sum(-1)
-    empty = (counts_p.sum(-1) <= 0) | (counts_q.sum(-1) <= 0)
+    # Adding the least positive number leaves every positive one as it is, and makes 0 log 0 zero.
+    tiny = np.finfo(np.float64).tiny
+    out = (0.5 * (p * np.log(p + tiny) + q * np.log(q + tiny)) - m * np.log(m + tiny)).sum(-1)
+    empty = (n_p[..., 0] <= 0) | (n_q[..., 0] <= 0)
     return np.where(empty, np.nan, np.clip(out, 0.0, math.log(2.0)))
 
 

@@ -117,7 +117,7 @@ def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, label: str)
         metric=f"Autocorrelation of cos ψ at {time}, {label}",
         unit="",
         tolerance=0.05,
-        tolerance_text="0.05",
+        tolerance_text="± 0.05",
         statement=lambda c, r: f"cos ψ of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
     )
 
@@ -133,7 +133,7 @@ def _time_row(trio: Trio, results: Sequence[_Correlated], label: str) -> Row:
         metric=f"Relaxation time of cos ψ, {label}",
         unit="ps",
         tolerance=0.2,
-        tolerance_text="20 %",
+        tolerance_text="± 20 %",
         statement=lambda c, r: _speed(f"cos ψ of {label} relaxes", c, r),
         log=True,
     )
@@ -191,7 +191,7 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
             metric=f"Timescale of TIC 0 at a lag of {format_time_ps(lag * lag_ps)}",
             unit="ps",
             tolerance=0.2,
-            tolerance_text="20 %",
+            tolerance_text="± 20 %",
             statement=lambda c, r: _speed("the slowest motion (TIC 0) decays", c, r),
             log=True,
         ),
@@ -246,8 +246,9 @@ def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:
             replicate=None,
             ratio=found,
             p_value=difference_p(found, seamless, log=True),
+            p_replicate=math.nan,
             tolerance=0.2,
-            tolerance_text="20 %",
+            tolerance_text="± 20 %",
             statement=f"torsions jump {found.value:.2g} times as far where one chunk meets the next",
         )
     ], []

@@ -29,6 +29,7 @@ GROUP_TITLES = {
     "kinetics": "Kinetics",
 }
 MAX_DRAWN = 6
+_UNITS = {"_per_ps": "/ps", "_k": "K", "_ps": "ps", "_da": "Da", "_nm": "nm", "_s": "s"}
 
 
 class Card(NamedTuple):
@@ -60,8 +61,7 @@ def write_report(comparison: Comparison, path: str | Path, *, command: str | Non
     beside = target.with_suffix(".json")
     text = json.dumps(comparison.to_dict(), indent=1, allow_nan=False, ensure_ascii=False)
     page = render(comparison, command=command or _command(comparison, target))
-    _write(beside, text + "\n")
-    _write(target, page)
+    _write_together({beside: text + "\n", target: page})
     return target, beside
 
 
@@ -74,7 +74,7 @@ def render(comparison: Comparison, *, command: str) -> str:
     environment = Environment(
         loader=DictLoader(sources), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(number=number, interval=interval, time=format_time_ps, plain=plain)
+    environment.filters.update(number=number, interval=interval, time=format_time_ps, plain=plain, setting=setting)
     candidates = [
         {
             "judgement": j,
@@ -139,7 +139,7 @@ def number(estimate: Estimate | None) -> str:
     if not math.isfinite(value):
         return "not defined"
     if math.isfinite(error) and error > 0:
-        decimals = min(max(1 - math.floor(math.log10(error)), 0), 4)
+        decimals = min(max(1 - math.floor(math.log10(error)), 0), 4 if abs(value) < 10 else 3)
         return f"{value:.{decimals}f}"
     return f"{value:.4g}"
 
@@ -160,6 +160,15 @@ def plain(estimate: Estimate | None) -> str:
     if estimate is None or not math.isfinite(estimate.value):
         return "–"
     return f"{estimate.value:.2f}" if estimate.value < 10 else f"{estimate.value:.3g}"
+
+
+def setting(key: str, value: object) -> str:
+    """Return an entry of a record for people: ('temperature_k', 300.0) -> 'temperature 300 K'."""
+    shown = f"{value:g}" if isinstance(value, float) else str(value)
+    for ending, unit in _UNITS.items():
+        if key.endswith(ending):
+            return f"{key.removesuffix(ending).replace('_', ' ')} {shown} {unit}"
+    return f"{key.replace('_', ' ')} {shown}"
 
 
 def _per_day(ns_per_day: float) -> str:
@@ -234,11 +243,20 @@ def _command(comparison: Comparison, target: Path) -> str:
     return shlex.join(words)
 
 
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
+def _write_together(texts: dict[Path, str]) -> None:
+    """Write all files under other names first, so that a full disk leaves neither one nor half a file."""
+    partial = {path: path.with_name(f".{path.name}.partial") for path in texts}
     try:
-        partial.write_text(text, "utf-8")
-        partial.replace(path)
+        for path, text in texts.items():
+            if path.is_dir():
+                raise StorageError(f"Cannot write {path}: it is a folder; choose another name with -o.")
+            partial[path].write_text(text, "utf-8")
+        for path in texts:
+            partial[path].replace(path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise StorageError(f"Cannot write {path}: {error.strerror or error}; choose another place with -o.") from error
+        raise StorageError(
+            f"Cannot write {error.filename or 'the report'}: {error.strerror or error}; choose another place with -o."
+        ) from error
+    finally:
+        for leftover in partial.values():
+            leftover.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from surrogate.judge.statistics import (
     difference_p,
     estimate,
     permutation_p,
+    pooled,
 )
 from surrogate.judge.structure import Backbone, Features
 from systems.scene import Scene
@@ -38,7 +39,7 @@ class Options:
     tica_lag_ps: float = 10.0
     lags_ps: tuple[float, ...] = (1.0, 10.0, 50.0)
     n_bootstrap: int = 400
-    n_permutations: int = 2000
+    n_permutations: int = 1000
     seed: int = 0
     significance: float = 0.05
 
@@ -49,7 +50,8 @@ class Row:
 
     `kind` says how it is judged: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
     floor; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is the part of
-    frames that pass a check. `statement` puts the deviation in words. `p_corrected` is Holm's over all rows.
+    frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against reference
+    and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows.
     """
 
     key: str
@@ -62,6 +64,7 @@ class Row:
     replicate: Estimate | None
     ratio: Estimate | None
     p_value: float
+    p_replicate: float
     tolerance: float
     tolerance_text: str
     statement: str
@@ -129,9 +132,12 @@ def distance_row(
     """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate).
 
     `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged.
-    `statement(ratio)` words the deviation. The p-value is a block permutation test of candidate against reference.
+    `statement(ratio)` words the deviation. The p-values are block permutation tests.
     """
     ref, cand, rep = (c.reshape(len(c), -1, c.shape[-1]) for c in counts)
+    # Bins that nobody visits add nothing to any distance.
+    visited = sum(c.sum((0, 1)) for c in (ref, cand, rep)) > 0
+    ref, cand, rep = ref[..., visited], cand[..., visited], rep[..., visited]
     n_series, n_bins = ref.shape[1:]
 
     def mean_distance(p: FloatArray, q: FloatArray) -> FloatArray:
@@ -149,7 +155,8 @@ def distance_row(
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
     rng = np.random.default_rng([trio.options.seed, 99])
-    p = permutation_p(flat[0], flat[1], mean_distance, rng, trio.options.n_permutations)
+    n_permutations = trio.options.n_permutations
+    p = permutation_p(np.concatenate([flat[0], flat[2]]), flat[1], mean_distance, rng, n_permutations)
     return Row(
         key=key,
         group=group,
@@ -161,8 +168,9 @@ def distance_row(
         replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
         ratio=ratio,
         p_value=p if math.isfinite(to_candidate) else math.nan,
+        p_replicate=permutation_p(flat[0], flat[2], mean_distance, rng, n_permutations),
         tolerance=2.0,
-        tolerance_text="at most 2 times the replicate's",
+        tolerance_text="≤ 2 × replicate",
         statement=statement(ratio.value),
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
@@ -200,8 +208,9 @@ def observable_row(
     """
     made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, trio.samples, strict=True)]
     ref, cand, rep = made
+    both = pooled(ref, rep, log=log) if math.isfinite(rep.value) else ref
     ratio = Estimate(math.nan)
-    if ref.value > 0:
+    if ref.value > 2.0 * ref.error:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(cand.value / ref.value, draws[1] / draws[0], min(ref.n_blocks, cand.n_blocks), log=log)
     return Row(
@@ -214,7 +223,8 @@ def observable_row(
         candidate=cand,
         replicate=rep,
         ratio=ratio,
-        p_value=1.0 if abs(cand.value - ref.value) < resolution else difference_p(cand, ref, log=log),
+        p_value=1.0 if abs(cand.value - ref.value) < resolution else difference_p(cand, both, log=log),
+        p_replicate=1.0 if abs(rep.value - ref.value) < resolution else difference_p(rep, ref, log=log),
         tolerance=tolerance * ref.value if log else tolerance,
         tolerance_text=tolerance_text,
         statement=statement(cand.value, ref.value),

@@ -157,6 +157,34 @@ def difference_p(a: Estimate, b: Estimate, *, log: bool = False) -> float:
     return float(2.0 * stdtr(freedom, -gap / combined))
 
 
+def pooled(a: Estimate, b: Estimate, *, log: bool = False) -> Estimate:
+    """Return the mean of two equally long measurements of one thing (geometric with `log`).
+
+    Its error is the combined standard error, or half their difference where that is larger: two pieces of one reference
+    that disagree by more than their error bars show that the bars are too short.
+    """
+    n_blocks = a.n_blocks + b.n_blocks
+    if log and a.value > 0 and b.value > 0:
+        value = math.sqrt(a.value * b.value)
+        combined = 0.5 * math.hypot(a.log_error, b.log_error)
+        log_error = max(combined, 0.5 * abs(math.log(a.value / b.value))) if math.isfinite(combined) else math.nan
+        return Estimate(value, error=value * log_error, log_error=log_error, n_blocks=n_blocks)
+    combined = 0.5 * math.hypot(a.error, b.error)
+    error = max(combined, 0.5 * abs(a.value - b.value)) if math.isfinite(combined) else math.nan
+    return Estimate(0.5 * (a.value + b.value), error=error, n_blocks=n_blocks)
+
+
+def excess_p(n_candidate: int, n_others: int, share: float) -> float:
+    """Return the probability that at least `n_candidate` of all faults fall to a trajectory with `share` of all frames.
+
+    Exact binomial test, one-sided, conditional on the number of faults (Przyborowski and Wilenski, Biometrika 31, 313,
+    1940); frames count as independent.
+    """
+    from scipy.special import bdtrc
+
+    return float(bdtrc(n_candidate - 1, n_candidate + n_others, share)) if n_candidate > 0 else 1.0
+
+
 def permutation_p(
     counts_a: FloatArray,
     counts_b: FloatArray,

@@ -9,12 +9,16 @@ from typing import Literal
 
 from surrogate.judge.rows import Options, Row, Word
 from surrogate.judge.statistics import holm
+from systems import validity
 
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
 
 _FAILS_AT = 10.0
+_SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
 _MENTIONED = 3
+FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
+ALL_KEY = "valid:all"
 
 
 def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
@@ -24,11 +28,14 @@ def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
     close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
     reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
     """
-    corrected = holm([r.p_value for r in rows])
-    return tuple(
+    corrected = holm([math.nan if r.kind == "share" else r.p_value for r in rows])
+    judged = [
         replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
         for row, p in zip(rows, corrected, strict=True)
-    )
+    ]
+    hard = [r.verdict for r in judged if r.kind == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
+    worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
+    return tuple(replace(r, verdict=worst) if r.key == ALL_KEY else r for r in judged)
 
 
 def _word(row: Row, p: float, significance: float) -> Word:
@@ -74,7 +81,8 @@ def _share_word(row: Row) -> Word:
     excess = failing - max(others, default=0.0)
     if not math.isfinite(excess):
         return "fails"
-    if excess <= 1e-9:
+    # Where thermal motion cannot reach, p is NaN: no fault is put down to chance.
+    if excess <= 1e-9 or row.p_value > _SHARE_SIGNIFICANCE:
         return "agrees"
     if excess <= row.tolerance:
         return "close"
@@ -96,9 +104,15 @@ def status(rows: Sequence[Row]) -> Status:
 
 def findings(rows: Sequence[Row]) -> tuple[str, ...]:
     """Return what is wrong, worst first; within one severity validity first, then by how far beyond the tolerance."""
-    bad = [r for r in rows if _SEVERITY[r.verdict] > 0 and r.key != "valid:all"]
-    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.group != "validity", -_excess(r)))
+    bad = [r for r in rows if _SEVERITY[r.verdict] > 0 and r.key != ALL_KEY and r.statement]
+    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.key != FINITE_KEY, r.group != "validity", -_excess(r)))
     return tuple(r.statement for r in bad)
+
+
+def replicate_differs(rows: Sequence[Row], options: Options) -> tuple[str, ...]:
+    """Return the metrics in which reference and replicate differ from each other (Holm over all rows)."""
+    corrected = holm([math.nan if r.kind == "share" else r.p_replicate for r in rows])
+    return tuple(r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance)
 
 
 def _excess(row: Row) -> float:

@@ -1,0 +1,341 @@
+"""The judge must pass what is as good as a replicate and reject, by the right metric, everything below."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from surrogate.judge.comparison import Comparison, Judgement, compare
+from surrogate.judge.ensemble import Ensemble, load_ensemble
+from systems import validity
+from systems.chemistry import backbone_torsions, bonded_graph
+from systems.errors import InputError
+from systems.geometry import torsion
+from systems.scene import Scene
+
+Trio = tuple[Ensemble, Ensemble, Ensemble]
+BAD = ("differs", "fails")
+
+
+def judge(trio: Trio, frames: np.ndarray, **changes: float) -> Judgement:
+    """Judge the trio's candidate with other frames (and, say, another lag) in its place."""
+    reference, candidate, replicate = trio
+    wrong = replace(candidate, segments=[frames.astype(np.float32)], **changes)
+    return compare(reference, [wrong], replicate).judgements[0]
+
+
+def frames_of(trio: Trio) -> np.ndarray:
+    return trio[1].segments[0].copy()
+
+
+def words(judgement: Judgement, group: str) -> set[str]:
+    return {r.verdict for r in judgement.rows if r.group == group}
+
+
+@pytest.fixture(scope="module")
+def fair(trio: Trio) -> Judgement:
+    return judge(trio, frames_of(trio))
+
+
+def test_an_equally_good_trajectory_is_indistinguishable(fair: Judgement) -> None:
+    assert fair.status == "indistinguishable", fair.verdict
+    assert not fair.findings
+    assert fair.row("joint_jsd").ratio.value < 1.5  # type: ignore[union-attr]
+    assert {r.verdict for r in fair.rows} <= {"agrees", "undecided"}
+    undecided = [r.key for r in fair.rows if r.verdict == "undecided"]
+    assert len(undecided) <= 6, undecided
+
+
+def test_shuffled_frames_lose_their_kinetics_and_nothing_else(trio: Trio, fair: Judgement) -> None:
+    frames = frames_of(trio)
+    np.random.default_rng(0).shuffle(frames)
+    found = judge(trio, frames)
+    assert found.status == "different"
+    for key in ("correlation:1", "correlation_time", "tic0_timescale"):
+        assert found.row(key).verdict in BAD, key
+    for key in ("joint_jsd", "phi_jsd", "psi_jsd"):
+        assert found.row(key).candidate.value == pytest.approx(fair.row(key).candidate.value, abs=1e-12)
+        assert found.row(key).verdict == "agrees"
+    assert "too fast" in found.verdict
+
+
+def test_mirror_image_inverts_the_stereocentre(trio: Trio) -> None:
+    found = judge(trio, frames_of(trio) * np.array([-1.0, 1.0, 1.0]))
+    assert found.status == "broken"
+    assert found.row(f"valid:{validity.CHIRALITY}").candidate.value == 0.0
+    assert found.row(f"valid:{validity.CHIRALITY}").verdict == "fails"
+    assert found.row("joint_jsd").verdict == "differs"
+    assert "inverted stereocentre" in found.verdict
+
+
+def test_a_frozen_trajectory_fails(trio: Trio) -> None:
+    frames = frames_of(trio)
+    found = judge(trio, np.repeat(frames[:1], len(frames), axis=0))
+    assert found.status == "broken"
+    assert math.isnan(found.row("correlation_time").candidate.value)
+    assert found.row("correlation_time").verdict == "fails"
+    assert found.row("joint_jsd").verdict == "differs"
+    assert "does not move" in " ".join(found.findings)
+
+
+def test_a_missing_basin_is_named(trio: Trio, alanine_dipeptide: Scene) -> None:
+    frames = frames_of(trio)
+    phi = torsion(frames, backbone_torsions(alanine_dipeptide)["phi"])[:, 0]
+    inside = np.flatnonzero(phi < 0)
+    # Each frame of the basin is replaced by the last one outside it: no jump to another time.
+    last = np.maximum.accumulate(np.where(phi < 0, np.arange(len(phi)), inside[0]))
+    found = judge(trio, frames[last])
+    assert found.row("population:φ > 0").candidate.value == 0.0
+    assert found.row("population:φ > 0").verdict == "differs"
+    assert found.row("phi_jsd").verdict == "differs"
+    assert any("φ > 0 of ALA 2 is never visited" in f for f in found.findings)
+
+
+def test_three_percent_longer_bonds_are_named(trio: Trio, alanine_dipeptide: Scene, fair: Judgement) -> None:
+    frames = frames_of(trio)
+    quad = backbone_torsions(alanine_dipeptide)["phi"][0]
+    carbon, nitrogen = int(quad[0]), int(quad[1])
+    graph = bonded_graph(alanine_dipeptide)
+    graph.remove_edge(carbon, nitrogen)
+    far = sorted(nx.node_connected_component(graph, nitrogen))
+    frames[:, far] += 0.03 * (frames[:, nitrogen] - frames[:, carbon])[:, None]
+    found = judge(trio, frames)
+    assert found.row("bond_shift").verdict == "differs"
+    assert re.search(r"C-N \(ACE 1 - ALA 2\) bonds are (2\.9|3\.0|3\.1) % long", found.verdict)
+    assert "C-N (ACE 1 - ALA 2)" in found.row("bond_shift").metric
+    assert found.row("bond_jsd").candidate.value > 1.3 * fair.row("bond_jsd").candidate.value
+    assert words(found, "validity") == {"agrees"}, "3 % is within every per-frame rule: only the means can show it"
+    assert words(found, "kinetics") <= {"agrees", "undecided"}
+
+
+@pytest.mark.parametrize("share", [0.0005, 0.05])
+def test_frames_that_are_not_finite_fail_and_help_no_score(trio: Trio, fair: Judgement, share: float) -> None:
+    frames = frames_of(trio)
+    n = int(share * len(frames))
+    frames[np.random.default_rng(1).choice(len(frames), n, replace=False)] = np.nan
+    found = judge(trio, frames)
+    assert found.status == "broken"
+    assert found.row("valid:1").verdict == "fails"
+    assert found.row("valid:1").candidate.value == pytest.approx(100 * (1 - share))
+    assert "not finite" in found.verdict
+    assert all(f.counts["not finite"] == k for f, k in zip(found.faults, (0, n, 0)))
+    for key in ("joint_jsd", "phi_jsd", "psi_jsd", "bond_jsd", "tic0_jsd"):
+        assert found.row(key).candidate.value > fair.row(key).candidate.value - 2e-3, key
+
+
+def test_hiding_a_wrong_region_behind_nan_gains_nothing(trio: Trio, alanine_dipeptide: Scene) -> None:
+    """A candidate that visits what the reference never does scores no better when those frames become NaN."""
+    from systems.geometry import superpose
+
+    frames = frames_of(trio)
+    wrong = frames.copy()
+    wrong[::10] = superpose(np.repeat(alanine_dipeptide.positions_nm[None], len(wrong[::10]), axis=0), frames[0])
+    hidden = wrong.copy()
+    hidden[::10] = np.nan
+    shown, covered = judge(trio, wrong), judge(trio, hidden)
+    assert covered.row("joint_jsd").candidate.value >= shown.row("joint_jsd").candidate.value - 1e-6
+    assert covered.status == "broken"
+
+
+def test_one_exploded_frame_is_seen(trio: Trio, fair: Judgement) -> None:
+    frames = frames_of(trio)
+    frames[5000] *= 1e6
+    found = judge(trio, frames)
+    name = "bond more than 0.5 Å off"
+    assert (fair.faults[1].counts[name], found.faults[1].counts[name]) == (0, 1)
+    assert found.faults[1].n_invalid == fair.faults[1].n_invalid + 1
+    assert found.faults[1].first_invalid_ps == 5000.0
+    assert found.row("valid:2").verdict == found.row("valid:all").verdict == "close"
+    assert any("have a bond more than 0.5 Å off" in f for f in found.findings)
+    assert found.row("joint_jsd").verdict == found.row("bond_shift").verdict == "agrees"
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_time_axis_shows_in_the_relaxation_time(trio: Trio, fair: Judgement, factor: float) -> None:
+    found = judge(trio, frames_of(trio), lag_ps=factor)
+    row = found.row("correlation_time")
+    assert row.verdict == "differs"
+    assert row.candidate.value == pytest.approx(factor * fair.row("correlation_time").candidate.value, rel=0.35)
+    assert found.row("joint_jsd").verdict == "agrees"
+    assert ("too slowly" if factor > 1 else "too fast") in found.verdict
+
+
+def test_repeated_frames_slow_it_down(trio: Trio) -> None:
+    found = judge(trio, np.repeat(frames_of(trio), 2, axis=0))
+    assert found.row("correlation_time").verdict == "differs"
+    assert found.row("correlation:1").verdict in ("close", "differs")
+
+
+def test_five_picometres_of_noise_widen_the_bonds(trio: Trio) -> None:
+    frames = frames_of(trio)
+    frames += np.random.default_rng(2).normal(0, 0.005, frames.shape)
+    found = judge(trio, frames)
+    assert found.row("bond_width").verdict == "differs"
+    assert found.row("bond_jsd").verdict == "differs"
+    assert any("vary by" in f for f in found.findings)
+
+
+def test_seams_between_chunks_show(trio: Trio, alanine_dipeptide: Scene) -> None:
+    """Chunks of 32 frames put in random order: each is true MD, the seams are not."""
+    frames = frames_of(trio)
+    n = len(frames) // 32
+    shuffled = frames[: 32 * n].reshape(n, 32, *frames.shape[1:])[np.random.default_rng(3).permutation(n)]
+    chunks = [np.repeat(np.arange(n, dtype=np.int32), 32)]
+    reference, candidate, replicate = trio
+    torn = replace(candidate, segments=[shuffled.reshape(-1, *frames.shape[1:])], chunk_idx=chunks)
+    seamless = replace(candidate, segments=[frames[: 32 * n]], chunk_idx=chunks)
+    found, fine = compare(reference, [torn, seamless], replicate).judgements
+    assert found.row("chunk_step").verdict == "differs"
+    assert any("where one chunk meets the next" in f for f in found.findings)
+    assert fine.row("chunk_step").verdict == "agrees"
+    assert fine.row("chunk_step").candidate.low < 1.0 < fine.row("chunk_step").candidate.high
+    assert found.curves.timelines[1].n_chunks == n
+
+
+def test_a_shift_or_a_turn_of_the_whole_changes_nothing(trio: Trio, fair: Judgement) -> None:
+    angle = 1.1
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    found = judge(trio, frames_of(trio).astype(np.float64) @ turn.T + np.array([3.0, -2.0, 1.0]))
+    assert found.status == fair.status
+    for a, b in zip(found.rows, fair.rows, strict=True):
+        assert a.candidate.value == pytest.approx(b.candidate.value, rel=2e-2, abs=2e-3), a.key
+
+
+def test_a_candidate_is_judged_the_same_alone_and_in_company(trio: Trio, fair: Judgement) -> None:
+    reference, candidate, replicate = trio
+    frozen = replace(candidate, label="frozen", segments=[np.repeat(candidate.segments[0][:1], 500, axis=0)])
+    both = compare(reference, [frozen, candidate], replicate)
+    assert [r.to_dict() for r in both.judgements[1].rows] == [r.to_dict() for r in fair.rows]
+    assert both.judgements[0].n_frames == 500
+
+
+def test_without_a_replicate_the_reference_is_halved_and_says_so(trio: Trio) -> None:
+    reference, candidate, _ = trio
+    found = compare(reference, [candidate])
+    judgement = found.judgements[0]
+    assert judgement.n_frames == reference.n_frames // 2
+    assert any("cut in two halves" in note for note in found.notes)
+    assert any(f"the first 6 ns of {candidate.total_ps / 1000:g} ns" in note for note in judgement.notes)
+    assert judgement.status == "indistinguishable"
+
+
+def test_lengths_are_made_equal(simulate: Callable[..., Ensemble], trio: Trio) -> None:
+    reference, _, replicate = trio
+    short = simulate(9, 3_000, n_segments=3)
+    judgement = compare(reference, [short], replicate).judgements[0]
+    assert judgement.n_frames == 3_000 and judgement.compared_ps == 3_000.0
+    assert sum("are used, for equal length" in n for n in judgement.notes) == 2
+
+
+def test_intervals_that_differ_are_thinned_to_a_common_one(trio: Trio) -> None:
+    reference, candidate, replicate = trio
+    thin = replace(candidate, segments=[candidate.segments[0][::3]], lag_ps=3.0)
+    found = compare(reference, [thin], replicate)
+    assert found.lag_ps == 3.0
+    assert found.judgements[0].row("correlation_time").verdict in ("agrees", "undecided")
+    assert any("every 3th frame" in note for note in found.notes)
+
+
+def test_what_cannot_be_compared_is_refused(trio: Trio) -> None:
+    reference, candidate, replicate = trio
+    with pytest.raises(InputError, match="at least one trajectory"):
+        compare(reference, [])
+    with pytest.raises(InputError, match="only 12 frames"):
+        compare(reference, [replace(candidate, segments=[candidate.segments[0][:12]])], replicate)
+    with pytest.raises(InputError, match="no metric 'rmsd'"):
+        compare(reference, [candidate], replicate).judgements[0].row("rmsd")
+
+
+def test_an_unvisited_state_is_undecided_not_fine(simulate: Callable[..., Ensemble]) -> None:
+    """With 120 frames next to nothing can be known, and the judge says so."""
+    judgement = compare(simulate(11, 120), [simulate(12, 120)], simulate(13, 120)).judgements[0]
+    assert judgement.row("population").verdict == "undecided"
+    assert any("too short to judge by" in note for note in judgement.notes)
+    assert "cannot be decided" in judgement.verdict or judgement.status != "indistinguishable"
+
+
+def methanol() -> Scene:
+    """Six atoms, no torsion about a peptide bond, no stereocentre, no ring."""
+    positions = [[0.0, 0, 0], [0.143, 0, 0], [-0.036, 0.103, 0], [-0.036, -0.051, 0.089], [-0.036, -0.051, -0.089],
+                 [0.175, 0.09, 0]]  # fmt: skip
+    return Scene(
+        name="methanol",
+        atom_names=("C", "O", "H1", "H2", "H3", "HO"),
+        elements=("C", "O", "H", "H", "H", "H"),
+        residue_of_atom=np.zeros(6, dtype=np.int64),
+        residue_names=("MOH",),
+        residue_ids=("1",),
+        chain_of_residue=("A",),
+        bonds=np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 5]]),
+        bond_orders=np.ones(5),
+        formal_charges=np.zeros(6, dtype=np.int64),
+        masses_da=np.array([12.0, 16, 1, 1, 1, 1]),
+        positions_nm=np.array(positions),
+    )
+
+
+def small_ensemble(seed: int, width_nm: float = 0.003) -> Ensemble:
+    scene = methanol()
+    rng = np.random.default_rng(seed)
+    frames = scene.positions_nm + width_nm * rng.standard_normal((2_000, 6, 3))
+    return Ensemble(f"methanol {seed}", [frames.astype(np.float32)], 0.5, scene)
+
+
+def test_a_scene_without_torsions_is_judged_by_what_it_has() -> None:
+    good, hot = compare(small_ensemble(1), [small_ensemble(2), small_ensemble(4, 0.006)], small_ensemble(3)).judgements
+    assert good.status == "indistinguishable"
+    assert hot.row("bond_width").verdict == "differs"
+    reasons = dict(good.skipped)
+    assert reasons["Torsion distributions, basins, autocorrelation"] == "the scene has no φ or ψ torsion"
+    assert reasons["Stereocentres"] == "the scene has none"
+    assert any(what.startswith("TICA") for what in reasons)
+    assert not any(r.group in ("populations", "kinetics") for r in good.rows)
+
+
+@pytest.mark.slow
+def test_replicates_pass_at_the_stated_rate(simulate: Callable[..., Ensemble]) -> None:
+    """At most 5 % of fair comparisons may end in 'close' or worse; of 50, more than 7 would be chance once in 80 times."""
+    alarms = 0
+    for seed in range(50):
+        a, b, c = (simulate(1000 + 3 * seed + k, 6_000) for k in range(3))
+        alarms += compare(a, [b], c).judgements[0].status not in ("indistinguishable", "undecided")
+    assert alarms <= 7
+
+
+def test_real_trajectories_of_one_molecule_agree(shared_data: Path, alanine_dipeptide: Scene) -> None:
+    folder = shared_data / "alanine-dipeptide"
+
+    def load(*numbers: int) -> Ensemble:
+        files = [folder / f"trajectory-{i}.dcd" for i in numbers]
+        return load_ensemble(files, template=alanine_dipeptide, top=folder / "ala2.pdb", lag_ps=1.0)
+
+    found: Comparison = compare(load(1, 2), [load(3, 4)], load(5, 6))
+    judgement = found.judgements[0]
+    assert judgement.status in ("indistinguishable", "close", "undecided")
+    assert judgement.faults[1].n_invalid == 0
+    assert judgement.row("population:ψ in the β basin").candidate.value == pytest.approx(52, abs=6)
+    assert judgement.row("correlation:1").reference.value == pytest.approx(0.987, abs=0.002)  # type: ignore[union-attr]
+    assert 150 < judgement.row("correlation_time").candidate.value < 400
+
+
+def test_real_torsions_equal_mdtrajs(shared_data: Path) -> None:
+    """An independent implementation on real frames."""
+    import mdtraj
+
+    from surrogate.judge import structure
+
+    folder = shared_data / "alanine-dipeptide"
+    files = [folder / "trajectory-1.dcd"]
+    ensemble = load_ensemble(files, top=folder / "ala2.pdb", lag_ps=1.0)
+    features = structure.measure(ensemble, structure.backbone(ensemble.scene), structure.reference_geometry(ensemble))
+    theirs = mdtraj.load(str(files[0]), top=str(folder / "ala2.pdb"))
+    for own, compute in ((features.phi, mdtraj.compute_phi), (features.psi, mdtraj.compute_psi)):
+        step = own[0][:, 0] - compute(theirs)[1][:, 0]
+        assert np.abs(np.angle(np.exp(1j * step))).max() < 2e-3

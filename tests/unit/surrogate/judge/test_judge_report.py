@@ -1,0 +1,160 @@
+"""The report: offline, whole or absent, strict JSON, the verdict first."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogate.judge import report
+from surrogate.judge.comparison import Comparison, compare
+from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.report import write_report
+from surrogate.judge.statistics import Estimate
+from systems.errors import InputError, StorageError
+
+VOID = {"meta", "link", "br", "img", "hr"}
+
+
+class Page(HTMLParser):
+    """Collects tags and checks that every element is closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href", "srcset", "action")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes <{self.open[-1:]}>"
+        self.open.pop()
+
+
+@pytest.fixture(scope="module")
+def comparison(simulate: Callable[..., Ensemble]) -> Comparison:
+    """One sound candidate, and one with every kind of trouble the page has to show."""
+    reference, good, replicate = (simulate(seed, 3_000) for seed in (31, 32, 33))
+    record = {"model": "lam-slide", "temperature_k": 300.0, "cost": {"wall_s": 10.0, "network_evaluations": 100}}
+    frames = good.segments[0].copy()
+    frames[::50] = np.nan
+    frames[7] *= 1.5
+    chunks = [np.repeat(np.arange(100, dtype=np.int32), 30)]
+    bad = replace(good, label="<script>alert(1)</script>", segments=[frames], chunk_idx=chunks, record=record)
+    reference = replace(reference, record={"temperature_k": 300.0, "cost": {"wall_s": 200.0}}, sources=("ref.h5",))
+    return compare(reference, [replace(good, sources=("a b.h5",)), bad], replicate)
+
+
+@pytest.fixture(scope="module")
+def written(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, object]]:
+    html, beside = write_report(comparison, tmp_path_factory.mktemp("report") / "report.html")
+    return html.read_text("utf-8"), json.loads(beside.read_text("utf-8"))
+
+
+def test_page_is_well_formed_and_asks_for_nothing(written: tuple[str, dict[str, object]]) -> None:
+    page = Page(written[0])
+    assert not page.open
+    assert all(a.startswith(("#", "data:")) for a in page.addresses), page.addresses
+    assert "script" not in page.tags
+    without_namespaces = re.sub(r'xmlns(:\w+)?="[^"]*"', "", written[0])
+    assert not re.search(r"https?://|@import|url\((?!#)", without_namespaces)
+
+
+def test_verdict_stands_before_everything_else(written: tuple[str, dict[str, object]], comparison: Comparison) -> None:
+    html = written[0]
+    first = html.index('class="verdict')
+    assert first < html.index("<svg") and first < html.index("<table")
+    assert comparison.judgements[1].status == "broken"
+    assert "Broken: 2 % of frames have coordinates that are not finite" in html
+
+
+def test_names_from_outside_are_escaped(written: tuple[str, dict[str, object]]) -> None:
+    assert "<script>alert" not in written[0]
+    assert "&lt;script&gt;alert(1)" in written[0]
+
+
+def test_costs_skips_definitions_and_command_are_there(written: tuple[str, dict[str, object]]) -> None:
+    html = written[0]
+    for text in ("25.9 µs/day", "20 × the reference", "Left out, and why", "Planar rings: the scene has none",
+                 "Jensen-Shannon distance", "How to make this report again", "surromd compare ref.h5 &#39;a b.h5&#39;",
+                 "100 chunks", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
+        assert text in html, text
+
+
+def test_json_is_strict_and_holds_every_row_and_curve(
+    written: tuple[str, dict[str, object]], comparison: Comparison
+) -> None:
+    data = written[1]
+    judged = data["judgements"]
+    assert isinstance(judged, list)
+    for out, judgement in zip(judged, comparison.judgements, strict=True):
+        assert [r["key"] for r in out["rows"]] == [r.key for r in judgement.rows]
+        assert out["verdict"] == judgement.verdict
+        assert np.array(out["curves"]["ramachandran"][0]["reference"]).shape == (50, 50)
+        assert {"correlations", "histograms", "timelines", "bonds"} <= set(out["curves"])
+    assert judged[1]["speed_ratio"] == pytest.approx(20.0)
+    assert data["replicate"] is not None
+
+
+def test_same_input_same_page(comparison: Comparison) -> None:
+    assert report.render(comparison, command="x") == report.render(comparison, command="x")
+
+
+def test_only_html_is_written(comparison: Comparison, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"written as \.html"):
+        write_report(comparison, tmp_path / "report.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_left_where_it_cannot_be_written(comparison: Comparison, tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="Cannot write"):
+        write_report(comparison, tmp_path / "absent" / "report.html")
+    (tmp_path / "taken.html").mkdir()
+    with pytest.raises(StorageError, match="Cannot write"):
+        write_report(comparison, tmp_path / "taken.html")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.html"]
+
+
+def test_numbers_show_as_many_digits_as_they_have() -> None:
+    assert report.number(Estimate(0.12345, error=0.02)) == "0.123"
+    assert report.number(Estimate(123.456, error=20.0)) == "123"
+    assert report.number(Estimate(99.9871, error=0.002)) == "99.987"
+    assert report.number(Estimate(float("nan"))) == "not defined"
+    assert report.number(None) == "–"
+    assert report.interval(Estimate(1.0, 0.9, 1.1, 0.05)) == "[0.900, 1.100]"
+    assert report.interval(Estimate(1.0, 1.0, 1.0, 0.0)) == ""
+    assert report.setting("temperature_k", 300.0) == "temperature 300 K"
+    assert report.setting("friction_per_ps", 1.0) == "friction 1 /ps"
+    assert report.setting("force_field", "ff14SB") == "force field ff14SB"
+
+
+def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:
+    from systems.scene import Scene
+
+    positions = np.array([[0.0, 0.0, 0.0], [0.096, 0.0, 0.0], [-0.024, 0.093, 0.0]])
+    water = Scene("water", ("O", "H1", "H2"), ("O", "H", "H"), np.zeros(3, dtype=np.int64), ("HOH",), ("1",), ("A",),
+                  np.array([[0, 1], [0, 2]]), np.ones(2), np.zeros(3, dtype=np.int64), np.array([16.0, 1, 1]),
+                  positions)  # fmt: skip
+    rng = np.random.default_rng(0)
+    made = [Ensemble(f"w{k}", [(positions + rng.normal(0, 0.002, (500, 3, 3))).astype(np.float32)], 0.5, water)
+            for k in range(2)]  # fmt: skip
+    html, _ = write_report(compare(made[0], [made[1]]), tmp_path / "water.html")
+    text = html.read_text("utf-8")
+    assert "the scene has no φ or ψ torsion" in text and not Page(text).open
