@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,11 @@ from md_reference.platforms import choose_platform
 from systems.errors import SimulationError
 from systems.scene import FloatArray, Scene
 
+GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
+# Minus the logarithm of how often chance may be taken for a blow-up.
+_UNLIKELINESS = 50.0
+
+
 @dataclass(frozen=True)
 class State:
     """Positions `(n_atoms, 3)` nm, energies in kJ/mol, time in ps, kinetic temperature in K."""
@@ -22,6 +28,11 @@ class State:
     kinetic_kj_mol: float
     time_ps: float
     temperature_k: float
+
+
+def _one_line(error: Exception) -> str:
+    """OpenMM's own words, without its advice and its address."""
+    return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
 
 
 class Engine:
@@ -58,7 +69,7 @@ class Engine:
                 self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties
             )
         except openmm.OpenMMException as error:
-            raise SimulationError(f"platform {self.platform_name} cannot run {scene.name!r}: {error}") from error
+            raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {_one_line(error)}") from error
         self._context.setPositions(scene.positions_nm)
         n_virtual = sum(self._system.isVirtualSite(i) for i in range(self._system.getNumParticles()))
         self._n_dof = 3 * (scene.n_atoms - n_virtual) - self._system.getNumConstraints()
@@ -81,20 +92,29 @@ class Engine:
         """Return the potential energy in kJ/mol, here or at given positions `(n_atoms, 3)` nm."""
         if positions_nm is not None:
             self.set_positions(positions_nm)
-        return float(self._context.getState(energy=True).getPotentialEnergy()._value)
+        return float(self._query(energy=True).getPotentialEnergy()._value)
 
     def forces(self, positions_nm: npt.ArrayLike | None = None) -> FloatArray:
         """Return the forces `(n_atoms, 3)` in kJ/mol/nm."""
         if positions_nm is not None:
             self.set_positions(positions_nm)
-        return np.asarray(self._context.getState(forces=True).getForces(asNumpy=True)._value, dtype=np.float64)
+        return np.asarray(self._query(forces=True).getForces(asNumpy=True)._value, dtype=np.float64)
 
     def minimise(self, *, max_iterations: int = 0) -> float:
-        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol."""
+        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
+
+        Raises SimulationError when the energy is not finite, as with atoms on top of each other.
+        """
         import openmm
 
-        openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
-        return self.energy()
+        try:
+            openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"minimisation failed: {_one_line(error)}") from error
+        energy = self.energy()
+        if not math.isfinite(energy):
+            raise SimulationError("minimisation failed: the energy is not finite; do atoms lie on top of each other?")
+        return energy
 
     def thermalise(self) -> None:
         """Draw velocities from the Maxwell-Boltzmann distribution at the bath's temperature."""
@@ -111,23 +131,41 @@ class Engine:
         try:
             self._integrator.step(n_steps)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"integration failed: {error}") from error
+            raise SimulationError(f"integration failed: {_one_line(error)}") from error
 
     def positions(self) -> FloatArray:
         """Return positions `(n_atoms, 3)` nm without computing any energy."""
-        return np.asarray(self._context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
+        return np.asarray(self._query(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
 
     def state(self) -> State:
-        """Return positions, energies, time and kinetic temperature."""
-        raw = self._context.getState(positions=True, energy=True)
+        """Return positions, energies, time and kinetic temperature. Raises SimulationError for a state that is not
+        finite, or hotter than the bath can make it: 1 + 2 sqrt(x/n) + 2 x/n times, n degrees of freedom, x = 50, which
+        chance exceeds in one frame of 10^21 (Laurent and Massart, Ann. Statist. 28, 1302 (2000), lemma 1).
+        """
+        raw = self._query(positions=True, energy=True)
         kinetic = float(raw.getKineticEnergy()._value)
-        return State(
+        state = State(
             positions_nm=np.asarray(raw.getPositions(asNumpy=True)._value, dtype=np.float64),
             potential_kj_mol=float(raw.getPotentialEnergy()._value),
             kinetic_kj_mol=kinetic,
             time_ps=float(raw.getTime()._value),
-            temperature_k=2.0 * kinetic / (self._n_dof * 8.31446261815324e-3),
+            temperature_k=2.0 * kinetic / (self._n_dof * GAS_CONSTANT_KJ_MOL_K),
         )
+        if not (np.isfinite(state.positions_nm).all() and math.isfinite(state.potential_kj_mol)):
+            raise SimulationError("coordinates or energy are no longer finite")
+        x = _UNLIKELINESS / self._n_dof
+        if not state.temperature_k <= self._temperature_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x):
+            raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
+        return state
+
+    def _query(self, **what: bool) -> Any:
+        """Return OpenMM's State; some platforms notice here that coordinates are no longer finite."""
+        import openmm
+
+        try:
+            return self._context.getState(**what)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"evaluation failed: {_one_line(error)}") from error
 
     def checkpoint(self) -> bytes:
         """Return OpenMM's binary checkpoint: positions, velocities, time, random states. Same platform only."""
@@ -140,7 +178,7 @@ class Engine:
         try:
             self._context.loadCheckpoint(blob)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"checkpoint does not fit this run: {error}") from error
+            raise SimulationError(f"checkpoint does not fit this run: {_one_line(error)}") from error
 
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""

@@ -34,11 +34,13 @@ class ForceFieldSpec:
         if self.force_field not in FORCE_FIELD_FILES:
             known = list(FORCE_FIELD_FILES)
             raise UnknownNameError(
-                f"unknown force field {self.force_field!r}; known: {', '.join(known)}.{nearest(self.force_field, known)}"
+                f"unknown force field {self.force_field!r}; known: {', '.join(known)}."
+                + nearest(self.force_field, known)
             )
         if self.solvent not in SOLVENTS:
             raise UnknownNameError(
-                f"unknown solvent {self.solvent!r}; known: {', '.join(SOLVENTS)}.{nearest(self.solvent, list(SOLVENTS))}"
+                f"unknown solvent {self.solvent!r}; known: {', '.join(SOLVENTS)}."
+                + nearest(self.solvent, list(SOLVENTS))
             )
         if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
             raise PreparationError("solvent 'amber99-obc' goes with --force-field ff99SB-ILDN; use obc2 otherwise.")

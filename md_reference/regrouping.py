@@ -24,6 +24,9 @@ def regroup(scene: Scene) -> tuple[Scene, IntArray]:
     bonds are cut; they follow the chain from its N to its C terminus, atoms keep their order within one. Names come
     from the first atom's residue. Force fields recognise residues by their bonds, so names need not be right: a whole
     peptide in one residue 'UNL', or residues whose atoms lie mixed, become what OpenMM's templates know.
+
+    Energies do not depend on the order of atoms for alanine dipeptide (to rounding); in residues with several equal
+    neighbours about a planar atom (ARG, TRP, HIS) Amber's improper torsions depend on it, by some tenths of a kJ/mol.
     """
     amides = backbone_torsions(scene)["omega"][:, 1:3]
     cut = {(min(c, n), max(c, n)) for c, n in amides.tolist()}
@@ -101,8 +104,8 @@ def _permuted_force(force: Any, to: list[int]) -> Any:
             new.setBondParameters(k, to[i], to[j], *rest)
     elif isinstance(force, openmm.HarmonicAngleForce):
         for k in range(force.getNumAngles()):
-            i, j, l, *rest = force.getAngleParameters(k)
-            new.setAngleParameters(k, to[i], to[j], to[l], *rest)
+            a, b, c, *rest = force.getAngleParameters(k)
+            new.setAngleParameters(k, to[a], to[b], to[c], *rest)
     elif isinstance(force, openmm.PeriodicTorsionForce):
         for k in range(force.getNumTorsions()):
             a, b, c, d, *rest = force.getTorsionParameters(k)

@@ -70,14 +70,14 @@ def simulate(
 
     A `kill -9` loses at most the frames since the last checkpoint (`checkpoint_every_s` of wall time); `resume=True`
     cuts the file back to that checkpoint and goes on with the same random stream. Ctrl-C and SIGTERM stop between two
-    frames, with a checkpoint: KeyboardInterrupt. Raises SimulationError when
-    coordinates stop being finite: the frames before stay in the file, which then says `completed: false`.
+    frames, with a checkpoint: KeyboardInterrupt. Raises SimulationError when coordinates stop being finite or the
+    system blows up (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
     n_frames, steps_per_frame = config.n_frames, config.steps_per_frame
     chk = checkpoint_path(out)
     if resume and not chk.exists() and out.exists():
-        return _already_complete(out, n_frames)
+        return _already_complete(out, config)
     resuming = resume and chk.exists() and out.exists()
     started = time.monotonic()
     with Engine(
@@ -92,20 +92,15 @@ def simulate(
         record = _record(config, engine)
         if resuming:
             header, blob = _read_checkpoint(chk)
-            _check_same_run(header["config"], asdict(config), out)
+            _check_same_run(header["config"], _settings(config), out)
             engine.restore(blob)
             done, spent_s = int(header["n_frames"]), float(header["wall_s"])
         else:
             done, spent_s = 0, 0.0
-            engine.minimise()
-            engine.thermalise()
-            to_equilibrate = max(1, round(config.equilibrate_ps / config.timestep_ps))
-            for start in range(0, to_equilibrate, _STEPS_BETWEEN_SIGNALS):
-                engine.step(min(_STEPS_BETWEEN_SIGNALS, to_equilibrate - start))
-            engine.reset_clock()
+            _equilibrate(engine, config, scene.name)
 
         def save_checkpoint(wall_s: float) -> None:
-            header = {"config": asdict(config), "n_frames": done, "wall_s": wall_s}
+            header = {"config": _settings(config), "n_frames": done, "wall_s": wall_s}
             _write_checkpoint(chk, header, engine.checkpoint())
 
         with (
@@ -131,12 +126,9 @@ def simulate(
                         break
                     try:
                         engine.step(steps_per_frame)
+                        state = engine.state()
                     except SimulationError as error:
                         failure = str(error)
-                        break
-                    state = engine.state()
-                    if not np.isfinite(state.positions_nm).all():
-                        failure = "coordinates are no longer finite"
                         break
                     frames[k] = state.positions_nm
                     scalars["potential_kj_mol"][k] = state.potential_kj_mol
@@ -150,7 +142,7 @@ def simulate(
                     writer.update_record({"completed": False, "failure": failure, "cost": _cost(wall_s, done, config)})
                     raise SimulationError(
                         f"{scene.name}: {failure} after {format_time_ps(done * config.save_every_ps)}; {done} good "
-                        f"frames are in {out}. Try a shorter --timestep (now {config.timestep_ps * 1000:g} fs)."
+                        f"frames are in {out}. {_advice(config)}"
                     )
                 if progress is not None:
                     progress(done, n_frames)
@@ -164,9 +156,28 @@ def simulate(
                 per_frame_s = max((time.monotonic() - block_began) / size, 1e-6)
                 block = min(max(1, round(0.5 / per_frame_s)), 1000, 2 * block)
             wall_s = spent_s + time.monotonic() - started
-            writer.update_record({"completed": True, "cost": _cost(wall_s, done, config)})
+            # A resumed run may have become longer than the one that wrote the record.
+            writer.update_record({"completed": True, "time_ps": config.time_ps, "cost": _cost(wall_s, done, config)})
     chk.unlink(missing_ok=True)
     return out
+
+
+def _equilibrate(engine: Engine, config: MDConfig, name: str) -> None:
+    """Minimise, draw velocities, run for `equilibrate_ps`, set the clock to 0. Raises SimulationError."""
+    try:
+        engine.minimise()
+        engine.thermalise()
+        n_steps = max(1, round(config.equilibrate_ps / config.timestep_ps))
+        for start in range(0, n_steps, _STEPS_BETWEEN_SIGNALS):
+            engine.step(min(_STEPS_BETWEEN_SIGNALS, n_steps - start))
+        engine.state()
+    except SimulationError as error:
+        raise SimulationError(f"{name}: {error} before the first frame. {_advice(config)}") from error
+    engine.reset_clock()
+
+
+def _advice(config: MDConfig) -> str:
+    return f"Try a shorter --timestep (now {config.timestep_ps * 1000:g} fs)."
 
 
 def _cost(wall_s: float, n_frames: int, config: MDConfig) -> dict[str, float]:
@@ -181,29 +192,39 @@ def _cost(wall_s: float, n_frames: int, config: MDConfig) -> dict[str, float]:
 def _record(config: MDConfig, engine: Engine) -> dict[str, Any]:
     import openmm
 
-    flat = asdict(config)
-    flat.update(flat.pop("force"))
-    flat["platform"] = engine.platform_name
     return {
         "kind": "reference",
         "integrator": "LangevinMiddle",
         "program": {"openmm": openmm.__version__},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,
-        **flat,
+        **_settings(config),
+        "platform": engine.platform_name,
     }
 
 
-def _already_complete(out: Path, n_frames: int) -> Path:
+def _settings(config: MDConfig) -> dict[str, Any]:
+    """The settings of a run as one level of names and plain values."""
+    flat = asdict(config)
+    force = flat.pop("force")
+    return {**flat, **force}
+
+
+def _already_complete(out: Path, config: MDConfig) -> Path:
     from systems.trajectory import open_trajectory
 
     with open_trajectory(out) as reader:
-        if reader.record.get("completed") and reader.n_frames == n_frames:
-            return out
-        raise InputError(
-            f"{out} holds {reader.n_frames} of {n_frames} frames but its checkpoint is gone; start again with "
-            "--overwrite, or keep it under another name."
-        )
+        record, n_frames = reader.record, reader.n_frames
+    asked = _settings(config)
+    # The record names the platform that ran, which "auto" leaves open.
+    asked.pop("platform")
+    _check_same_run({key: record.get(key) for key in asked}, asked, out)
+    if record.get("completed") and n_frames == config.n_frames:
+        return out
+    raise InputError(
+        f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
+        "--overwrite, or keep it under another name."
+    )
 
 
 def _check_same_run(old: dict[str, Any], new: dict[str, Any], out: Path) -> None:
