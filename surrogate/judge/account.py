@@ -18,11 +18,14 @@ from systems import validity
 class Account:
     """What one trajectory is: where from, how long, how it was made, what it cost.
 
-    `total_ps`, `n_frames` are of the whole input; `ns_per_day` and `wall_s` are None where its record holds no cost.
+    `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
+    `ns_per_day` and `wall_s` are None where its record holds no cost.
     """
 
     label: str
     sources: tuple[str, ...]
+    top: str | None
+    stated_lag_ps: float | None
     n_segments: int
     n_frames: int
     lag_ps: float
@@ -69,6 +72,8 @@ def account_of(ensemble: Ensemble) -> Account:
     return Account(
         label=ensemble.label,
         sources=ensemble.sources,
+        top=ensemble.top,
+        stated_lag_ps=ensemble.stated_lag_ps,
         n_segments=len(ensemble.segments),
         n_frames=ensemble.n_frames,
         lag_ps=ensemble.lag_ps,

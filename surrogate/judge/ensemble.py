@@ -30,7 +30,8 @@ class Ensemble:
 
     `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`; `lag_ps`: time between frames;
     `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
-    the writer said of itself (costs summed over files); `sources`: the files; `notes`: what was done on reading.
+    the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
+    said of them; `notes`: what was done on reading.
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -42,6 +43,8 @@ class Ensemble:
     chunk_idx: Sequence[npt.NDArray[np.int32]] | None = None
     record: dict[str, Any] = field(default_factory=dict)
     sources: tuple[str, ...] = ()
+    top: str | None = None
+    stated_lag_ps: float | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -146,6 +149,8 @@ def load_ensemble(
         chunk_idx=chunks if len(chunks) == len(segments) else None,
         record=_merged_record(records, name, notes),
         sources=tuple(str(p) for p in paths),
+        top=None if top is None else str(top),
+        stated_lag_ps=lag_ps,
         notes=tuple(notes),
     )
 

@@ -85,7 +85,7 @@ def _share_row(trio: Trio, check: Check, key: str) -> Row:
         found = estimate(float(value), draws, sample.blocks.n_blocks)
         failing_frames.append(round(float(total.sum() - inside.sum())))
         made.append(replace(found, low=max(found.low, 0.0), high=min(found.high, 100.0)))
-    # Frames that are not finite fail every check; the sentence counts what this one finds.
+    # Frames that are not finite fail every check; the sentence counts what this one finds beyond the reference.
     flags = np.concatenate(list(trio.candidate.features.flags))
     percent = 100.0 * float(((flags & check.mask) != 0).mean())
     said = f"{percent:.2g} %" if percent < 99.5 else f"{percent:.1f} %"
@@ -105,7 +105,7 @@ def _share_row(trio: Trio, check: Check, key: str) -> Row:
         p_replicate=math.nan,
         tolerance=100.0 * check.allowed,
         tolerance_text=f"≥ {100 * (1 - check.allowed):g} %, or as the reference" if check.allowed else "all frames",
-        statement=f"{said} of frames {check.failing}" if percent else "",
+        statement=f"{said} of frames {check.failing}" if percent > 100.0 - made[0].value else "",
     )
 
 

@@ -233,14 +233,15 @@ def _accounts(comparison: Comparison) -> list[tuple[str, Account, str]]:
 
 def _command(comparison: Comparison, target: Path) -> str:
     """The command line that makes this report again, as far as the file names tell."""
-    words = ["surromd", "compare", *comparison.reference.sources]
-    for judgement in comparison.judgements:
-        words += judgement.account.sources
+    accounts = [comparison.reference, *(j.account for j in comparison.judgements)]
+    words = ["surromd", "compare", *(",".join(a.sources) or a.label for a in accounts)]
     if comparison.replicate is not None:
-        for source in comparison.replicate.sources:
-            words += ["--replicate", source]
-    words += ["-o", target.name]
-    return shlex.join(words)
+        words += ["--replicate", ",".join(comparison.replicate.sources) or comparison.replicate.label]
+    if comparison.reference.top is not None:
+        words += ["--top", comparison.reference.top]
+    if comparison.reference.stated_lag_ps is not None:
+        words += ["--lag", format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+    return shlex.join([*words, "-o", target.name])
 
 
 def _write_together(texts: dict[Path, str]) -> None:

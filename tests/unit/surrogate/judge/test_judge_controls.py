@@ -301,7 +301,7 @@ def test_a_scene_without_torsions_is_judged_by_what_it_has() -> None:
 
 @pytest.mark.slow
 def test_replicates_pass_at_the_stated_rate(simulate: Callable[..., Ensemble]) -> None:
-    """At most 5 % of fair comparisons may end in 'close' or worse; of 50, more than 7 would be chance once in 80 times."""
+    """At most 5 % of fair comparisons may end in 'close' or worse; more than 7 of 50 are chance once in 80 times."""
     alarms = 0
     for seed in range(50):
         a, b, c = (simulate(1000 + 3 * seed + k, 6_000) for k in range(3))

@@ -58,7 +58,8 @@ def comparison(simulate: Callable[..., Ensemble]) -> Comparison:
     frames[7] *= 1.5
     chunks = [np.repeat(np.arange(100, dtype=np.int32), 30)]
     bad = replace(good, label="<script>alert(1)</script>", segments=[frames], chunk_idx=chunks, record=record)
-    reference = replace(reference, record={"temperature_k": 300.0, "cost": {"wall_s": 200.0}}, sources=("ref.h5",))
+    reference = replace(reference, record={"temperature_k": 300.0, "cost": {"wall_s": 200.0}},
+                        sources=("r0.h5", "r1.h5"), top="ala2.pdb", stated_lag_ps=1.0)  # fmt: skip
     return compare(reference, [replace(good, sources=("a b.h5",)), bad], replicate)
 
 
@@ -93,7 +94,9 @@ def test_names_from_outside_are_escaped(written: tuple[str, dict[str, object]]) 
 def test_costs_skips_definitions_and_command_are_there(written: tuple[str, dict[str, object]]) -> None:
     html = written[0]
     for text in ("25.9 µs/day", "20 × the reference", "Left out, and why", "Planar rings: the scene has none",
-                 "Jensen-Shannon distance", "How to make this report again", "surromd compare ref.h5 &#39;a b.h5&#39;",
+                 "Jensen-Shannon distance", "How to make this report again",
+                 "surromd compare r0.h5,r1.h5 &#39;a b.h5&#39;",
+                 "--top ala2.pdb --lag 1ps -o report.html",
                  "100 chunks", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
         assert text in html, text
 
