@@ -43,6 +43,8 @@ class TrainingConfig:
     device: str = "cpu"
     validate_every_s: float = 60.0
     snapshot_every_s: float | None = None
+    # Compile stage two's network; needs a C++ compiler on the machine.
+    compile: bool = False
 
     def stages(self) -> tuple[StageConfig, StageConfig]:
         share = STAGE_ONE_SHARE
@@ -163,6 +165,8 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
     offsets = torch.arange(length)
     model.autoencoder.requires_grad_(False)
+    if config.compile:
+        model.approximator.compile()
     cache = encode_all(model, frames, elements).to(device) if model.canonical else None
 
     def windows(first: Tensor, generator: torch.Generator) -> Tensor:
