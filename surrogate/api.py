@@ -220,14 +220,15 @@ def demo(
     out_dir: PathLike = "surromd-demo",
     *,
     reference_ps: float = 3_000.0,
-    rollout_ps: float = 20_000.0,
+    rollout_ps: float = 2_500.0,
+    rollout_replicas: int = 8,
     seed: int = 0,
     quiet: bool = False,
 ) -> Comparison:
-    """The whole way on alanine dipeptide: two OpenMM runs, a longer rollout with shipped weights, the comparison.
+    """The whole way on alanine dipeptide: two OpenMM runs, longer rollouts with shipped weights, the comparison.
 
-    Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate.h5, report.html and report.json into `out_dir`,
-    replacing those of an earlier demo.
+    Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate_r0.h5, ..., report.html and report.json into
+    `out_dir`, replacing those of an earlier demo.
     """
     folder = Path(out_dir)
     try:
@@ -239,7 +240,16 @@ def demo(
     truth, replicate = reference(
         name, folder / "reference.h5", time_ps=reference_ps, replicas=2, seed=seed, overwrite=True, quiet=quiet
     )
-    (rolled,) = rollout(name, name, folder / "surrogate.h5", time_ps=rollout_ps, seed=seed, overwrite=True, quiet=quiet)
+    rolled = rollout(
+        name,
+        name,
+        folder / "surrogate.h5",
+        time_ps=rollout_ps,
+        replicas=rollout_replicas,
+        seed=seed,
+        overwrite=True,
+        quiet=quiet,
+    )
     return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"])
 
 
