@@ -427,8 +427,8 @@ def _print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet:
 
 def main() -> None:
     """Entry point of the command `surromd`."""
-    # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when the
-    # numerical libraries load, which is later; a user's own setting stands.
+    # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when
+    # the numerical libraries load, which is later; a user's own setting stands.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         app(prog_name="surromd")
