@@ -107,13 +107,16 @@ class Engine:
         """
         import openmm
 
+        # Without this the minimiser may search for ever.
+        if not math.isfinite(self.energy()):
+            raise SimulationError("the energy of the starting positions is not finite; atoms lie on top of each other")
         try:
             openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
         except openmm.OpenMMException as error:
             raise SimulationError(f"minimisation failed: {_one_line(error)}") from error
         energy = self.energy()
         if not math.isfinite(energy):
-            raise SimulationError("minimisation failed: the energy is not finite; do atoms lie on top of each other?")
+            raise SimulationError("minimisation failed: the energy is no longer finite")
         return energy
 
     def thermalise(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -239,6 +240,7 @@ def _check_same_run(old: dict[str, Any], new: dict[str, Any], out: Path) -> None
 
 def _write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
     temporary = path.with_name(path.name + ".new")
+    header = {**header, "sha256": hashlib.sha256(blob).hexdigest()}
     try:
         with open(temporary, "wb") as handle:
             handle.write(json.dumps(header).encode() + b"\n" + blob)
@@ -253,6 +255,10 @@ def _write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
 def _read_checkpoint(path: Path) -> tuple[dict[str, Any], bytes]:
     try:
         line, _, blob = path.read_bytes().partition(b"\n")
-        return json.loads(line), blob
-    except (OSError, ValueError) as error:
-        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
+        header = json.loads(line)
+        # OpenMM loads a truncated checkpoint without a word.
+        if hashlib.sha256(blob).hexdigest() != header["sha256"]:
+            raise ValueError("its checksum is wrong")
+        return header, blob
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"checkpoint {path} is damaged ({error}); start again with --overwrite.") from error
