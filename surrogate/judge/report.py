@@ -59,6 +59,7 @@ def write_report(comparison: Comparison, path: str | Path, *, command: str | Non
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{target}: a report is written as .html (its JSON goes beside it).")
     beside = target.with_suffix(".json")
+    _check_place(target, beside)
     text = json.dumps(comparison.to_dict(), indent=1, allow_nan=False, ensure_ascii=False)
     page = render(comparison, command=command or _command(comparison, target))
     _write_together({beside: text + "\n", target: page})
@@ -244,13 +245,20 @@ def _command(comparison: Comparison, target: Path) -> str:
     return shlex.join([*words, "-o", target.name])
 
 
+def _check_place(*paths: Path) -> None:
+    """Fail before anything is drawn where it is plain that nothing can be written."""
+    for path in paths:
+        if not path.parent.is_dir():
+            raise StorageError(f"Cannot write {path}: its folder does not exist; choose another place with -o.")
+        if path.is_dir():
+            raise StorageError(f"Cannot write {path}: it is a folder; choose another name with -o.")
+
+
 def _write_together(texts: dict[Path, str]) -> None:
     """Write all files under other names first, so that a full disk leaves neither one nor half a file."""
     partial = {path: path.with_name(f".{path.name}.partial") for path in texts}
     try:
         for path, text in texts.items():
-            if path.is_dir():
-                raise StorageError(f"Cannot write {path}: it is a folder; choose another name with -o.")
             partial[path].write_text(text, "utf-8")
         for path in texts:
             partial[path].replace(path)

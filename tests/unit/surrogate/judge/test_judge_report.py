@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from collections.abc import Callable
@@ -117,7 +118,8 @@ def test_json_is_strict_and_holds_every_row_and_curve(
 
 
 def test_same_input_same_page(comparison: Comparison) -> None:
-    assert report.render(comparison, command="x") == report.render(comparison, command="x")
+    once = replace(comparison, judgements=comparison.judgements[1:])
+    assert report.render(once, command="x") == report.render(once, command="x")
 
 
 def test_only_html_is_written(comparison: Comparison, tmp_path: Path) -> None:
@@ -133,6 +135,22 @@ def test_nothing_is_left_where_it_cannot_be_written(comparison: Comparison, tmp_
     with pytest.raises(StorageError, match="Cannot write"):
         write_report(comparison, tmp_path / "taken.html")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.html"]
+
+
+def test_a_full_disk_leaves_the_old_report_alone(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, text: str, encoding: str) -> int:
+        if path.name.endswith("html.partial"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return path.write_bytes(text.encode(encoding))
+
+    (tmp_path / "report.html").write_text("old")
+    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(report, "render", lambda *_, **__: "new")
+    with pytest.raises(StorageError, match="No space left"):
+        write_report(comparison, tmp_path / "report.html")
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("report.html", "old")]
 
 
 def test_numbers_show_as_many_digits_as_they_have() -> None:

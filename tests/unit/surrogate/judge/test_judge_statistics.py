@@ -64,7 +64,7 @@ def test_intervals_from_few_blocks_still_cover() -> None:
 
 def test_blocks_shorter_than_the_correlation_time_do_not_cover() -> None:
     """Negative control: two frames of twenty correlated ones taken for independent make intervals far too narrow."""
-    assert coverage(0.9, 2, 2, n_experiments=60) < 0.7
+    assert coverage(0.9, 3, 2, n_experiments=40) < 0.75
 
 
 def test_log_interval_stays_positive_and_is_asymmetric() -> None:
