@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import json
@@ -19,6 +20,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.interface import draw_noise
+from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.domain import match_scene
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
@@ -100,6 +102,8 @@ def rollout(
     target = template.positions_nm - template.positions_nm[fit].mean(axis=0)
     elements = torch.tensor(_atomic_numbers(template))
     use_bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_in_hardware())
+    if use_bf16:
+        model = with_bf16_weights(model)
     settings = {**asdict(config), "bf16": use_bf16, "weights_hash": weights.hash, "replicas": len(outs)}
     del settings["time_ps"]  # a rollout may be resumed to become longer
     state_path = outs[0].with_name(outs[0].name + ".checkpoint")
@@ -124,7 +128,7 @@ def rollout(
                 writer.truncate(min(state.steps, n_frames * stride) // stride)
         last_flush = time.monotonic()
         while state.steps < n_frames * stride:
-            chunk = _next_chunk(weights, state, target, fit, elements, config, use_bf16)
+            chunk = _next_chunk(model, state, target, fit, elements, config, use_bf16)
             times = (state.steps + 1 + np.arange(model.n_new)) * lag_ps
             keep = np.flatnonzero((state.steps + 1 + np.arange(model.n_new)) % stride == 0)
             keep = keep[state.steps + 1 + keep <= n_frames * stride]
@@ -163,10 +167,9 @@ def rollout(
 
 
 @torch.inference_mode()
-def _next_chunk(weights: Weights, state: _Progress, target: npt.NDArray[np.float64], fit: npt.NDArray[np.int64],
+def _next_chunk(model: LamSlide, state: _Progress, target: npt.NDArray[np.float64], fit: npt.NDArray[np.int64],
                 elements: torch.Tensor, config: RolloutConfig, use_bf16: bool) -> Float32Array:  # fmt: skip
     """Return the next chunk `(replicas, n_new, n_atoms, 3)` nm in model order and the pose of the frames before."""
-    model = weights.model
     last = state.last_frames.astype(np.float64)
     n_replicas, _, n_atoms, _ = last.shape
     if model.canonical:
@@ -191,6 +194,15 @@ def _next_chunk(weights: Weights, state: _Progress, target: npt.NDArray[np.float
 def _seed(seed: int, replica: int, chunk: int) -> int:
     digest = hashlib.sha256(f"{seed}/{replica}/{chunk}".encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1
+
+
+def with_bf16_weights(model: LamSlide) -> LamSlide:
+    """Return a copy whose matrix weights are bf16 already: autocast would round them anew in every evaluation."""
+    copied = copy.deepcopy(model)
+    for module in copied.modules():
+        if isinstance(module, torch.nn.Linear):
+            module.to(torch.bfloat16)
+    return copied
 
 
 def bf16_in_hardware() -> bool:

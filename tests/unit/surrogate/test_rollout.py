@@ -44,7 +44,9 @@ def test_file_says_what_it_is(tmp_path: Path, small_weights: Weights, alanine_di
     assert not (tmp_path / "a.h5.checkpoint").exists()
 
 
-def test_a_replica_does_not_depend_on_its_batch(tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene) -> None:
+def test_a_replica_does_not_depend_on_its_batch(
+    tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene
+) -> None:
     alone = roll(alanine_dipeptide, small_weights, tmp_path / "a.h5")
     beside = roll(alanine_dipeptide, small_weights, *(tmp_path / f"b{k}.h5" for k in range(3)))
     np.testing.assert_allclose(beside, alone, rtol=0, atol=2e-5)
