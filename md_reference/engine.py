@@ -55,7 +55,7 @@ class Engine:
 
         self.scene = scene
         self.spec = spec
-        choice = choose_platform(scene.n_atoms, platform)
+        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
         self.platform_name = choice.name
         self._system = build_system(scene, spec, native_gb=native_gb)
         self._integrator = openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)

@@ -12,6 +12,7 @@ from md_reference.forcefield import ForceFieldSpec, build_system
 from md_reference.platforms import choose_platform
 from md_reference.replicas import available_cores
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
 _LONGEST_NATURAL_STEP_PS = 0.0025
@@ -29,7 +30,10 @@ class Skip:
 
 @dataclass(frozen=True)
 class Plan:
-    """A run before it starts. `terms` counts the interactions of each force; `us_per_step` is None if not measured."""
+    """A run before it starts. `terms` counts the interactions of each force; what was not measured is None.
+
+    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free.
+    """
 
     scene: str
     formula: str
@@ -39,11 +43,15 @@ class Plan:
     integrator: str
     platform: str
     platform_reason: str
+    threads: int
     parallel: str
+    hydrogen_mass: str
     constraints: str
     terms: dict[str, int]
     us_per_step: float | None
     ns_per_day: float | None
+    length: str | None
+    wall_s: float | None
     skipped: tuple[Skip, ...]
     warnings: tuple[str, ...]
 
@@ -61,6 +69,8 @@ def make_plan(
     timestep_ps: float = 0.004,
     platform: str = "auto",
     replicas: int = 1,
+    time_ps: float | None = None,
+    equilibrate_ps: float = 100.0,
     measure_s: float = 0.3,
 ) -> Plan:
     """Return the plan of a run with these settings (units as in `simulate.MDConfig`).
@@ -68,7 +78,7 @@ def make_plan(
     For `measure_s` of wall time each, steps are timed as planned and as OpenMM would do it unasked; 0 times nothing.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    choice = choose_platform(scene.n_atoms, platform)
+    choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
@@ -77,6 +87,9 @@ def make_plan(
         bath = (temperature_k, friction_per_ps, timestep_ps)
         planned = _time_step_s(scene, spec, bath, measure_s, platform=platform, native_gb=True)
         default = _time_step_s(scene, spec, bath, measure_s, platform="CPU", native_gb=False)
+    wall_s = None
+    if planned is not None and time_ps is not None:
+        wall_s = math.ceil(replicas / cores) * (time_ps + equilibrate_ps) / timestep_ps * planned
     return Plan(
         scene=scene.name,
         formula=scene.formula,
@@ -86,11 +99,17 @@ def make_plan(
         integrator=f"Langevin middle, {timestep_ps * 1000:g} fs, {temperature_k:g} K, {friction_per_ps:g}/ps",
         platform=choice.name,
         platform_reason=choice.reason,
+        threads=choice.threads,
         parallel=_parallel(replicas, cores),
+        hydrogen_mass="natural"
+        if spec.hydrogen_mass_da is None
+        else f"{spec.hydrogen_mass_da:g} Da, taken from the atom it is bonded to",
         constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
         terms=_terms(system),
         us_per_step=None if planned is None else planned * 1e6,
         ns_per_day=None if planned is None else timestep_ps * 1e-3 * 86_400.0 / planned,
+        length=None if time_ps is None else format_time_ps(time_ps),
+        wall_s=wall_s,
         skipped=_skips(scene, spec, n_constraints, planned, default),
         warnings=_warnings(scene, spec, timestep_ps),
     )
@@ -105,9 +124,10 @@ def _time_step_s(
     platform: str,
     native_gb: bool,
 ) -> float:
-    """Return the wall seconds of one step on one thread: the fastest of all batches, so that other work counts little.
+    """Return the seconds of one step on one thread: the fastest of all batches, measured for `wall_s`.
 
-    `bath`: temperature in K, friction in 1/ps, time step in ps.
+    On a CPU it is processor time, which other work on the machine does not lengthen; `bath`: temperature in K, friction
+    in 1/ps, time step in ps.
     """
     temperature_k, friction_per_ps, timestep_ps = bath
     with Engine(
@@ -122,12 +142,13 @@ def _time_step_s(
         engine.minimise(max_iterations=100)
         engine.thermalise()
         engine.step(_STEPS_AT_ONCE)
+        clock = time.process_time if engine.platform_name in ("Reference", "CPU") else time.perf_counter
         fastest = math.inf
         began = time.perf_counter()
         while math.isinf(fastest) or time.perf_counter() - began < wall_s:
-            start = time.perf_counter()
+            start = clock()
             engine.step(_STEPS_AT_ONCE)
-            fastest = min(fastest, (time.perf_counter() - start) / _STEPS_AT_ONCE)
+            fastest = min(fastest, (clock() - start) / _STEPS_AT_ONCE)
         return fastest
 
 

@@ -86,10 +86,12 @@ def plan(
     ensemble: str = "nvt",
     replicas: int = 1,
     platform: str = "auto",
+    time_ps: float | None = None,
 ) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
-    Steps are timed for about a second. Raises what `reference` raises for settings that cannot be.
+    Steps are timed for about a second; with `time_ps` the wall time of a run of that length is estimated. Raises what
+    `reference` raises for settings that cannot be.
     """
     from md_reference.plan import make_plan
 
@@ -102,6 +104,7 @@ def plan(
         timestep_ps=timestep_ps,
         platform=platform,
         replicas=replicas,
+        time_ps=time_ps,
     ).to_dict()
 
 

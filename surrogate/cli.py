@@ -141,6 +141,7 @@ def systems(
 @app.command()
 def plan(
     scene: SceneArg,
+    time: Annotated[str | None, typer.Option("--time", help="Estimate the wall time of a run this long.")] = None,
     force_field: ForceFieldOpt = "ff14SB",
     solvent: SolventOpt = "obc2",
     temperature: TemperatureOpt = "300K",
@@ -166,6 +167,7 @@ def plan(
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
+        time_ps=None if time is None else parse_time_ps(time, "--time"),
     )
     if as_json:
         _print_json(account)

@@ -8,6 +8,8 @@ import pytest
 
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.plan import make_plan
+from md_reference.platforms import choose_platform
+from md_reference.replicas import available_cores
 from systems.errors import UnknownNameError
 from systems.scene import Scene
 
@@ -52,3 +54,23 @@ def test_steps_are_timed_and_the_saving_is_stated(alanine_dipeptide: Scene) -> N
     assert plan.us_per_step is not None and plan.ns_per_day is not None
     assert plan.ns_per_day == pytest.approx(0.004e-3 * 86_400.0 / (plan.us_per_step * 1e-6))
     assert "times faster" in plan.skipped[-1].saves
+
+
+def test_the_wall_time_of_a_length_is_estimated(alanine_dipeptide: Scene) -> None:
+    plan = make_plan(alanine_dipeptide, ForceFieldSpec(), time_ps=900.0, replicas=3 * available_cores(), measure_s=0.05)
+    assert plan.length == "900 ps"
+    assert plan.us_per_step is not None
+    # A nanosecond with its 100 ps of equilibration, three rounds of replicas.
+    assert plan.wall_s == pytest.approx(3 * 250_000 * plan.us_per_step * 1e-6)
+    assert make_plan(alanine_dipeptide, ForceFieldSpec(), measure_s=0.0, time_ps=900.0).wall_s is None
+
+
+@pytest.mark.parametrize(
+    ("n_atoms", "born", "platform"),
+    [(22, True, "Reference"), (62, True, "CPU"), (62, False, "Reference"), (150, False, "CPU")],
+)
+def test_the_platform_follows_the_size_and_the_solvent(n_atoms: int, born: bool, platform: str) -> None:
+    choice = choose_platform(n_atoms, born=born)
+    assert choice.name == platform
+    assert choice.threads == 1
+    assert str(n_atoms) in choice.reason
