@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -42,8 +43,8 @@ def simulate_replicas(
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
-    Each replica is a process with one thread: on small scenes that is the fastest use of the cores. Raises the first
-    failure after the other replicas have ended; finished replicas stay on disk.
+    Each replica is a process with one thread: on small scenes that is the fastest use of the cores. Raises
+    SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     if len(outs) == 1:
@@ -53,7 +54,8 @@ def simulate_replicas(
     errors = context.Queue()
     waiting = list(range(len(outs)))
     running: dict[int, Any] = {}
-    failures: list[str] = []
+    failures: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     width = workers or min(len(outs), available_cores())
     try:
         while waiting or running:
@@ -69,15 +71,26 @@ def simulate_replicas(
                 process = running.pop(k)
                 process.join()
                 if process.exitcode != 0:
-                    reason = errors.get(timeout=1) if not errors.empty() else f"exit code {process.exitcode}"
-                    failures.append(f"replica {k}: {reason}")
+                    _collect(errors, reasons, k)
+                    failures[k] = reasons.get(k, f"exit code {process.exitcode}")
     finally:
         for process in running.values():
             process.terminate()
             process.join()
     if failures:
-        raise SimulationError(f"{len(failures)} of {len(outs)} replicas failed; {failures[0]} (--resume goes on)")
+        k = min(failures)
+        raise SimulationError(f"{len(failures)} of {len(outs)} replicas failed; replica {k}: {failures[k]}")
     return list(outs)
+
+
+def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
+    """Read what replicas said when they failed, until `wanted` is among them; a killed one says nothing."""
+    try:
+        while wanted not in reasons:
+            k, reason = errors.get(timeout=1)
+            reasons[k] = reason
+    except queue.Empty:
+        pass
 
 
 def _replica(
@@ -91,7 +104,7 @@ def _replica(
     try:
         simulate(Scene.from_dict(scene), config, out, resume=resume, overwrite=overwrite, progress=report)
     except SurromdError as error:
-        errors.put(str(error))
+        errors.put((k, str(error)))
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None
