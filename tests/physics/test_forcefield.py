@@ -107,6 +107,20 @@ def test_the_comparison_notices_one_wrong_parameter(changed: str) -> None:
     assert energy_gap > 10 * ENERGY_TOLERANCE_KJ_MOL
 
 
+def test_amber99_obc_has_its_own_radii_and_the_charges_of_the_force_field() -> None:
+    scene = scene_of("alanine-dipeptide")
+    system, other = build_system(scene, SPECS["amber99-obc"]), build_system(scene, SPECS["ff99SB-ILDN"])
+    nonbonded, born, plain = (
+        force_of(system, "NonbondedForce"),
+        force_of(system, "GBSAOBCForce"),
+        force_of(other, "GBSAOBCForce"),
+    )
+    for i in range(scene.n_atoms):
+        charge, radius, _ = born.getParticleParameters(i)
+        assert charge == nonbonded.getParticleParameters(i)[0]
+        assert radius != plain.getParticleParameters(i)[1]
+
+
 # ---- what is left out ----------------------------------------------------------------------------------------------
 
 
