@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from systems.errors import UnknownNameError, nearest
 
-# Up to so many atoms one thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
-# OpenMM 8.6.1 on peptides of 22 to 108 atoms: with native OBC2 they are level at 47 atoms on free cores (102 against 115
+# Up to so many atoms a thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
+# OpenMM 8.6.1 on peptides of 22 to 108 atoms: level with native OBC2 at 47 atoms on free cores (102 against 115
 # µs a step at 42, 205 against 167 at 62) and near 62 on busy ones, in vacuum at about 105 (9 against 47 µs at 22).
 REFERENCE_MAX_ATOMS_BORN = 55
 REFERENCE_MAX_ATOMS_VACUUM = 100
