@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from surrogate import api
 from systems.units import parse_wall_s
@@ -20,6 +22,10 @@ TRAIN_SEED, N_TRAIN = 100, 4
 HELD_SEED, N_HELD = 104, 2
 REPLICA_PS = 100_000.0
 ROLLOUT_SEED = 1
+ROLLOUT_REPLICAS = 16
+CURVE_PS = 20_000.0
+FIGURES = ("joint_jsd", "correlation:1", "correlation_time", "valid:2", "valid:4")
+ROLLOUT_REPLICAS = 16
 SNAPSHOT_S = 480.0
 
 
@@ -78,12 +84,29 @@ def ship(source: Path, target: Path) -> Path:
     return target
 
 
-def judge(weights: Path, held: list[Path], folder: Path, name: str, solver_steps: int | None) -> dict[str, object]:
-    """Roll 100 ns from the library's structure and compare with held-out reference, its second half the replicate."""
-    out = folder / f"{name}.h5"
-    api.rollout(SCENE, weights, out, time_ps=REPLICA_PS, seed=ROLLOUT_SEED, solver_steps=solver_steps, resume=True)
-    comparison = api.compare(held[0], [out], folder / f"{name}.html", replicate=held[1], labels=[name])
-    return comparison.to_dict()
+def judge(
+    weights: Path, held: list[Path], folder: Path, name: str, *, total_ps: float, solver_steps: int | None
+) -> dict[str, Any]:
+    """Roll `total_ps` in a batch, compare with as much held-out reference (the other held-out run is the replicate).
+
+    Returns the figures that the project is judged by, each with its interval, and writes the report beside the rollout.
+    """
+    outs = api.rollout(
+        SCENE,
+        weights,
+        folder / f"{name}.h5",
+        time_ps=total_ps / ROLLOUT_REPLICAS,
+        replicas=ROLLOUT_REPLICAS,
+        seed=ROLLOUT_SEED,
+        solver_steps=solver_steps,
+        resume=True,
+    )
+    comparison = api.compare(held[0], [outs], folder / f"{name}.html", replicate=held[1], labels=[name])
+    judgement = comparison.judgements[0]
+    rows: dict[str, Any] = {key: judgement.row(key).to_dict() for key in FIGURES}
+    for key, row in rows.items():
+        sys.stdout.write(f"{name:16s} {key:18s} {row['candidate']}  floor or reference: {row['replicate']}\n")
+    return rows
 
 
 def main() -> None:
@@ -99,11 +122,13 @@ def main() -> None:
     held = make_reference(paths, "held", N_HELD, HELD_SEED)
     train(paths, references, parse_wall_s(args.budget))
     ship(paths.weights, paths.shipped)
-    rows = judge(paths.shipped, held, paths.folder, "rollout", args.solver_steps)
-    (paths.folder / "figures.json").write_text(json.dumps(rows, indent=1))
+    steps = args.solver_steps
+    figures = {"rollout": judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)}
     if args.curve:
-        for snapshot in sorted(paths.folder.glob("model.at*min.safetensors")):
-            judge(snapshot, held, paths.folder, snapshot.stem.replace("model.", "curve_"), args.solver_steps)
+        for weights in [*sorted(paths.folder.glob("model.at*min.safetensors")), paths.weights]:
+            name = weights.stem.replace("model", "curve").replace(".at", "_")
+            figures[name] = judge(weights, held, paths.folder, name, total_ps=CURVE_PS, solver_steps=steps)
+    (paths.folder / "figures.json").write_text(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":
