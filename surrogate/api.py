@@ -213,8 +213,8 @@ def rollout(
     saved_ps = loaded.domain.lag_ps if save_every_ps is None else save_every_ps
     with (
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
-        # The bar counts one replica's frames; all of them advance together.
-        progress_bar(label, quiet=quiet, ps_per_frame=saved_ps) as progress,
+        # The verb counts the frames of one replica; all advance together.
+        progress_bar(label, quiet=quiet, ps_per_frame=saved_ps * replicas) as progress,
     ):
         return roll(molecule, loaded, outs, config, resume=resume, overwrite=overwrite, progress=progress)
 
@@ -240,19 +240,22 @@ def demo(
         raise InputError(f"{folder} is a file; name a folder with --out.") from None
     name = "alanine-dipeptide"
     weights_path(name)  # missing weights are noticed before anything is simulated
-    truth, replicate = reference(
-        name, folder / "reference.h5", time_ps=reference_ps, replicas=2, seed=seed, overwrite=True, quiet=quiet
-    )
-    rolled = rollout(
-        name,
-        name,
-        folder / "surrogate.h5",
-        time_ps=rollout_ps,
-        replicas=rollout_replicas,
-        seed=seed,
-        overwrite=True,
-        quiet=quiet,
-    )
+    try:
+        truth, replicate = reference(
+            name, folder / "reference.h5", time_ps=reference_ps, replicas=2, seed=seed, overwrite=True, quiet=quiet
+        )
+        rolled = rollout(
+            name,
+            name,
+            folder / "surrogate.h5",
+            time_ps=rollout_ps,
+            replicas=rollout_replicas,
+            seed=seed,
+            overwrite=True,
+            quiet=quiet,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
     return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"])
 
 

@@ -44,12 +44,20 @@ def guarded_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[N
         yield
     except KeyboardInterrupt:
         counts = {path: frames for path in paths if (frames := _sweep(path, before)) is not None}
-        kept = ", ".join(f"{path} holds {frames} frames" for path, frames in counts.items())
-        raise KeyboardInterrupt(f"{kept}; {resumable}" if kept else "nothing was written") from None
+        raise KeyboardInterrupt(f"{_kept(counts)}; {resumable}" if counts else "nothing was written") from None
     except BaseException:
         for path in paths:
             _sweep(path, before)
         raise
+
+
+def _kept(counts: dict[Path, int]) -> str:
+    if len(counts) <= 2:
+        return ", ".join(f"{path} holds {frames} frames" for path, frames in counts.items())
+    first, *_, last = counts
+    fewest, most = min(counts.values()), max(counts.values())
+    frames = str(most) if fewest == most else f"{fewest} to {most}"
+    return f"{first} to {last.name} hold {frames} frames each"
 
 
 def _sweep(path: Path, before: set[Path]) -> int | None:
