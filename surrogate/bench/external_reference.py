@@ -80,20 +80,29 @@ def basin_boundaries(psi_rad: Sequence[FloatArray]) -> tuple[float, float]:
 
 
 def summarise(psi_rad: Sequence[FloatArray], lag_ps: float, alpha: tuple[float, float]) -> dict[str, Mean]:
-    """Return occupancies of beta and alphaR and the relaxation time of cos psi (ps), each a mean over trajectories.
+    """Return occupancies of beta and alphaR, the mean psi in each (degrees) and the relaxation time of cos psi (ps).
 
+    Each is a mean over trajectories. The mean psi within a basin settles within picoseconds: it compares the force
+    fields far more sharply than the occupancies, of which 10 ns hold some twenty independent samples.
     The relaxation time is the integrated autocorrelation time up to the first zero crossing (judge.kinetics), of each
     trajectory about its own mean.
     """
     from surrogate.judge.kinetics import zero_crossing
 
-    inside = [float(np.mean((psi - alpha[0]) % (2 * np.pi) < (alpha[1] - alpha[0]) % (2 * np.pi))) for psi in psi_rad]
+    in_alpha = [(psi - alpha[0]) % (2 * np.pi) < (alpha[1] - alpha[0]) % (2 * np.pi) for psi in psi_rad]
+    inside = [float(np.mean(x)) for x in in_alpha]
     times = [zero_crossing([np.cos(psi)])[1] * lag_ps for psi in psi_rad]
     return {
         "beta": _mean([1.0 - x for x in inside]),
         "alphaR": _mean(inside),
-        "relaxation_ps": _mean(times),
+        "psi in beta": _mean([_circular_mean_deg(p[~x]) for p, x in zip(psi_rad, in_alpha, strict=True)]),
+        "psi in alphaR": _mean([_circular_mean_deg(p[x]) for p, x in zip(psi_rad, in_alpha, strict=True)]),
+        "relaxation": _mean(times),
     }
+
+
+def _circular_mean_deg(angles_rad: FloatArray) -> float:
+    return float(np.degrees(np.angle(np.exp(1j * angles_rad).mean()))) if len(angles_rad) else math.nan
 
 
 def _mean(values: Sequence[float]) -> Mean:
@@ -179,7 +188,7 @@ def compare_with_published(
     theirs, ours = read_psi(published, top=data_dir / "ala2.pdb"), read_psi(runs)
     alpha = basin_boundaries(theirs)
     a, b = summarise(ours, 1.0, alpha), summarise(theirs, 1.0, alpha)
-    units = {"beta": "", "alphaR": "", "relaxation_ps": "ps"}
+    units = {"beta": "", "alphaR": "", "psi in beta": "deg", "psi in alphaR": "deg", "relaxation": "ps"}
     result = {
         "settings": "ff99SB-ILDN, amber99_obc, 300 K, 91/ps, 2 fs, natural masses, 1 ps per frame",
         "alphaR_deg": [math.degrees(x) for x in alpha],
@@ -208,7 +217,7 @@ def table(result: dict[str, Any]) -> str:
         word = "agrees" if row["agrees"] else "DIFFERS"
         lines.append(
             f"{row['quantity']:<16} {ours:>18} {theirs:>18} {row['difference']:>11.{digits}f} "
-            f"{row['combined_errors']:>8.2f} {word}"
+            f"{row['combined_errors']:>8.2f} {word:<8} {row['unit']}".rstrip()
         )
     return "\n".join(lines)
 

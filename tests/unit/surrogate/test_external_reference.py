@@ -48,13 +48,16 @@ def test_occupancy_and_time_of_a_known_chain(theirs: list[FloatArray]) -> None:
     assert found["beta"].mean + found["alphaR"].mean == pytest.approx(1.0)
     assert abs(found["alphaR"].mean - 0.5) < 4 * found["alphaR"].error
     assert 0.005 < found["alphaR"].error < 0.05
+    assert found["psi in alphaR"].mean == pytest.approx(-25.0, abs=1.5)
+    assert found["psi in beta"].mean == pytest.approx(155.0, abs=1.5)
+    assert found["psi in beta"].error < 0.5
     # cos psi is the state plus noise within the wells, which halves no more than a tenth of the correlation.
-    assert found["relaxation_ps"].mean == pytest.approx(50.0, rel=0.25)
+    assert found["relaxation"].mean == pytest.approx(50.0, rel=0.25)
 
 
 @pytest.mark.parametrize(
     ("change", "wrong"),
-    [({}, set()), ({"share_alpha": 0.65}, {"beta", "alphaR"}), ({"stay": 0.995}, {"relaxation_ps"})],
+    [({}, set()), ({"share_alpha": 0.65}, {"beta", "alphaR"}), ({"stay": 0.995}, {"relaxation"})],
     ids=["same", "other occupancy", "slower"],
 )
 def test_what_agrees_and_what_does_not(theirs: list[FloatArray], change: dict[str, float], wrong: set[str]) -> None:
