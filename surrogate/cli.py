@@ -413,11 +413,11 @@ def _print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet:
         return
     for judgement in () if quiet else result.judgements:
         typer.echo(f"{judgement.account.label}: {judgement.verdict}")
-        typer.echo(f"  {'':<44} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+        typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
         for row in judgement.rows:
             figures = (row.reference, row.candidate, row.replicate)
             numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
-            typer.echo(f"  {row.metric[:44]:<44} {numbers} {row.unit:<8} {row.verdict}")
+            typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
         if judgement.speed_ratio is not None:
             typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
         for note in judgement.notes:
