@@ -29,7 +29,7 @@ from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
 from systems.trajectory_types import TrajectoryWriter
 from systems.units import format_time_ps, whole_steps
-from systems.validity import INVALID, Geometry, check_frames
+from systems.validity import Geometry, check_frames
 from systems.whole_file import create_whole
 
 if TYPE_CHECKING:
@@ -66,7 +66,6 @@ class _Progress:
     chunks: int = 0  # chunks done
     steps: int = 0  # model frames done, kept or not
     wall_s: float = 0.0
-    invalid: int = 0
 
 
 def rollout(
@@ -135,7 +134,6 @@ def rollout(
             for k in range(len(outs)):
                 kept = chunk[k, keep]
                 flags = check_frames(kept, geometry)
-                state.invalid += int(((flags & INVALID) > 0).sum())
                 buffers[k].append((kept[:, back], times[keep], flags, np.full(len(keep), state.chunks, dtype=np.int32)))
             state.last_frames = chunk[:, -model.n_conditioning :].copy()
             state.steps += model.n_new
