@@ -24,6 +24,10 @@ class Scene:
     Shapes: per atom `(n_atoms,)`, bonds `(n_bonds, 2)` with i < j, positions `(n_atoms, 3)` in nm, masses in dalton,
     formal charges in elementary charges. `bond_orders` holds 1, 1.5, 2, 3, or 0 where the source does not say.
     `residue_of_atom` indexes `residue_names`, `residue_ids` and `chain_of_residue`.
+
+    `cell_nm`: reduced box vectors `(3, 3)` of a periodic system, else None. `interactions`: the law of a model system
+    (charges, springs, a potential) as JSON-able values with a key `kind`; None where a force field says what the forces
+    are.
     """
 
     name: str
@@ -39,6 +43,8 @@ class Scene:
     masses_da: FloatArray
     positions_nm: FloatArray
     provenance: dict[str, Any] = field(default_factory=dict)
+    cell_nm: FloatArray | None = None
+    interactions: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.elements)
@@ -54,6 +60,10 @@ class Scene:
         for array in (self.residue_of_atom, self.bonds, self.bond_orders, self.formal_charges, self.masses_da,
                       self.positions_nm):  # fmt: skip
             array.setflags(write=False)
+        if self.cell_nm is not None:
+            if self.cell_nm.shape != (3, 3):
+                raise InputError(f"Scene {self.name!r}: cell_nm has shape {self.cell_nm.shape}, not (3, 3).")
+            self.cell_nm.setflags(write=False)
 
     @property
     def n_atoms(self) -> int:
@@ -68,8 +78,8 @@ class Scene:
     def topology_hash(self) -> str:
         """Hash of the ordered topology, names included, positions left out."""
         record = self.to_dict()
-        for key in ("positions_nm", "provenance", "name", "masses_da"):
-            record.pop(key)
+        for key in ("positions_nm", "provenance", "name", "masses_da", "cell_nm"):
+            record.pop(key, None)
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
@@ -92,8 +102,8 @@ class Scene:
         return replace(self, positions_nm=np.array(positions_nm, dtype=np.float64))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and strings that `from_dict` and JSON take back exactly."""
-        out = asdict(self)
+        """Return plain lists and strings that `from_dict` and JSON take back exactly; what is None is left out."""
+        out = {key: value for key, value in asdict(self).items() if value is not None}
         for key, value in out.items():
             if isinstance(value, np.ndarray):
                 out[key] = value.tolist()
@@ -113,6 +123,8 @@ class Scene:
             for key in ("bond_orders", "masses_da", "positions_nm"):
                 fields[key] = np.array(fields[key], dtype=np.float64)
             fields["bonds"] = fields["bonds"].reshape(-1, 2)
+            if fields.get("cell_nm") is not None:
+                fields["cell_nm"] = np.array(fields["cell_nm"], dtype=np.float64)
             return Scene(**fields)
         except (KeyError, TypeError) as error:
             raise InputError(f"Scene record is incomplete or has unknown entries: {error}.") from error
