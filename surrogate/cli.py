@@ -4,24 +4,39 @@ from __future__ import annotations
 
 import os
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from surrogate.cli_options import (
+    EnsembleOpt,
+    ForceFieldOpt,
+    FrictionOpt,
+    HydrogenMassOpt,
+    JsonOpt,
+    OverwriteOpt,
+    PlatformOpt,
+    Precision,
+    QuietOpt,
+    ReplicasOpt,
+    ResumeOpt,
+    SceneArg,
+    SeedOpt,
+    SolventOpt,
+    TemperatureOpt,
+    TimestepOpt,
+    parse_hydrogen_mass_da,
+)
+from surrogate.cli_printing import print_comparison, print_json, print_pairs, print_written
 from systems.errors import SurromdError
 from systems.units import (
-    parse_mass_da,
     parse_rate_per_ps,
     parse_temperature_k,
     parse_time_ps,
     parse_wall_s,
 )
-
-if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison
 
 
 class _Group(TyperGroup):
@@ -80,31 +95,6 @@ app = typer.Typer(
 )
 
 
-class Precision(StrEnum):
-    auto = "auto"
-    fp32 = "fp32"
-    bf16 = "bf16"
-
-
-SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Library name, path or sequence:ACE-ALA-NME.")]
-ForceFieldOpt = Annotated[str, typer.Option("--force-field", help="ff14SB or ff99SB-ILDN.")]
-SolventOpt = Annotated[str, typer.Option("--solvent", help="obc2, vacuum or amber99-obc.")]
-TemperatureOpt = Annotated[str, typer.Option("--temperature", help="Of the bath.")]
-FrictionOpt = Annotated[str, typer.Option("--friction", help="Of the Langevin bath.")]
-TimestepOpt = Annotated[str, typer.Option("--timestep", help="Integration step.")]
-HydrogenMassOpt = Annotated[str, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'.")]
-EnsembleOpt = Annotated[str, typer.Option("--ensemble", help="nvt.")]
-ReplicasOpt = Annotated[
-    int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
-]
-PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform, or auto.")]
-SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
-ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
-OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
-QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.")]
-JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-
-
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the report.")] = Path(
@@ -117,7 +107,7 @@ def demo(
     from surrogate import api
 
     result = api.demo(out, seed=seed, quiet=quiet)
-    _print_comparison(result, out / "report.html", as_json=False, quiet=quiet)
+    print_comparison(result, out / "report.html", as_json=False, quiet=quiet)
 
 
 @app.command()
@@ -130,12 +120,12 @@ def systems(
 
     found = api.systems(name)
     if as_json:
-        _print_json(found)
+        print_json(found)
     elif name is None:
         for entry in found:
             typer.echo(f"{entry['name']:<24} {entry['n_atoms']:>5} atoms  {entry['formula']:<14} {entry['title']}")
     else:
-        _print_pairs(found[0])
+        print_pairs(found[0])
 
 
 @app.command()
@@ -163,16 +153,16 @@ def plan(
         temperature_k=parse_temperature_k(temperature, "--temperature"),
         friction_per_ps=parse_rate_per_ps(friction, "--friction"),
         timestep_ps=parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da=_hydrogen_mass(hydrogen_mass),
+        hydrogen_mass_da=parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
         time_ps=None if time is None else parse_time_ps(time, "--time"),
     )
     if as_json:
-        _print_json(account)
+        print_json(account)
     else:
-        _print_pairs(account)
+        print_pairs(account)
 
 
 @app.command()
@@ -209,7 +199,7 @@ def reference(
         temperature_k=parse_temperature_k(temperature, "--temperature"),
         friction_per_ps=parse_rate_per_ps(friction, "--friction"),
         timestep_ps=parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da=_hydrogen_mass(hydrogen_mass),
+        hydrogen_mass_da=parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
@@ -218,7 +208,7 @@ def reference(
         overwrite=overwrite,
         quiet=quiet,
     )
-    _print_written(written, as_json, quiet)
+    print_written(written, as_json, quiet)
 
 
 @app.command()
@@ -234,7 +224,7 @@ def windows(
     """Turn reference trajectories into training data: one compact file."""
     from surrogate import api
 
-    _print_written([api.windows(references, out, overwrite=overwrite, quiet=quiet)], as_json, quiet)
+    print_written([api.windows(references, out, overwrite=overwrite, quiet=quiet)], as_json, quiet)
 
 
 @app.command()
@@ -268,7 +258,7 @@ def train(
         overwrite=overwrite,
         quiet=quiet,
     )
-    _print_written([written], as_json, quiet)
+    print_written([written], as_json, quiet)
 
 
 @app.command()
@@ -306,7 +296,7 @@ def rollout(
         overwrite=overwrite,
         quiet=quiet,
     )
-    _print_written(written, as_json, quiet)
+    print_written(written, as_json, quiet)
 
 
 @app.command()
@@ -335,7 +325,7 @@ def compare(
         top=top,
         lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
     )
-    _print_comparison(result, out, as_json=as_json, quiet=quiet)
+    print_comparison(result, out, as_json=as_json, quiet=quiet)
 
 
 @app.command()
@@ -348,83 +338,9 @@ def info(
 
     found = api.info(path)
     if as_json:
-        _print_json(found)
+        print_json(found)
     else:
-        _print_pairs(found)
-
-
-def _hydrogen_mass(text: str) -> float | None:
-    return None if text in ("natural", "none") else parse_mass_da(text, "--hydrogen-mass")
-
-
-def _print_json(value: Any) -> None:
-    import json
-
-    typer.echo(json.dumps(value, indent=2, default=str))
-
-
-def _print_pairs(record: dict[str, Any], indent: int = 0) -> None:
-    """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
-    shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
-    width = max((len(k) for k in shown), default=0)
-    for key, value in shown.items():
-        margin = " " * indent
-        if isinstance(value, dict):
-            typer.echo(f"{margin}{key}")
-            _print_pairs(value, indent + 2)
-        elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
-            typer.echo(f"{margin}{key}")
-            for entry in value:
-                typer.echo(f"{margin}  {_one_line(entry)}")
-        else:
-            text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
-            typer.echo(f"{margin}{key:<{width}}  {text}")
-
-
-def _one_line(entry: Any) -> str:
-    if not isinstance(entry, dict):
-        return str(entry)
-    if "what" in entry:
-        saves = f" ({entry['saves']})" if entry.get("saves") else ""
-        return f"{entry['what']}: {entry['why']}{saves}"
-    return ", ".join(f"{key} {_plain(value)}" for key, value in entry.items())
-
-
-def _plain(value: Any, digits: int = 6) -> str:
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
-
-
-def _print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
-    """Say what was written: its length and what it cost."""
-    from surrogate import api
-
-    records = [api.info(path) for path in paths] if as_json or not quiet else []
-    if as_json:
-        _print_json(records)
-    for path, record in zip(paths, records, strict=False):
-        if not as_json:
-            typer.echo(f"{path}: {record['summary']}")
-
-
-def _print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool) -> None:
-    """Print each candidate's verdict and its figures between reference and replicate."""
-    if as_json:
-        _print_json(result.to_dict())
-        return
-    for judgement in () if quiet else result.judgements:
-        typer.echo(f"{judgement.account.label}: {judgement.verdict}")
-        typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
-        for row in judgement.rows:
-            figures = (row.reference, row.candidate, row.replicate)
-            numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
-            typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
-        if judgement.speed_ratio is not None:
-            typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
-        for note in judgement.notes:
-            typer.echo(f"  note: {note}")
-    for note in () if quiet else result.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"report: {report}")
+        print_pairs(found)
 
 
 def main() -> None:

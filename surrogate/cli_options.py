@@ -1,0 +1,40 @@
+"""Types of the command line's arguments and options that several verbs share, with their help."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from systems.units import parse_mass_da
+
+
+class Precision(StrEnum):
+    auto = "auto"
+    fp32 = "fp32"
+    bf16 = "bf16"
+
+
+SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Library name, path or sequence:ACE-ALA-NME.")]
+ForceFieldOpt = Annotated[str, typer.Option("--force-field", help="ff14SB or ff99SB-ILDN.")]
+SolventOpt = Annotated[str, typer.Option("--solvent", help="obc2, vacuum or amber99-obc.")]
+TemperatureOpt = Annotated[str, typer.Option("--temperature", help="Of the bath.")]
+FrictionOpt = Annotated[str, typer.Option("--friction", help="Of the Langevin bath.")]
+TimestepOpt = Annotated[str, typer.Option("--timestep", help="Integration step.")]
+HydrogenMassOpt = Annotated[str, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'.")]
+EnsembleOpt = Annotated[str, typer.Option("--ensemble", help="nvt.")]
+ReplicasOpt = Annotated[
+    int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
+]
+PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform, or auto.")]
+SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
+ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
+OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.")]
+JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+def parse_hydrogen_mass_da(text: str) -> float | None:
+    """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
+    return None if text in ("natural", "none") else parse_mass_da(text, "--hydrogen-mass")

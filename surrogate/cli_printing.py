@@ -1,0 +1,82 @@
+"""What the command line prints: records, what was written, verdicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from surrogate.judge.comparison import Comparison
+
+
+def print_json(value: Any) -> None:
+    """Print a value as indented JSON on stdout."""
+    import json
+
+    typer.echo(json.dumps(value, indent=2, default=str))
+
+
+def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
+    """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
+    shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
+    width = max((len(k) for k in shown), default=0)
+    for key, value in shown.items():
+        margin = " " * indent
+        if isinstance(value, dict):
+            typer.echo(f"{margin}{key}")
+            print_pairs(value, indent + 2)
+        elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
+            typer.echo(f"{margin}{key}")
+            for entry in value:
+                typer.echo(f"{margin}  {_one_line(entry)}")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
+            typer.echo(f"{margin}{key:<{width}}  {text}")
+
+
+def _one_line(entry: Any) -> str:
+    if not isinstance(entry, dict):
+        return str(entry)
+    if "what" in entry:
+        saves = f" ({entry['saves']})" if entry.get("saves") else ""
+        return f"{entry['what']}: {entry['why']}{saves}"
+    return ", ".join(f"{key} {_plain(value)}" for key, value in entry.items())
+
+
+def _plain(value: Any, digits: int = 6) -> str:
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
+    """Say what was written: its length and what it cost."""
+    from surrogate import api
+
+    records = [api.info(path) for path in paths] if as_json or not quiet else []
+    if as_json:
+        print_json(records)
+    for path, record in zip(paths, records, strict=False):
+        if not as_json:
+            typer.echo(f"{path}: {record['summary']}")
+
+
+def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool) -> None:
+    """Print each candidate's verdict and its figures between reference and replicate."""
+    if as_json:
+        print_json(result.to_dict())
+        return
+    for judgement in () if quiet else result.judgements:
+        typer.echo(f"{judgement.account.label}: {judgement.verdict}")
+        typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+        for row in judgement.rows:
+            figures = (row.reference, row.candidate, row.replicate)
+            numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
+            typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
+        if judgement.speed_ratio is not None:
+            typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
+        for note in judgement.notes:
+            typer.echo(f"  note: {note}")
+    for note in () if quiet else result.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"report: {report}")
