@@ -11,18 +11,20 @@ import numpy as np
 
 from systems.bonding import Bonding, Residue, find_bonds
 from systems.errors import InputError, PreparationError, SurromdError
+from systems.mol_file import SUFFIXES, suffix_of
 from systems.pdb_records import AtomRecord, read_structure
 from systems.residues import is_water
 from systems.scene import Scene
 from systems.structure import scene_from_records
 
 _FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
-_OTHER_SUFFIXES = (".sdf", ".mol", ".mol2", ".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
+_OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
 def prepare(spec: str, *, ph: float = 7.0) -> Scene:
-    """Return the scene that `spec` names: `alanine-dipeptide`, `molecule.pdb`, `sequence:ACE-ALA-NME`.
+    """Return the scene that `spec` names: `alanine-dipeptide`, `molecule.pdb`, `sequence:ACE-ALA-NME`,
+    `molecule.sdf`, `smiles:CCO`.
 
     Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
     line each, in `scene.provenance["repairs"]`. `ph` decides the protonation where hydrogens are missing.
@@ -39,13 +41,19 @@ def prepare(spec: str, *, ph: float = 7.0) -> Scene:
 
         return build_peptide(rest, ph=ph)
     if kind.lower() == "smiles":
-        raise InputError("SMILES input is not supported yet; give a PDB file with all hydrogens and CONECT records.")
+        from systems.molecule import scene_from_smiles
+
+        return scene_from_smiles(rest)
     path = Path(text).expanduser()
     if text in library.names():
         return library.load(text)
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
+    if suffix in SUFFIXES:
+        from systems.molecule import scene_from_mol_file
+
+        return scene_from_mol_file(path)
     if suffix in _OTHER_SUFFIXES:
-        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB or mmCIF.")
+        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
         return prepare_file(path, ph=ph)
     return library.load(text)

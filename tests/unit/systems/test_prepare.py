@@ -282,7 +282,9 @@ def test_unreadable_files_are_refused_in_one_line(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         assert expected in _refusal(tmp_path / name), name
     (tmp_path / "x.sdf").write_text("")
-    assert "convert" in _refusal(tmp_path / "x.sdf")
+    assert "is empty" in _refusal(tmp_path / "x.sdf")
+    (tmp_path / "x.gro").write_text("")
+    assert "convert" in _refusal(tmp_path / "x.gro")
     (tmp_path / "x.txt").write_text("x")
     assert "suffix" in _refusal(tmp_path / "x.txt")
 
@@ -330,7 +332,7 @@ def test_bad_arguments_are_refused() -> None:
     with pytest.raises(InputError, match="pH"):
         prepare("alanine-dipeptide", ph=20)
     with pytest.raises(InputError, match="SMILES"):
-        prepare("smiles:CCO")
+        prepare("smiles:")
 
 
 # ---- sequences ----------------------------------------------------------------------------------------------------
