@@ -1,0 +1,217 @@
+"""GAFF2 parameters and AM1-BCC charges of one molecule, through AmberTools; shipped and cached ones first.
+
+GAFF2: Wang, Wolf, Caldwell, Kollman and Case, J. Comput. Chem. 25, 1157 (2004), second generation (gaff2.dat). AM1-BCC:
+Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+
+from md_reference import parameter_cache
+from md_reference.ambertools import ambertools, complaint, find_ambertools, run
+from md_reference.parameter_cache import Entry
+from md_reference.prmtop import Prmtop
+from systems.element_data import covalent_radius_nm
+from systems.errors import PreparationError, StorageError
+from systems.scene import FloatArray, Scene
+
+METHOD = "gaff2-am1bcc"
+ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
+_ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl": 17, "Br": 35, "I": 53}
+# SQM's cost grows with the third power: some seconds at 20 atoms, a quarter of an hour at 150.
+LARGEST = 250
+_CHARGE_TOLERANCE_E = 0.01
+_BOND_STRETCH = 1.3
+
+
+def parameters(scene: Scene, *, cached: bool = True) -> str:
+    """Return the AMBER prmtop text of a molecule, atoms in the scene's order.
+
+    Shipped parameters are taken first, then those cached by `molecule_key` and program versions, and only then is
+    AmberTools run on the scene's bonds, charge and positions (`cached=False`: at once, and nothing is kept). Stereo
+    plays no part in GAFF2, and positions are left alone. Raises PreparationError with the reason for what GAFF2 or
+    AM1-BCC cannot describe, and where AmberTools is needed and absent.
+    """
+    return entry(scene, cached=cached).ordered_as(scene)
+
+
+def entry(scene: Scene, *, cached: bool = True) -> Entry:
+    """Return what `parameters` reads: the prmtop in the order in which it was made, and its source."""
+    refuse(scene)
+    if not cached:
+        return _parametrise(scene)
+    shipped = parameter_cache.find_shipped(scene, METHOD)
+    if shipped is not None and parameter_cache.fits(shipped, scene):
+        return shipped
+    tools = find_ambertools()
+    known = parameter_cache.find_cached(scene, METHOD, None if tools is None else tools.label)
+    if known is not None and parameter_cache.fits(known, scene):
+        return known
+    made = _parametrise(scene)
+    try:
+        return parameter_cache.store(parameter_cache.cached_path(scene, METHOD, ambertools().label), made)
+    except StorageError:
+        return made  # a cache that cannot be written costs time, not the run
+
+
+def write_shipped(scene: Scene) -> Path:
+    """Write the molecule's parameters into the package (systems/data/parameters) and return the file.
+
+    For the library's makers: `parameters` reads it before anything else, without AmberTools. Raises as `parameters`.
+    """
+    found = entry(scene)
+    path = parameter_cache.shipped_folder() / f"{scene.molecule_key}-{METHOD}.json.gz"
+    parameter_cache.store(path, found)
+    return path
+
+
+def refuse(scene: Scene) -> None:
+    """Raise PreparationError with the reason when GAFF2 with AM1-BCC cannot describe the scene."""
+    foreign = sorted(set(scene.elements) - set(ELEMENTS))
+    if foreign:
+        raise PreparationError(
+            f"GAFF2 has no parameters for {', '.join(foreign)} in scene {scene.name!r} (it covers "
+            f"{', '.join(ELEMENTS)}); use --level gfn2-xtb."
+        )
+    graph: nx.Graph = nx.Graph()
+    graph.add_nodes_from(range(scene.n_atoms))
+    graph.add_edges_from(scene.bonds.tolist())
+    pieces = nx.number_connected_components(graph)
+    if pieces != 1:
+        raise PreparationError(f"scene {scene.name!r} holds {pieces} molecules; GAFF2 parameters are made one by one.")
+    if scene.n_atoms < 2:
+        raise PreparationError(f"GAFF2 has no parameters for a lone {scene.elements[0]} atom.")
+    charge = int(scene.formal_charges.sum())
+    electrons = sum(_ATOMIC_NUMBERS[e] for e in scene.elements) - charge
+    unpaired = int(scene.provenance.get("multiplicity", 1)) - 1
+    if electrons % 2 or unpaired:
+        n = unpaired or 1
+        raise PreparationError(
+            f"scene {scene.name!r} (charge {charge:+d}) has {n} unpaired electron{'s' if n > 1 else ''}; GAFF2 and "
+            "AM1-BCC are made for closed shells. Check hydrogens and charges, or use --level gfn2-xtb."
+        )
+    if scene.n_atoms > LARGEST:
+        raise PreparationError(
+            f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field; AM1-BCC charges for more "
+            f"than {LARGEST} take hours. Give a smaller molecule."
+        )
+
+
+def _parametrise(scene: Scene) -> Entry:
+    tools = ambertools()
+    with tempfile.TemporaryDirectory(prefix="surromd-gaff-") as name:
+        folder = Path(name)
+        try:
+            notes = _charges_and_types(scene, folder)
+            _missing_terms(scene, folder)
+            text = _assemble(folder)
+        except PreparationError as error:
+            raise PreparationError(f"scene {scene.name!r} cannot be given GAFF2 parameters: {error}") from error
+    _check(scene, Prmtop(text))
+    source = {
+        "force_field": f"GAFF2 {tools.gaff2_version}",
+        "charges": "AM1-BCC",
+        "program": f"AmberTools {tools.version}",
+        "notes": notes,
+    }
+    return Entry(scene, text, source)
+
+
+def _charges_and_types(scene: Scene, folder: Path) -> list[str]:
+    """Run antechamber: atom types, bond types and AM1-BCC charges into `typed.mol2`; return what was unusual."""
+    (folder / "input.sdf").write_text(_sdf(scene))
+    arguments = ["-i", "input.sdf", "-fi", "sdf", "-o", "typed.mol2", "-fo", "mol2", "-at", "gaff2", "-c", "bcc"]
+    arguments += ["-nc", str(int(scene.formal_charges.sum())), "-m", "1", "-rn", "MOL", "-s", "2", "-dr", "no"]
+    printed = run("antechamber", arguments, folder)
+    if not (folder / "typed.mol2").exists():
+        raise PreparationError(f"antechamber failed: {complaint(printed)}")
+    if not _rearranged(scene, folder / "sqm.pdb"):
+        return []
+    # AM1-BCC wants the AM1 minimum; where that is another molecule (a proton that hops), the scene's own geometry.
+    keywords = "qm_theory='AM1', maxcyc=0, scfconv=1.d-10, ndiis_attempts=700,"
+    run("antechamber", [*arguments, "-ek", keywords], folder)
+    if _rearranged(scene, folder / "sqm.pdb"):
+        raise PreparationError("its positions do not fit its bonds; minimise or repair the structure first")
+    return ["AM1 charges at the scene's own geometry: the isolated molecule rearranges when AM1 minimises it"]
+
+
+def _missing_terms(scene: Scene, folder: Path) -> None:
+    """Run parmchk2; raise PreparationError for what it could not even guess."""
+    run("parmchk2", ["-i", "typed.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"], folder)
+    unknown = [
+        line.split("ATTN")[0].strip() for line in (folder / "extra.frcmod").read_text().splitlines() if "ATTN" in line
+    ]
+    if unknown:
+        terms = "; ".join(" ".join(term.split()) for term in unknown[:3])
+        raise PreparationError(
+            f"GAFF2 has no parameters for {len(unknown)} of its terms ({terms}); use --level gfn2-xtb"
+        )
+
+
+def _assemble(folder: Path) -> str:
+    """Run tleap and return the prmtop text."""
+    script = (
+        "set default PBRadii mbondi2\nsource leaprc.gaff2\nloadamberparams extra.frcmod\n"
+        "molecule = loadmol2 typed.mol2\nsaveamberparm molecule out.prmtop out.inpcrd\nquit\n"
+    )
+    (folder / "leap.in").write_text(script)
+    printed = run("tleap", ["-f", "leap.in"], folder)
+    out = folder / "out.prmtop"
+    if not out.exists() or not out.stat().st_size:
+        raise PreparationError(f"tleap failed: {complaint(printed)}")
+    return out.read_text()
+
+
+def _check(scene: Scene, made: Prmtop) -> None:
+    """Raise PreparationError unless the parameters are for exactly the scene's atoms, bonds and charge, in order."""
+    what = ""
+    numbers = [_ATOMIC_NUMBERS[e] for e in scene.elements]
+    bonds = {(min(i, j), max(i, j)) for i, j in scene.bonds.tolist()}
+    charge = int(scene.formal_charges.sum())
+    if made.fields["ATOMIC_NUMBER"] != numbers:
+        what = "other elements or another atom order"
+    elif made.bonds != bonds:
+        what = f"other bonds ({len(made.bonds - bonds)} more, {len(bonds - made.bonds)} fewer)"
+    elif abs(float(made.charges_e.sum()) - charge) > _CHARGE_TOLERANCE_E:
+        what = f"charge {float(made.charges_e.sum()):+.3f} instead of {charge:+d}"
+    elif {"DU", "du"} & set(made.fields["AMBER_ATOM_TYPE"]):
+        what = "atoms it found no type for"
+    if what:
+        raise PreparationError(f"AmberTools made parameters with {what} for scene {scene.name!r}; check its bonds.")
+
+
+def _rearranged(scene: Scene, pdb: Path) -> bool:
+    """Return whether the geometry sqm ended with has lost a bond or moved a hydrogen to another atom."""
+    lines = [line for line in pdb.read_text().splitlines() if line.startswith(("ATOM", "HETATM"))]
+    x: FloatArray = np.array([[float(line[k : k + 8]) for k in (30, 38, 46)] for line in lines]) / 10.0
+    radius = np.array([covalent_radius_nm(e) for e in scene.elements])
+    gaps = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    np.fill_diagonal(gaps, np.inf)
+    i, j = scene.bonds.T
+    if (gaps[i, j] > _BOND_STRETCH * (radius[i] + radius[j])).any():
+        return True
+    bonded = np.zeros_like(gaps, dtype=bool)
+    bonded[i, j] = bonded[j, i] = True
+    reach = gaps / (radius[:, None] + radius[None])
+    return any(not bonded[h, np.argmin(reach[h])] for h, e in enumerate(scene.elements) if e == "H")
+
+
+def _sdf(scene: Scene) -> str:
+    """The scene as a V2000 MOL block, centred, in Å; antechamber reads elements, bonds and positions from it."""
+    x = (scene.positions_nm - scene.positions_nm.mean(axis=0)) * 10.0
+    lines = ["molecule", "  surromd", "", f"{scene.n_atoms:3d}{len(scene.bonds):3d}  0  0  0  0  0  0  0  0999 V2000"]
+    for (a, b, c), element in zip(x.tolist(), scene.elements, strict=True):
+        lines.append(f"{a:10.4f}{b:10.4f}{c:10.4f} {element:<3} 0  0  0  0  0  0  0  0  0  0  0  0")
+    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
+        kind = 4 if order == 1.5 else max(1, round(order))
+        lines.append(f"{i + 1:3d}{j + 1:3d}{kind:3d}  0")
+    charged: list[tuple[int, int]] = [(i + 1, int(q)) for i, q in enumerate(scene.formal_charges.tolist()) if q]
+    for start in range(0, len(charged), 8):
+        row = charged[start : start + 8]
+        lines.append(f"M  CHG{len(row):3d}" + "".join(f"{i:4d}{q:4d}" for i, q in row))
+    return "\n".join([*lines, "M  END", "$$$$", ""])
