@@ -11,8 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from md_reference.parent_watch import end_with_parent
 from md_reference.simulate import MDConfig, simulate
 from systems.errors import SimulationError, SurromdError
+from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 
 # (frames done over all replicas, frames in all) -> None
@@ -43,40 +45,47 @@ def simulate_replicas(
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
-    Each replica is a process with one thread: on small scenes that is the fastest use of the cores. Raises
-    SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
+    Each replica is a process with one thread: on small scenes that is the fastest use of the cores. Ctrl-C and SIGTERM
+    stop them all between two frames, each with a checkpoint: KeyboardInterrupt. When this process is killed outright
+    they stop by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished
+    replicas stay on disk.
     """
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     if len(outs) == 1:
         return [simulate(scene, configs[0], outs[0], resume=resume, overwrite=overwrite, progress=progress)]
     context = multiprocessing.get_context("spawn")
-    done = context.Array("Q", len(outs))
+    # Without a lock, which a killed process would never give back: each number has one writer.
+    done = context.Array("Q", len(outs), lock=False)
     errors = context.Queue()
     waiting = list(range(len(outs)))
     running: dict[int, Any] = {}
     failures: dict[int, str] = {}
     reasons: dict[int, str] = {}
     width = workers or min(len(outs), available_cores())
-    try:
-        while waiting or running:
-            while waiting and len(running) < width:
-                k = waiting.pop(0)
-                args = (scene.to_dict(), configs[k], str(outs[k]), resume, overwrite, done, k, errors)
-                running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
-                running[k].start()
-            time.sleep(0.1)
-            if progress is not None:
-                progress(int(sum(done[:])), config.n_frames * len(outs))
-            for k in [k for k, process in running.items() if not process.is_alive()]:
-                process = running.pop(k)
+    with deferred_interrupt() as asked_to_stop:
+        try:
+            while waiting or running:
+                while waiting and len(running) < width:
+                    k = waiting.pop(0)
+                    args = (scene.to_dict(), configs[k], str(outs[k]), resume, overwrite, done, k, errors)
+                    running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
+                    running[k].start()
+                time.sleep(0.1)
+                if asked_to_stop():
+                    raise KeyboardInterrupt
+                if progress is not None:
+                    progress(int(sum(done[:])), config.n_frames * len(outs))
+                for k in [k for k, process in running.items() if not process.is_alive()]:
+                    process = running.pop(k)
+                    process.join()
+                    if process.exitcode != 0:
+                        _collect(errors, reasons, k)
+                        failures[k] = reasons.get(k, f"exit code {process.exitcode}")
+        finally:
+            for process in running.values():
+                process.terminate()
+            for process in running.values():
                 process.join()
-                if process.exitcode != 0:
-                    _collect(errors, reasons, k)
-                    failures[k] = reasons.get(k, f"exit code {process.exitcode}")
-    finally:
-        for process in running.values():
-            process.terminate()
-            process.join()
     if failures:
         k = min(failures)
         raise SimulationError(f"{len(failures)} of {len(outs)} replicas failed; replica {k}: {failures[k]}")
@@ -96,6 +105,7 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
 def _replica(
     scene: dict[str, Any], config: MDConfig, out: str, resume: bool, overwrite: bool, done: Any, k: int, errors: Any
 ) -> None:
+    end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
 
     def report(frames: int, _: int) -> None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from md_reference.replicas import replica_paths, simulate_replicas
-from md_reference.simulate import MDConfig
-from systems.errors import SimulationError
+from md_reference.simulate import MDConfig, checkpoint_path
+from systems.errors import SimulationError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory import open_trajectory, open_writer
 
 SHORT = MDConfig(time_ps=0.8, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
 
@@ -44,3 +49,67 @@ def test_replicas_resume_and_keep_what_is_complete(alanine_dipeptide: Scene, tmp
         assert reader.record["seed"] == 1
     with pytest.raises(SimulationError, match=r"replica 0: .*temperature_k"):
         simulate_replicas(alanine_dipeptide, replace(SHORT, temperature_k=310.0), outs, resume=True)
+
+
+# ---- the end of the parent -----------------------------------------------------------------------------------------
+
+PARENT = """
+import sys
+sys.path.insert(0, {repository!r})
+from pathlib import Path
+from md_reference.replicas import simulate_replicas
+from md_reference.simulate import MDConfig
+from systems.library import load
+
+if __name__ == "__main__":
+    config = MDConfig(time_ps=4e6, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
+    try:
+        simulate_replicas(load("alanine-dipeptide"), config, [Path(p) for p in {outs!r}])
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+def being_written(path: Path, scene: Scene) -> bool:
+    """True while some process holds the file, which has frames, open for writing."""
+    if not path.exists() or frames_in(path) == 0:  # its writer is not disturbed before it has begun
+        return False
+    try:
+        open_writer(path, scene, {}, append=True).close()
+    except TrajectoryError as error:
+        return "another process" in str(error)
+    return False
+
+
+def frames_in(path: Path) -> int:
+    with open_trajectory(path) as reader:
+        return reader.n_frames
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGKILL")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["kill -9", "SIGTERM"])
+def test_replicas_end_with_their_parent_and_can_be_resumed(
+    alanine_dipeptide: Scene, tmp_path: Path, repository: Path, number: signal.Signals
+) -> None:
+    outs = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT.format(repository=str(repository), outs=[str(out) for out in outs]))
+    with subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as parent:
+        deadline = time.monotonic() + 60
+        while not all(being_written(out, alanine_dipeptide) for out in outs):  # also shows that the question can be yes
+            assert parent.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        parent.send_signal(number)
+        parent.wait(timeout=30)
+        assert parent.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 130)
+        deadline = time.monotonic() + 10
+        while any(being_written(out, alanine_dipeptide) for out in outs):
+            assert time.monotonic() < deadline, "an orphan goes on writing"
+            time.sleep(0.05)
+        assert "Traceback" not in (parent.stderr.read() if parent.stderr else "")
+    for out in outs:
+        n_frames = frames_in(out)
+        assert checkpoint_path(out).exists()
+        # Stopped between two frames, with a checkpoint at the last one: nothing is lost on the way to a longer run.
+        header = checkpoint_path(out).read_bytes().partition(b"\n")[0]
+        assert f'"n_frames": {n_frames}'.encode() in header
