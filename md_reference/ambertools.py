@@ -87,7 +87,8 @@ def run(program: str, arguments: list[str], folder: Path) -> str:
 def complaint(printed: str) -> str:
     """Return the lines of an output that say what is wrong, in one line."""
     lines = [" ".join(line.split()) for line in printed.splitlines()]
-    telling = [line for line in lines if _COMPLAINT.search(line) and "Errors = " not in line]
+    telling = [line for line in lines if _COMPLAINT.search(line) and not line.endswith("Fatal Error!")]
+    telling = [line for line in telling if "Errors = " not in line]
     chosen = list(dict.fromkeys(telling))[:3] or [line for line in lines if line][-1:]
     return "; ".join(line.rstrip(".") for line in chosen) or "it said nothing"
 

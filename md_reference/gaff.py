@@ -15,7 +15,7 @@ import numpy as np
 from md_reference import parameter_cache
 from md_reference.ambertools import ambertools, complaint, find_ambertools, run
 from md_reference.parameter_cache import Entry
-from md_reference.prmtop import Prmtop
+from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError, StorageError
 from systems.scene import FloatArray, Scene
@@ -34,7 +34,7 @@ def parameters(scene: Scene, *, cached: bool = True) -> str:
 
     Shipped parameters are taken first, then those cached by `molecule_key` and program versions, and only then is
     AmberTools run on the scene's bonds, charge and positions (`cached=False`: at once, and nothing is kept). Stereo
-    plays no part in GAFF2, and positions are left alone. Raises PreparationError with the reason for what GAFF2 or
+    plays no part in GAFF2, and positions are left alone. What rounding leaves of the total charge is spread evenly. Raises PreparationError with the reason for what GAFF2 or
     AM1-BCC cannot describe, and where AmberTools is needed and absent.
     """
     return entry(scene, cached=cached).ordered_as(scene)
@@ -86,6 +86,12 @@ def refuse(scene: Scene) -> None:
         raise PreparationError(f"scene {scene.name!r} holds {pieces} molecules; GAFF2 parameters are made one by one.")
     if scene.n_atoms < 2:
         raise PreparationError(f"GAFF2 has no parameters for a lone {scene.elements[0]} atom.")
+    crowded = [i for i, n in graph.degree if n > 4]
+    if crowded:
+        raise PreparationError(
+            f"{scene.atom_names[crowded[0]]} in scene {scene.name!r} has {graph.degree(crowded[0])} neighbours; GAFF2 "
+            "has no angle terms for more than four. Use --level gfn2-xtb."
+        )
     charge = int(scene.formal_charges.sum())
     electrons = sum(_ATOMIC_NUMBERS[e] for e in scene.elements) - charge
     unpaired = int(scene.provenance.get("multiplicity", 1)) - 1
@@ -112,14 +118,19 @@ def _parametrise(scene: Scene) -> Entry:
             text = _assemble(folder)
         except PreparationError as error:
             raise PreparationError(f"scene {scene.name!r} cannot be given GAFF2 parameters: {error}") from error
-    _check(scene, Prmtop(text))
+    made = Prmtop(text)
+    _check(scene, made)
+    # AmberTools rounds charges to 0.0001 e or so each; the sum must be whole for PME and for a neutral box.
+    residual = float(made.charges_e.sum()) - int(scene.formal_charges.sum())
+    made.fields["CHARGE"] = [q - residual * CHARGE_UNIT / scene.n_atoms for q in made.fields["CHARGE"]]
     source = {
         "force_field": f"GAFF2 {tools.gaff2_version}",
         "charges": "AM1-BCC",
         "program": f"AmberTools {tools.version}",
+        "residual_charge_e": round(residual, 6),
         "notes": notes,
     }
-    return Entry(scene, text, source)
+    return Entry(scene, made.text(), source)
 
 
 def _charges_and_types(scene: Scene, folder: Path) -> list[str]:
