@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 
 import networkx as nx
 import numpy as np
@@ -41,9 +42,12 @@ def molecule_key(scene: Scene) -> str:
     """Return a hash of elements, connectivity, total charge and stereo, 16 hexadecimal digits.
 
     Free of atom order, names, positions, bond orders and the atom a charge is drawn on; enantiomers, diastereomers and
-    E/Z isomers differ. `systems.symmetry` states the method and its limits.
+    E/Z isomers differ. `systems.symmetry` states the method and its limits. Of a model system it is a hash of the law,
+    particle by particle: which of them are equivalent is not worked out.
     """
-    record = (classify(scene).fingerprint, int(scene.formal_charges.sum()))
+    record: tuple[object, ...] = (classify(scene).fingerprint, int(scene.formal_charges.sum()))
+    if scene.interactions is not None:
+        record = (*record, json.dumps(scene.interactions, sort_keys=True), scene.masses_da.tolist())
     return hashlib.sha256(repr(record).encode()).hexdigest()[:16]
 
 

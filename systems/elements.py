@@ -9,3 +9,6 @@ Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No Lr Rf Db Sg Bh Hs Mt Ds Rg Cn 
 """
 
 ATOMIC_NUMBERS: dict[str, int] = {symbol: number for number, symbol in enumerate(_SYMBOLS.split(), start=1)}
+
+# A particle of a model system, which is no chemical element; MDTraj's symbol of a virtual site, atomic number 0.
+PARTICLE = "VS"

@@ -44,7 +44,8 @@ def find_rules(scene: Scene) -> dict[str, Any]:
         "bond_mean_nm": np.sqrt(squared_distance(start, scene.bonds)[:, 0]),
         "bond_std_nm": np.zeros(len(scene.bonds)),
         "near_idx": exclusions(scene, depth=3),
-        "clash_min_nm": np.array(_CLASH_WITHOUT_FRAMES_NM),
+        # The particles of a model system have no size.
+        "clash_min_nm": np.array(_CLASH_WITHOUT_FRAMES_NM) if scene.interactions is None else np.zeros(3),
         "stereo_idx": stereo_idx,
         "stereo_sign": np.where(signed_volume(start, stereo_idx)[:, 0] > 0, 1, -1),
         "omega_idx": omega_idx,
@@ -93,7 +94,7 @@ def measured_rules(scene: Scene, positions_nm: FloatArray) -> dict[str, Any]:
         "omega_idx": omega_idx[keep_omega], "omega_sign": np.where(2 * n_cis > n, 1, -1)[keep_omega],
         "ring_idx": ring_idx[keep_ring], "excluded": tuple(labels.lines),
     }  # fmt: skip
-    if pairs:
+    if pairs and scene.interactions is None:
         seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
         rules["clash_min_nm"] = np.minimum(_CLASH_SHARE_OF_LEAST * seen, _CLASH_AT_MOST_NM)
     return rules

@@ -25,8 +25,14 @@ def match_atoms(scene: Scene, template: Scene) -> npt.NDArray[np.int64]:
     Of the equivalent assignments one is taken in which every four-coordinate atom keeps its handedness at the two
     scenes' positions, prochiral groups, CH2 and methyl hydrogens included, so that `positions_nm[order]` superposes on
     the template with no group inverted; rotors and planar NH2 take the labelling nearest in torsion.
-    Raises OutOfDomainError with the reason: another formula, charge or connectivity, the mirror image, a stereoisomer.
+    Particles of a model system are matched one by one in their order, and their laws must agree.
+    Raises OutOfDomainError with the reason: another formula, charge, connectivity or law, the mirror image, a
+    stereoisomer.
     """
+    if scene.interactions != template.interactions:
+        raise OutOfDomainError(f"{scene.name} and {template.name} are under different laws: not the same model system.")
+    if scene.interactions is not None:
+        return np.arange(scene.n_atoms)
     if sorted(scene.elements) != sorted(template.elements):
         raise OutOfDomainError(f"{scene.name} is {scene.formula}, but {template.name} is {template.formula}.")
     charges = int(scene.formal_charges.sum()), int(template.formal_charges.sum())

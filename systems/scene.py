@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.elements import PARTICLE
 from systems.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,7 +28,7 @@ class Scene:
 
     `cell_nm`: reduced box vectors `(3, 3)` of a periodic system, else None. `interactions`: the law of a model system
     (charges, springs, a potential) as JSON-able values with a key `kind`; None where a force field says what the forces
-    are.
+    are. `velocities_nm_ps`: starting velocities `(n_atoms, 3)` where they are part of the system, else None.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Scene:
     provenance: dict[str, Any] = field(default_factory=dict)
     cell_nm: FloatArray | None = None
     interactions: dict[str, Any] | None = None
+    velocities_nm_ps: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.elements)
@@ -64,6 +66,10 @@ class Scene:
             if self.cell_nm.shape != (3, 3):
                 raise InputError(f"Scene {self.name!r}: cell_nm has shape {self.cell_nm.shape}, not (3, 3).")
             self.cell_nm.setflags(write=False)
+        if self.velocities_nm_ps is not None:
+            if self.velocities_nm_ps.shape != (n, 3):
+                raise InputError(f"Scene {self.name!r}: velocities {self.velocities_nm_ps.shape}, not ({n}, 3).")
+            self.velocities_nm_ps.setflags(write=False)
 
     @property
     def n_atoms(self) -> int:
@@ -78,7 +84,7 @@ class Scene:
     def topology_hash(self) -> str:
         """Hash of the ordered topology, names included, positions left out."""
         record = self.to_dict()
-        for key in ("positions_nm", "provenance", "name", "masses_da", "cell_nm"):
+        for key in ("positions_nm", "provenance", "name", "masses_da", "cell_nm", "velocities_nm_ps"):
             record.pop(key, None)
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -91,7 +97,9 @@ class Scene:
 
     @property
     def formula(self) -> str:
-        """Hill-order formula, for people: C6H12N2O2."""
+        """Hill-order formula, for people: C6H12N2O2; `5 particles` where there are no elements."""
+        if self.elements and set(self.elements) == {PARTICLE}:
+            return f"{self.n_atoms} particle{'s' if self.n_atoms > 1 else ''}"
         counts = {e: self.elements.count(e) for e in set(self.elements)}
         order: list[str] = [e for e in ("C", "H") if e in counts and "C" in counts]
         order += sorted(e for e in counts if e not in order)
@@ -123,8 +131,9 @@ class Scene:
             for key in ("bond_orders", "masses_da", "positions_nm"):
                 fields[key] = np.array(fields[key], dtype=np.float64)
             fields["bonds"] = fields["bonds"].reshape(-1, 2)
-            if fields.get("cell_nm") is not None:
-                fields["cell_nm"] = np.array(fields["cell_nm"], dtype=np.float64)
+            for key in ("cell_nm", "velocities_nm_ps"):
+                if fields.get(key) is not None:
+                    fields[key] = np.array(fields[key], dtype=np.float64)
             return Scene(**fields)
         except (KeyError, TypeError) as error:
             raise InputError(f"Scene record is incomplete or has unknown entries: {error}.") from error
@@ -144,7 +153,7 @@ class Scene:
             residues.append(topology.addResidue(name, chains[chain_id], resid))
         atoms = []
         for name, symbol, res in zip(self.atom_names, self.elements, self.residue_of_atom, strict=True):
-            element = app.Element.getBySymbol(symbol)
+            element = None if symbol == PARTICLE else app.Element.getBySymbol(symbol)
             atoms.append(topology.addAtom(name, element, residues[res]))
         if [a.index for a in topology.atoms()] != list(range(self.n_atoms)):
             raise InputError(f"Scene {self.name!r}: atoms of one residue or chain are not contiguous.")
