@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.atomic_file import storage_error, write_whole
-from systems.dcd_layout import DcdLayout, header_bytes, step_fields, title_bytes
+from systems.dcd_layout import DcdLayout, cell_blocks, cells_of_blocks, header_bytes, step_fields, title_bytes
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.frame_store import (
     FrameStore,
@@ -53,7 +53,7 @@ class DcdWriter(TrajectoryWriter):
         try:
             check_same_topology(path, self._store.scene, scene)
             layout = DcdLayout.read(path)
-            if layout != DcdLayout.ours(scene.n_atoms, layout.first_frame_at):
+            if layout != DcdLayout.ours(scene.n_atoms, layout.first_frame_at, has_cell=scene.cell_nm is not None):
                 raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
             _check_against_meta(path, layout, self._store.n_frames, self._store.largest_append)
             self._layout, self.n_frames = layout, self._store.n_frames
@@ -84,7 +84,8 @@ class DcdWriter(TrajectoryWriter):
             made.append(self._meta)
             write_new(self._pdb, topology)
             made.append(self._pdb)
-            write_new(self.path, header_bytes(0, 0, 1, 0.0) + title_bytes(self.scene.n_atoms))
+            header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
+            write_new(self.path, header + title_bytes(self.scene.n_atoms))
         except SurromdError:
             for file in made:
                 file.unlink(missing_ok=True)
@@ -93,11 +94,18 @@ class DcdWriter(TrajectoryWriter):
     def _append(self, block: FrameBlock) -> None:
         self._refuse_closed()
         self._store.check_flags(block)
+        if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
+            raise InputError(f"{self.path}: a DCD holds positions only; write an .h5 to keep velocities or forces.")
+        if block.cell_nm is not None and not self._layout.has_cell:
+            raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
         self._store.announce(len(block))
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         for axis in range(3):
             frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
             frames[f"x{axis}"] = block.positions_nm[:, :, axis] * np.float32(10.0)
+        if self._layout.has_cell:
+            own = np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
+            frames["cell"] = cell_blocks(own if block.cell_nm is None else block.cell_nm)
         first_times = self._first_times
         try:
             write_whole(self._fd, frames.tobytes(), self._layout.offset(self.n_frames))
@@ -117,7 +125,7 @@ class DcdWriter(TrajectoryWriter):
         first, nsavc, timestep_ps = 0, 1, 0.0
         if len(self._first_times):
             first, nsavc, timestep_ps = step_fields(self._first_times, self._store.record)
-        write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps), 0)
+        write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
         os.ftruncate(self._fd, self._layout.offset(n_frames))
 
     def truncate(self, n_frames: int) -> None:
@@ -194,6 +202,13 @@ class DcdReader(TrajectoryReader):
                 raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
             np.multiply(frames[f"x{axis}"], np.float32(0.1), out=out[:, :, axis])
         return out
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> npt.NDArray[np.float64] | None:
+        if self._frames is None:
+            raise InputError(f"{self.path} is closed.")
+        if not self._layout.has_cell:
+            return None
+        return cells_of_blocks(np.asarray(self._frames["cell"][start:stop:stride]), self._layout.byte_order)
 
     def close(self) -> None:
         self._frames = None

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.cell_shape import box_vectors, lengths_and_angles
 from systems.errors import TrajectoryError
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
@@ -45,9 +46,9 @@ class DcdLayout:
         return mine == (other.n_atoms, other.first_frame_at, other.byte_order, other.has_cell)
 
     @staticmethod
-    def ours(n_atoms: int, first_frame_at: int) -> DcdLayout:
+    def ours(n_atoms: int, first_frame_at: int, *, has_cell: bool = False) -> DcdLayout:
         """Return the layout we write."""
-        return DcdLayout(n_atoms, first_frame_at)
+        return DcdLayout(n_atoms, first_frame_at, has_cell=has_cell)
 
     @staticmethod
     def read(path: Path) -> DcdLayout:
@@ -140,13 +141,32 @@ def step_fields(times_ps: npt.NDArray[np.float64], record: dict[str, Any]) -> tu
     return 0, 1, interval
 
 
-def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float) -> bytes:
+def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Return the unit-cell blocks `(n, 14)` of box vectors `(n, 3, 3)` nm: A, gamma, B, beta, alpha, C (Å, degrees)."""
+    lengths, angles = lengths_and_angles(cell_nm)
+    (a, b, c), (alpha, beta, gamma) = 10.0 * lengths.T, angles.T
+    out = np.full((len(lengths), 14), 48, dtype="<i4")
+    out[:, 1:13] = np.ascontiguousarray(np.stack([a, gamma, b, beta, alpha, c], axis=1), dtype="<f8").view("<i4")
+    return out
+
+
+def cells_of_blocks(blocks: npt.NDArray[np.int32], byte_order: str) -> npt.NDArray[np.float64]:
+    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks; some programs write the cosines of the angles."""
+    raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
+    angles = raw[:, [4, 3, 1]]
+    if (np.abs(angles) <= 1.0).all():
+        angles = np.degrees(np.arccos(angles))
+    return box_vectors(0.1 * raw[:, [0, 2, 5]], angles)
+
+
+def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float, *, has_cell: bool = False) -> bytes:
     """Return the first block of our header; `nsavc` time steps lie between frames."""
     fields = np.zeros(20, dtype="<i4")
     fields[:3] = n_frames, first_step, nsavc
     fields[3] = min(n_frames * nsavc, 2**31 - 1)
     fields[9:10] = np.array([timestep_ps / AKMA_PS], dtype="<f4").view("<i4")
-    fields[19] = 24  # CHARMM's version: float32 time step, no unit cell (field 10), three dimensions (field 11)
+    fields[10] = int(has_cell)
+    fields[19] = 24  # CHARMM's version: float32 time step, three dimensions (field 11)
     mark = np.array([84], dtype="<i4").tobytes()
     return mark + b"CORD" + fields.tobytes() + mark
 

@@ -28,6 +28,9 @@ from systems.trajectory_types import FrameBlock
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048
 _RECORD_BYTES = 4096
+# Box vectors of each frame, where H5MD wants them.
+EDGES = "particles/trajectory/box/edges/value"
+_EXTRA = ("velocities", "forces", "cell_lengths", "cell_angles", EDGES)
 
 
 def program_version() -> str:
@@ -158,6 +161,8 @@ def column_names(file: h5py.File) -> list[str]:
     """Return the names of all per-frame columns present in the file."""
     fixed = ("coordinates", "time", "particles/trajectory/position/step", "surromd/flags", "surromd/chunk_idx")
     names = [name for name in fixed if name in file]
+    if "surromd" in file:
+        names += [name for name in _EXTRA if name in file]
     if "surromd/scalars" in file:
         names += [f"surromd/scalars/{name}" for name in file["surromd/scalars"]]
     return names

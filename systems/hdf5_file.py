@@ -2,12 +2,14 @@
 
 MDTraj: `/coordinates` (n, n_atoms, 3) float32 nm, `/time` ps, `/topology` JSON (mdtraj.org, HDF5 format, version 1.1).
 H5MD 1.1 (de Buyl, Colberg and Höfling, Comput. Phys. Commun. 185, 1546 (2014)): `/particles/trajectory/position` with
-`value` and `time` as hard links onto the same datasets, so that the second convention takes no space.
+`value` and `time` as hard links onto the same datasets, so that the second convention takes no space. What else frames
+may have (velocities, forces, a cell) is in `extra_columns`.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError, TrajectoryError
+from systems.extra_columns import check_wanted, extra_values, lay_out_extras, read_cells
 from systems.frame_store import (
     FrameStore,
     add_column,
@@ -29,6 +32,7 @@ from systems.frame_store import (
 from systems.scene import Scene
 from systems.trajectory_types import (
     Float32Array,
+    Float64Array,
     FrameBlock,
     TrajectoryReader,
     TrajectoryWriter,
@@ -44,10 +48,20 @@ _POSITION = "particles/trajectory/position"
 class Hdf5Writer(TrajectoryWriter):
     """Writes one HDF5 trajectory; see `systems.trajectory.open_writer` for the arguments and errors."""
 
-    def __init__(self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        scene: Scene,
+        record: dict[str, Any],
+        *,
+        append: bool,
+        overwrite: bool,
+        columns: Sequence[str] = (),
+    ) -> None:
         self.path, self.scene = path, scene
+        check_wanted(columns, path)
         if not append:
-            create_store(path, scene, record, lambda file: _lay_out(file, scene), overwrite=overwrite)
+            create_store(path, scene, record, lambda file: _lay_out(file, scene, columns), overwrite=overwrite)
         self._store = FrameStore(path)
         try:
             check_same_topology(path, self._store.scene, scene)
@@ -68,7 +82,8 @@ class Hdf5Writer(TrajectoryWriter):
             step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
         else:
             step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
-        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step})
+        extra = extra_values(self._store.file, self.scene, block, f"{self.path}, after frame {self.n_frames}")
+        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra})
 
     def truncate(self, n_frames: int) -> None:
         self._refuse_closed()
@@ -126,20 +141,35 @@ class Hdf5Reader(TrajectoryReader):
         return scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        frames = self._gather(self._coordinates, start, stop, stride)
+        return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
+
+    def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
+        if not self._file:
+            raise InputError(f"{self.path} is closed.")
+        return self._gather(self._file[name], start, stop, stride) if name in self._file else None
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if not self._file:
+            raise InputError(f"{self.path} is closed.")
+        with damage_reported(self.path):
+            return read_cells(self._file, start, stop, stride)
+
+    def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
+        if start >= stop:
+            return np.empty((0, *column.shape[1:]), dtype=np.float32)
         try:
             if stride == 1:
-                frames = np.asarray(self._coordinates[start:stop], dtype=np.float32)
-            else:
-                # HDF5 gathers strided rows one by one; whole blocks, thinned here, are many times faster.
-                block = max(_STRIDED_READ_FRAMES // stride, 1) * stride
-                parts = [self._coordinates[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
-                frames = np.concatenate(parts).astype(np.float32, copy=False)
+                return np.asarray(column[start:stop], dtype=np.float32)
+            # HDF5 gathers strided rows one by one; whole blocks, thinned here, are many times faster.
+            block = max(_STRIDED_READ_FRAMES // stride, 1) * stride
+            parts = [column[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
+            return np.concatenate(parts).astype(np.float32, copy=False)
         except (OSError, RuntimeError, ValueError) as error:
             if not self._file:
                 raise InputError(f"{self.path} is closed.") from error
             reason = str(error).splitlines()[0]
             raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
-        return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
 
     def close(self) -> None:
         self._file.close()
@@ -169,7 +199,7 @@ def _nm_per_unit(dataset: h5py.Dataset, path: Path) -> float:
     return known[name]
 
 
-def _lay_out(file: h5py.File, scene: Scene) -> None:
+def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
     """Add MDTraj's and H5MD's groups, empty columns and units."""
     version = program_version()
     for key, value in {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
@@ -191,10 +221,10 @@ def _lay_out(file: h5py.File, scene: Scene) -> None:
     particles = file.create_group("particles/trajectory")
     box = particles.create_group("box")
     box.attrs["dimension"] = np.int32(3)
-    box.attrs["boundary"] = np.array([b"none"] * 3, dtype="S8")
     position = particles.create_group("position")
     position["value"], position["time"] = coordinates, time
     add_column(file, f"{_POSITION}/step", 0, "<i8")
+    lay_out_extras(file, scene, columns, chunk)
     particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
     particles["mass"] = scene.masses_da
     particles["mass"].attrs["unit"] = "u"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,23 @@ _HDF5 = (".h5", ".hdf5")
 
 
 def open_writer(
-    path: str | Path, scene: Scene, record: dict[str, Any], *, append: bool = False, overwrite: bool = False
+    path: str | Path,
+    scene: Scene,
+    record: dict[str, Any],
+    *,
+    append: bool = False,
+    overwrite: bool = False,
+    columns: Sequence[str] = (),
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5` or `.dcd`), or continue one with `append=True`.
 
     A DCD is accompanied by `NAME.pdb` (topology) and `NAME.meta.h5` (record, exact times, flags). With `append` the
     file must be ours and hold the same ordered topology; what it records stays, new keys of `record` are added, and an
-    append that a crash interrupted is cut off. `record` must be JSON-able.
-    Raises InputError for an unknown suffix or record; TrajectoryError when the file exists (and neither `append` nor
-    `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another process;
-    StorageError when the folder is missing, not writable or full.
+    append that a crash interrupted is cut off. `record` must be JSON-able. `columns`: what each frame has beside
+    positions, 'velocities' and 'forces' (HDF5 only); the cell of a periodic scene is kept in any case.
+    Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
+    `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
+    process; StorageError when the folder is missing, not writable or full.
     """
     path = Path(path)
     if append and overwrite:
@@ -36,10 +44,12 @@ def open_writer(
     if path.suffix.lower() in _HDF5:
         from systems.hdf5_file import Hdf5Writer
 
-        return Hdf5Writer(path, scene, record, append=append, overwrite=overwrite)
+        return Hdf5Writer(path, scene, record, append=append, overwrite=overwrite, columns=columns)
     if path.suffix.lower() == ".dcd":
         from systems.dcd_file import DcdWriter
 
+        if columns:
+            raise InputError(f"{path}: a DCD holds positions only; write an .h5 to keep {' and '.join(columns)}.")
         return DcdWriter(path, scene, record, append=append, overwrite=overwrite)
     raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,13 +21,19 @@ Float64Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FrameBlock:
-    """Frames that belong together, checked: positions `(n, n_atoms, 3)` float32 nm, all else `(n,)`."""
+    """Frames that belong together, checked: positions `(n, n_atoms, 3)` float32 nm, series `(n,)`.
+
+    Where they are kept: velocities and forces `(n, n_atoms, 3)` float32, box vectors `(n, 3, 3)`.
+    """
 
     positions_nm: Float32Array
     time_ps: Float64Array
     flags: npt.NDArray[np.uint16] | None
     chunk_idx: npt.NDArray[np.int32]
     scalars: dict[str, Float64Array]
+    velocities_nm_ps: Float32Array | None = None
+    forces_kj_mol_nm: Float32Array | None = None
+    cell_nm: Float64Array | None = None
 
     def __len__(self) -> int:
         return len(self.time_ps)
@@ -49,20 +55,49 @@ class TrajectoryWriter(ABC):
         flags: npt.ArrayLike | None = None,
         chunk_idx: int | npt.ArrayLike | None = -1,
         scalars: dict[str, npt.ArrayLike] | None = None,
+        velocities_nm_ps: npt.ArrayLike | None = None,
+        forces_kj_mol_nm: npt.ArrayLike | None = None,
+        cell_nm: npt.ArrayLike | None = None,
     ) -> None:
         """Append frames `(n, n_atoms, 3)` nm at times `(n,)` ps, later than all before, and flush them to disk.
 
         `flags` `(n,)` are validity bits (systems.validity), given for all frames of a file or for none; `chunk_idx` is
         the surrogate's chunk these frames came from, one number or `(n,)` (-1: none); `scalars` are further `(n,)`
-        series by name, NaN in frames where they are not given.
+        series by name, NaN in frames where they are not given. Velocities nm/ps and forces kJ/mol/nm, shaped as the
+        positions, come with every frame of a file that was opened for them; `cell_nm` `(n, 3, 3)` holds the box vectors
+        of a periodic scene (its own where not given).
         Raises InputError for frames that do not fit the scene, the times or what was appended before; StorageError
         when the disk is full (what was complete stays readable, the writer is then closed to further frames).
         """
         block = self._checked(positions_nm, time_ps, flags, chunk_idx, scalars or {})
+        block = replace(
+            block,
+            velocities_nm_ps=self._as_frames("velocities", velocities_nm_ps, block),
+            forces_kj_mol_nm=self._as_frames("forces", forces_kj_mol_nm, block),
+            cell_nm=self._as_cells(cell_nm, block),
+        )
         if len(block):
             self._append(block)
             self.n_frames += len(block)
             self.last_time_ps = float(block.time_ps[-1])
+
+    def _as_frames(self, what: str, values: npt.ArrayLike | None, block: FrameBlock) -> Float32Array | None:
+        if values is None:
+            return None
+        frames = np.ascontiguousarray(values, dtype=np.float32)
+        if frames.shape != block.positions_nm.shape:
+            raise InputError(f"{self.path}: {what} have shape {frames.shape}, positions {block.positions_nm.shape}.")
+        return frames
+
+    def _as_cells(self, values: npt.ArrayLike | None, block: FrameBlock) -> Float64Array | None:
+        if values is None:
+            return None
+        cells = np.asarray(values, dtype=np.float64)
+        if cells.shape != (len(block), 3, 3) or not (np.isfinite(cells).all() and (np.linalg.det(cells) > 0).all()):
+            raise InputError(
+                f"{self.path}: cells must be box vectors ({len(block)}, 3, 3) with a volume, not {cells.shape}."
+            )
+        return cells
 
     @abstractmethod
     def _append(self, block: FrameBlock) -> None: ...
@@ -139,15 +174,37 @@ class TrajectoryReader(ABC):
 
         Raises InputError for a stride below 1, TrajectoryError when the frames cannot be read.
         """
-        if stride < 1:
-            raise InputError(f"{self.path}: stride must be at least 1, not {stride}.")
-        first, last, step = slice(start, stop, stride).indices(self.n_frames)
+        first, last, step = self._span(start, stop, stride)
         if first >= last:
             return np.empty((0, self.n_atoms, 3), dtype=np.float32)
         return self._read(first, last, step)
 
+    def read_velocities(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array | None:
+        """Return velocities `(n, n_atoms, 3)` nm/ps, None when the file holds none. Frames and errors as in `read`."""
+        return self._read_extra("velocities", *self._span(start, stop, stride))
+
+    def read_forces(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array | None:
+        """Return forces `(n, n_atoms, 3)` kJ/mol/nm, None when the file holds none. Frames and errors as in `read`."""
+        return self._read_extra("forces", *self._span(start, stop, stride))
+
+    def read_cells(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float64Array | None:
+        """Return box vectors `(n, 3, 3)` nm, None when the file is not periodic. Frames and errors as in `read`."""
+        return self._read_cells(*self._span(start, stop, stride))
+
+    def _span(self, start: int, stop: int | None, stride: int) -> tuple[int, int, int]:
+        if stride < 1:
+            raise InputError(f"{self.path}: stride must be at least 1, not {stride}.")
+        first, last, step = slice(start, stop, stride).indices(self.n_frames)
+        return first, max(first, last), step
+
     @abstractmethod
     def _read(self, start: int, stop: int, stride: int) -> Float32Array: ...
+
+    def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
+        return None
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        return None
 
     def iter_blocks(self, n_frames_per_block: int = 4096) -> Iterator[Float32Array]:
         """Yield positions in consecutive blocks of at most `n_frames_per_block` frames."""
