@@ -10,6 +10,7 @@ from pathlib import Path
 
 from systems.element_data import element_symbol
 from systems.errors import InputError
+from systems.hybrid36 import decode
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
@@ -163,12 +164,19 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
         altloc=line[16].strip(),
         residue_name=residue_name or "UNL",
         chain=line[21].strip(),
-        residue_id=(line[22:27].strip() or "1").replace(" ", ""),
+        residue_id=_residue_id(line[22:26], line[26:27]),
         position_angstrom=(x, y, z),
         occupancy=occupancy,
         element=symbol,
         hetero=line.startswith("HETATM"),
     )
+
+
+def _residue_id(number: str, insertion: str) -> str:
+    """`181A`: the number, decimal where the file has it in hybrid-36, and the insertion code."""
+    text = number.strip() or "1"
+    value = decode(number, 4)
+    return (text if value is None or text.lstrip("-").isdigit() else str(value)) + insertion.strip()
 
 
 def _resolve_conect(found: StructureFile, lines: list[str], index_of: dict[str, int], repeated: set[str]) -> None:

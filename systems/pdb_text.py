@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from systems.errors import InputError
+from systems.hybrid36 import encode
 from systems.scene import Scene
 
 
@@ -20,6 +21,8 @@ def pdb_text(scene: Scene) -> str:
         x, y, z = scene.positions_nm[i] * 10.0
         resid = scene.residue_ids[res]
         number, insertion = (resid[:-1], resid[-1]) if resid and resid[-1].isalpha() else (resid, " ")
+        if number.lstrip("-").isdigit():
+            number = encode(int(number), 4) or number
         chain = (scene.chain_of_residue[res] or " ")[0]
         lines.append(
             f"ATOM  {i + 1:5d} {padded:<4s} {scene.residue_names[res][:3]:>3s} {chain}{number[-4:]:>4s}{insertion}   "

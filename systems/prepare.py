@@ -1,19 +1,22 @@
-"""A Scene from what the user names: a library system, a PDB or mmCIF file, or a peptide sequence."""
+"""A Scene from what the user names: a library system, a structure file, a SMILES string or a peptide sequence."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from systems.bonding import Bonding, Residue, find_bonds
-from systems.errors import InputError, PreparationError, SurromdError
+from systems.errors import InputError, PreparationError
+from systems.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
+from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_waters
+from systems.modified_residues import describe_residue, standardise
 from systems.mol_file import SUFFIXES, suffix_of
 from systems.pdb_records import AtomRecord, read_structure
-from systems.residues import is_water
 from systems.scene import Scene
 from systems.structure import scene_from_records
 
@@ -22,18 +25,23 @@ _OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", "
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
-def prepare(spec: str, *, ph: float = 7.0) -> Scene:
-    """Return the scene that `spec` names: `alanine-dipeptide`, `molecule.pdb`, `sequence:ACE-ALA-NME`,
-    `molecule.sdf`, `smiles:CCO`.
+def prepare(
+    spec: str, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, drop_water: bool = False
+) -> Scene:
+    """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
+    `sequence:ACE-ALA-NME`.
 
     Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
-    line each, in `scene.provenance["repairs"]`. `ph` decides the protonation where hydrogens are missing.
+    line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
+    missing. Ligands and ions beside a peptide, and waters, are refused until one says what becomes of them.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
     from systems import library
 
     if not 0.0 <= ph <= 14.0:
         raise InputError(f"pH {ph:g} lies outside 0 to 14.")
+    if keep_ligand and drop_ligand:
+        raise InputError("--keep-ligand and --drop-ligand exclude each other; choose one.")
     text = str(spec).strip()
     kind, _, rest = text.partition(":")
     if kind.lower() == "sequence":
@@ -55,42 +63,60 @@ def prepare(spec: str, *, ph: float = 7.0) -> Scene:
     if suffix in _OTHER_SUFFIXES:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
-        return prepare_file(path, ph=ph)
+        return prepare_file(path, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
     return library.load(text)
 
 
-def prepare_file(path: Path, *, ph: float = 7.0) -> Scene:
+def prepare_file(
+    path: Path, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, drop_water: bool = False
+) -> Scene:
     """Return the scene of a PDB or mmCIF file; see `prepare`."""
     try:
-        return _prepare_file(path, ph)
+        return _prepare_file(path, ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
     except PreparationError as error:
         if str(path) in str(error):
             raise
         raise PreparationError(f"{path}: {error}") from error
-    except SurromdError:
-        raise
 
 
-def _prepare_file(path: Path, ph: float) -> Scene:
+def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool, drop_water: bool) -> Scene:
     found = read_structure(path)
     repairs = list(found.notes)
     kept = _choose_alternates(found.atoms, repairs)
-    kept = _without_water(found.atoms, kept, repairs)
-    atoms = [found.atoms[i] for i in kept]
-    new_index = {old: new for new, old in enumerate(kept)}
-    conect = [(new_index[i], new_index[j]) for i, j in found.conect if i in new_index and j in new_index]
-    bonding = find_bonds(atoms, conect)
+    kept = settle_waters(found.atoms, kept, drop_water, repairs)
+    part = standardise([found.atoms[i] for i in kept], repairs)
+    structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
+    bonding = find_bonds(structure.atoms, structure.conect)
+    ligands = ligand_atoms(structure.atoms, bonding)
+    if ligands:
+        stays = settle_ligands(structure.atoms, ligands, keep=keep_ligand, drop=drop_ligand, notes=repairs)
+        rest = structure.without(ligands)
+        if stays:
+            refuse_bare_ligands(structure.atoms, ligands)
+            others = structure.only(ligands)
+            others_bonding = find_bonds(others.atoms, others.conect)
+        structure, bonding = rest, find_bonds(rest.atoms, rest.conect)
     repairs += bonding.notes
-    _refuse_gaps(bonding, atoms, {new_index[i] for i in found.chain_ends if i in new_index})
-    bonds = bonding.bonds
+    _refuse_gaps(bonding, structure.atoms, structure.chain_ends)
+    repairs += _disulfides(bonding, structure.atoms)
+    atoms, bonds = list(structure.atoms), bonding.bonds
+    before = _handedness(bonding, atoms)
+    say_inverted(before, repairs)
     if not bonding.is_complete:
         _refuse_beyond_repair(bonding, atoms)
         from systems.repair import complete
 
         atoms, bonds, account = complete(atoms, bonding, ph=ph)
         repairs += account
+        after = heavy_of_records(atoms)
+        names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
+        compare(before, handedness((key, names[key], heavy) for key, heavy in after.items() if key in names))
     else:
         _refuse_bare_skeletons(bonding.residues, atoms)
+    if ligands and stays:
+        bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
+        atoms = [*atoms, *others.atoms]
+        repairs += others_bonding.notes
     scene = scene_from_records(
         atoms,
         bonds,
@@ -105,6 +131,47 @@ def _prepare_file(path: Path, ph: float) -> Scene:
     )
     _refuse_long_double_bonds(scene)
     return scene
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """Records with what the file says of their bonds (index pairs) and of chain ends (indices)."""
+
+    atoms: list[AtomRecord]
+    conect: list[tuple[int, int]]
+    chain_ends: set[int]
+
+    def only(self, chosen: Sequence[int]) -> _Structure:
+        return _Structure([self.atoms[i] for i in chosen], *_reindexed(self.conect, self.chain_ends, chosen))
+
+    def without(self, left_out: Sequence[int]) -> _Structure:
+        gone = set(left_out)
+        return self.only([i for i in range(len(self.atoms)) if i not in gone])
+
+
+def _reindexed(
+    conect: Sequence[tuple[int, int]], chain_ends: set[int], kept: Sequence[int]
+) -> tuple[list[tuple[int, int]], set[int]]:
+    new = {old: k for k, old in enumerate(kept)}
+    return [(new[i], new[j]) for i, j in conect if i in new and j in new], {new[i] for i in chain_ends if i in new}
+
+
+def _handedness(bonding: Bonding, atoms: Sequence[AtomRecord]) -> Handedness:
+    return handedness(
+        (r.key, r.template.name, {a: atoms[i] for a, i in r.heavy.items()})
+        for r in bonding.residues
+        if r.template is not None
+    )
+
+
+def _disulfides(bonding: Bonding, atoms: Sequence[AtomRecord]) -> list[str]:
+    sulfur = {r.heavy["SG"]: r for r in bonding.residues if "SG" in r.heavy}
+    return [
+        f"disulfide bond {sulfur[i].label} - {sulfur[j].label} "
+        f"({np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom)):.2f} Å)"
+        for i, j in bonding.bonds.tolist()
+        if i in sulfur and j in sulfur
+    ]
 
 
 def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[int]:
@@ -124,15 +191,6 @@ def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[
             f"{len(atoms) - len(kept)} atoms left out"
         )
     return kept
-
-
-def _without_water(atoms: Sequence[AtomRecord], kept: list[int], repairs: list[str]) -> list[int]:
-    dry = [i for i in kept if not is_water(atoms[i].residue_name)]
-    if not dry or len(dry) == len(kept):
-        return kept
-    n = len({atoms[i].residue_key for i in kept} - {atoms[i].residue_key for i in dry})
-    repairs.append(f"{n} water molecules left out")
-    return dry
 
 
 def _refuse_gaps(bonding: Bonding, atoms: Sequence[AtomRecord], chain_ends: set[int]) -> None:
@@ -156,12 +214,11 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
         if all(atoms[i].element == "H" for i in residue.atoms):
             raise PreparationError(f"{residue.label} has only hydrogens; give its other atoms, or number it correctly.")
         if residue.template is None or not residue.heavy:
-            if len(residue.atoms) == 1 and atoms[residue.atoms[0]].element != "C":
-                continue
             short = next(r for r in bonding.residues if r.missing or r.lacks_hydrogens)
             raise PreparationError(
-                f"{short.label} lacks atoms that cannot be added beside {residue.label}, which is no standard residue; "
-                "give the structure with all atoms and hydrogens."
+                f"{short.label} lacks atoms that cannot be added beside {residue.label}"
+                f"{describe_residue(residue.key[2])}, which is no standard residue; give the structure with all atoms "
+                "and hydrogens."
             )
         essential = [a for a in ("N", "CA", "C") if a in residue.template.heavy and a in residue.missing]
         if essential:

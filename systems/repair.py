@@ -14,9 +14,20 @@ import numpy.typing as npt
 
 from systems.bonding import Bonding, Residue
 from systems.errors import PreparationError
+from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
+from systems.residues import template_for
 from systems.structure import atom_label
 
+# Hydrogens (in OpenMM's names) whose presence tells the protonation state.
+_TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}
+_STATES = {
+    ("ASP", (False,)): "ASP charged", ("ASP", (True,)): "ASP neutral (ASH)", ("GLU", (False,)): "GLU charged",
+    ("GLU", (True,)): "GLU neutral (GLH)", ("LYS", (True, True, True)): "LYS charged",
+    ("LYS", (False, True, True)): "LYS neutral (LYN)", ("LYS", (True, True, False)): "LYS neutral (LYN)",
+    ("HIS", (True, True)): "HIS charged (HIP)", ("HIS", (True, False)): "HIS neutral (HID)",
+    ("HIS", (False, True)): "HIS neutral (HIE)", ("CYS", (True,)): "CYS neutral",
+}  # fmt: skip
 _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 
 
@@ -53,7 +64,34 @@ def complete(
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
     _refuse_lost_bonds(records, bonds, atoms, bonding)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
-    return records, bonds, _account(residues, records)
+    account = _account(residues, records)
+    account += protonation_account([r.label for r in residues], [r.key for r in residues], variants, records, ph)
+    if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
+        account.append("atoms stand in the standard order under their standard names")
+    return records, bonds, account
+
+
+def protonation_account(
+    labels: Sequence[str],
+    keys: Sequence[tuple[str, str, str]],
+    given: Sequence[str | None],
+    records: Sequence[AtomRecord],
+    ph: float,
+) -> list[str]:
+    """One line for each kind of protonation that `ph` decided, that is where `given` holds no variant."""
+    hydrogens: dict[tuple[str, str, str], set[str]] = {}
+    for atom in records:
+        if atom.element == "H":
+            hydrogens.setdefault(atom.residue_key, set()).add(atom.name)
+    states: dict[str, list[str]] = {}
+    for label, key, variant in zip(labels, keys, given, strict=True):
+        template = template_for(key[2])
+        if variant is None and template is not None and template.name in _TITRATED:
+            marks = tuple(h in hydrogens.get(key, set()) for h in _TITRATED[template.name])
+            state = _STATES.get((template.name, marks))
+            if state:
+                states.setdefault(state, []).append(label)
+    return [f"protonation at pH {ph:g}: {state}: {listed(found)}" for state, found in sorted(states.items())]
 
 
 def records_from_openmm(
@@ -156,8 +194,24 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
                 head = f"ATOM  {len(lines) % 100000:5d} {padded:<4s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
                 x, y, z = atom.position_angstrom
                 lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {atom.element.upper():>2s}")
+            if "CB" in residue.missing:
+                x, y, z = _natural_cb(residue, atoms)
+                head = f"ATOM  {len(lines) % 100000:5d}  CB  {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
+                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           C")
         lines.append("TER")
     return "\n".join([*lines, "END", ""])
+
+
+def _natural_cb(residue: Residue, atoms: Sequence[AtomRecord]) -> list[float]:
+    """CB of an L residue in Å, from N, CA and C: PDBFixer superposes its template on N, CA, C and O, which are nearly
+    in one plane, and then and now comes out with a D residue.
+
+    The coefficients are those of ideal geometry (Dauparas et al., Science 378, 49, 2022, code of ProteinMPNN).
+    """
+    n, ca, c = (np.array(atoms[residue.heavy[a]].position_angstrom) for a in ("N", "CA", "C"))
+    b, d = ca - n, c - ca
+    position: list[float] = (-0.58273431 * np.cross(b, d) + 0.56802827 * b - 0.54067466 * d + ca).tolist()
+    return position
 
 
 def _refuse_lost_bonds(
@@ -223,6 +277,5 @@ def _account(residues: Sequence[Residue], records: Sequence[AtomRecord]) -> list
     if short:
         of_short = {r.key for r in residues if r.lacks_hydrogens}
         n = sum(a.element == "H" and a.residue_key in of_short for a in records)
-        which = ", ".join(short[:6]) + (f" and {len(short) - 6} more residues" if len(short) > 6 else "")
-        notes.append(f"hydrogens placed on {which}: {n}")
+        notes.append(f"hydrogens placed on {listed(short)}: {n}")
     return notes

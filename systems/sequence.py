@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy.typing as npt
 
 from systems.errors import PreparationError, nearest
 from systems.geometry import signed_volumes, superposition, torsion
+from systems.modified_residues import D_RESIDUES
 from systems.pdb_records import read_structure
-from systems.repair import fixed_random_numbers, records_from_openmm
+from systems.repair import fixed_random_numbers, protonation_account, records_from_openmm
 from systems.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.scene import Scene
 from systems.structure import scene_from_records
@@ -37,6 +39,7 @@ def parse_sequence(text: str) -> list[str]:
     if not word:
         raise PreparationError("The sequence is empty; write it like sequence:ACE-ALA-NME or sequence:SDFS.")
     names = [n.strip() for n in word.split("-")] if "-" in word or word in allowed else None
+    _refuse_d_residues(text, names)
     if names is None:
         unknown = sorted({c for c in word if c not in ONE_LETTER})
         if unknown:
@@ -63,6 +66,22 @@ def parse_sequence(text: str) -> list[str]:
     return names
 
 
+def _refuse_d_residues(text: str, names: list[str] | None) -> None:
+    """D-residues by name (DAL), by prefix (D-ALA) or as a lower-case letter among capitals (SdFS)."""
+    if names is None:
+        written = text.strip()
+        found = "" if written.isupper() or written.islower() else next(c for c in written if c.islower())
+    else:
+        known = {*ONE_LETTER.values(), *_PROTONATED}
+        found = next((f"D-{b}" for a, b in pairwise(names) if a == "D" and b in known), "")
+        found = found or next((n for n in names if n in D_RESIDUES), "")
+    if found:
+        raise PreparationError(
+            f"Sequence {text!r}: {found!r} is a D-residue; sequences are built of L-residues alone, give a PDB file or "
+            "a SMILES string."
+        )
+
+
 def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged.
 
@@ -80,11 +99,13 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     relaxed_nm = _relaxed(modeller)
     keys = [("A", str(k), name) for k, name in enumerate(names, start=1)]
     records, bonds = records_from_openmm(modeller.topology, relaxed_nm, keys)
+    labels = [f"{name} {number}" for _, number, name in keys]
+    account = protonation_account(labels, keys, variants, records, ph)
     scene = scene_from_records(
         records,
         bonds,
         name="-".join(names),
-        provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": []},
+        provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": account},
     )
     _verify(scene)
     return scene

@@ -247,7 +247,7 @@ def test_first_model_is_taken_and_water_left_out(tmp_path: Path) -> None:
     )
     path = tmp_path / "models.pdb"
     path.write_text(f"MODEL        1\n{body}{water}ENDMDL\nMODEL        2\n{body}ENDMDL\nEND\n")
-    scene = prepare(str(path))
+    scene = prepare(str(path), drop_water=True)
     assert scene.provenance["repairs"] == ["2 models in the file: the first is taken", "2 water molecules left out"]
     _assert_is_ala2(scene)
 

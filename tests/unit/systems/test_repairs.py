@@ -1,0 +1,230 @@
+"""The account of repairs: what stands beside the peptide, residues under other names, numbers, handedness."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from systems import library
+from systems.bonding import find_bonds
+from systems.errors import InputError, PreparationError
+from systems.handedness import compare, handedness, say_inverted
+from systems.heterogens import ligand_atoms
+from systems.hybrid36 import decode, encode
+from systems.modified_residues import standardise
+from systems.pdb_records import AtomRecord, read_structure
+from systems.pdb_text import pdb_text
+from systems.prepare import prepare
+from systems.repair import complete, protonation_account
+
+ALA2 = library.load("alanine-dipeptide")
+WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
+METHANE = (
+    "HETATM  910  C1  LIG A 201      30.000  20.000  20.000  1.00  0.00           C\n"
+    "HETATM  911  H1  LIG A 201      30.629  20.629  20.629  1.00  0.00           H\n"
+    "HETATM  912  H2  LIG A 201      29.371  19.371  20.629  1.00  0.00           H\n"
+    "HETATM  913  H3  LIG A 201      29.371  20.629  19.371  1.00  0.00           H\n"
+    "HETATM  914  H4  LIG A 201      30.629  19.371  19.371  1.00  0.00           H\n"
+)
+CHLORIDE = "HETATM  920 CL    CL A 301      30.000  30.000  20.000  1.00  0.00          CL\n"
+
+
+def _peptide(drop: tuple[str, ...] = ()) -> str:
+    lines = [ln for ln in pdb_text(ALA2).splitlines() if ln.startswith("ATOM")]
+    return "\n".join(ln for ln in lines if ln[12:16].strip() not in drop) + "\n"
+
+
+def _write(path: Path, *parts: str) -> str:
+    path.write_text("".join(parts) + "END\n")
+    return str(path)
+
+
+def _record(name: str, residue: str, number: str, x: float, y: float, z: float, element: str) -> AtomRecord:
+    return AtomRecord("1", name, "", residue, "A", number, (x, y, z), 1.0, element, False)
+
+
+def test_what_stands_beside_the_peptide_is_refused_kept_or_dropped_as_told(tmp_path: Path) -> None:
+    path = _write(tmp_path / "x.pdb", _peptide(), METHANE, CHLORIDE, WATER)
+    with pytest.raises(PreparationError, match=r"1 water molecule; add --drop-water"):
+        prepare(path)
+    with pytest.raises(PreparationError, match=r"LIG A201, CL A301; add --keep-ligand .* or --drop-ligand") as caught:
+        prepare(path, drop_water=True)
+    assert "\n" not in str(caught.value) and "x.pdb" in str(caught.value)
+    with pytest.raises(InputError, match="exclude each other"):
+        prepare(path, keep_ligand=True, drop_ligand=True)
+    bare = prepare(path, drop_water=True, drop_ligand=True)
+    assert bare.provenance["repairs"] == [
+        "1 water molecule left out",
+        "left out, as asked (--drop-ligand): LIG A201, CL A301",
+    ]
+    assert bare.molecule_key == ALA2.molecule_key
+    kept = prepare(path, drop_water=True, keep_ligand=True)
+    assert "kept beside the peptide: LIG A201, CL A301" in kept.provenance["repairs"]
+    assert kept.residue_names == ("ACE", "ALA", "NME", "LIG", "CL")
+    assert kept.positions_nm[:22] == pytest.approx(bare.positions_nm)
+    assert int(kept.formal_charges.sum()) == -1
+    kept.to_openmm_topology()
+
+
+def test_a_kept_ligand_stays_while_the_peptide_is_completed(tmp_path: Path) -> None:
+    methyl = ("HB1", "HB2", "HB3")
+    scene = prepare(_write(tmp_path / "x.pdb", METHANE, _peptide(drop=methyl)), keep_ligand=True)
+    assert scene.formula == "C7H16N2O2"
+    ligand = [i for i, r in enumerate(scene.residue_of_atom) if scene.residue_names[r] == "LIG"]
+    assert scene.positions_nm[ligand[0]] == pytest.approx([3.0, 2.0, 2.0])
+    assert scene.bonds[np.isin(scene.bonds, ligand).any(axis=1)].tolist() == [[22, k] for k in (23, 24, 25, 26)]
+    bare = METHANE.splitlines(keepends=True)[0]
+    with pytest.raises(PreparationError, match=r"LIG A201 has no hydrogens.*--drop-ligand"):
+        prepare(_write(tmp_path / "y.pdb", _peptide(), bare), keep_ligand=True)
+
+
+def test_a_file_without_peptide_is_the_molecule_itself(tmp_path: Path) -> None:
+    assert prepare(_write(tmp_path / "x.pdb", METHANE)).formula == "CH4"
+
+
+def test_bonded_foreign_residues_are_no_ligands() -> None:
+    atoms = [
+        _record("N", "GLY", "1", 0.0, 0.0, 0.0, "N"), _record("CA", "GLY", "1", 1.46, 0.0, 0.0, "C"),
+        _record("C1", "XXX", "2", -0.7, 1.2, 0.0, "C"), _record("O1", "YYY", "3", 9.0, 0.0, 0.0, "O"),
+    ]  # fmt: skip
+    assert ligand_atoms(atoms, find_bonds(atoms, [])) == [3]
+
+
+def test_selenomethionine_becomes_methionine_and_is_said() -> None:
+    atoms = [_record("SE", "MSE", "7", 0, 0, 0, "Se"), _record("CE", "MSE", "7", 1.9, 0, 0, "C")]
+    notes: list[str] = []
+    out = standardise([replace(a, hetero=True) for a in atoms], notes)
+    assert [(a.name, a.element, a.residue_name, a.hetero) for a in out] == [
+        ("SD", "S", "MET", False),
+        ("CE", "C", "MET", False),
+    ]
+    assert notes == ["selenomethionine made methionine (SE to SD): A7"]
+
+
+def test_caps_that_charmm_writes_into_their_neighbours_are_set_apart(tmp_path: Path) -> None:
+    names = "HY1 CAY HY2 HY3 CY OY N HN CA HA CB HB1 HB2 HB3 C O NT HNT CAT HT1 HT2 HT3".split()  # noqa: SIM905
+    lines = []
+    for line, name in zip(_peptide().splitlines(), names, strict=True):
+        padded = name if len(name) == 4 else f" {name:<3s}"
+        lines.append(f"{line[:12]}{padded} ALA A   1 {line[27:]}\n")
+    scene = prepare(_write(tmp_path / "x.pdb", *lines))
+    assert scene.residue_names == ("ACE", "ALA", "NME")
+    assert scene.molecule_key == ALA2.molecule_key
+    assert scene.provenance["repairs"] == [
+        "ALA A1: CAY CY OY set apart as the cap ACE",
+        "ALA A1: NT CAT set apart as the cap NME",
+    ]
+
+
+def test_a_missing_cb_is_built_l_whatever_psi(shared_data: Path) -> None:
+    scene = prepare(str(shared_data / "hard-pdb" / "capping" / "nma.pdb"))  # PDBFixer alone makes this D-alanine
+    index = {n: i for i, n in enumerate(scene.atom_names[:11])}
+    heavy = {a: _record(a, "ALA", "1", *(scene.positions_nm[index[a]] * 10), a[0]) for a in ("N", "CA", "C", "CB")}
+    assert handedness([(("A", "1", "ALA"), "ALA", heavy)]) == {(("A", "1", "ALA"), "CA"): 1}
+
+
+def test_inverted_centres_are_seen_said_and_refused() -> None:
+    index = {n: i for i, n in enumerate(ALA2.atom_names) if ALA2.residue_of_atom[i] == 1}
+    key = ("", "2", "ALA")
+
+    def at(mirror: float) -> dict[str, AtomRecord]:
+        x = ALA2.positions_nm * [1, 1, mirror] * 10
+        return {a: _record(a, "ALA", "2", *x[index[a]], a[0]) for a in ("N", "CA", "C", "CB")}
+
+    natural, inverted = (handedness([(key, "ALA", at(m))]) for m in (1.0, -1.0))
+    assert (natural, inverted) == ({(key, "CA"): 1}, {(key, "CA"): -1})
+    notes: list[str] = []
+    say_inverted(inverted, notes)
+    assert notes == ["D-residues, as the file has them: ALA 2"]
+    compare(natural, natural)
+    compare(inverted, inverted)
+    for before, after in ((natural, inverted), (inverted, natural), ({}, inverted)):
+        with pytest.raises(PreparationError, match="CA came out inverted"):
+            compare(before, after)
+
+
+def test_protonation_is_chosen_by_ph_and_said(tmp_path: Path) -> None:
+    scene = prepare("sequence:ACE-ASP-HIS-NME", ph=2.0)
+    assert scene.provenance["repairs"] == [
+        "protonation at pH 2: ASP neutral (ASH): ASP 2",
+        "protonation at pH 2: HIS charged (HIP): HIS 3",
+    ]
+    heavy = [i for i, e in enumerate(scene.elements) if e != "H"]
+    text = "".join(pdb_text(scene).splitlines(keepends=True)[1 + i] for i in heavy)
+    at_seven = prepare(_write(tmp_path / "x.pdb", text)).provenance["repairs"]
+    assert "protonation at pH 7: ASP charged: ASP A2" in at_seven
+    assert protonation_account(["ASP 2"], [("A", "2", "ASP")], ["ASH"], [], 7.0) == []
+
+
+def test_disulfides_are_said(tmp_path: Path) -> None:
+    single = prepare("sequence:ACE-CYS-NME")
+    index = {n: i for i, n in enumerate(single.atom_names)}
+    sulfur, hydrogen = single.positions_nm[index["SG"]], single.positions_nm[index["HG"]]
+    axis = (hydrogen - sulfur) / np.linalg.norm(hydrogen - sulfur)
+    keep = [i for i in range(single.n_atoms) if i != index["HG"]]
+    turned = 2 * (sulfur + 0.1025 * axis) - single.positions_nm  # inversion makes the second one D
+    lines = pdb_text(single).splitlines(keepends=True)[1 : single.n_atoms + 1]
+    second = []
+    for i in keep:
+        x, y, z = turned[i] * 10
+        second.append(f"{lines[i][:21]}B{lines[i][22:30]}{x:8.3f}{y:8.3f}{z:8.3f}{lines[i][54:]}")
+    scene = prepare(_write(tmp_path / "x.pdb", *(lines[i] for i in keep), *second))
+    assert scene.provenance["repairs"] == [
+        "disulfide bond CYS A2 - CYS B2 (2.05 Å)",
+        "D-residues, as the file has them: CYS B2",
+    ]
+
+
+def test_hybrid_36_numbers() -> None:
+    for number, width, text in (
+        (9999, 4, "9999"), (10000, 4, "A000"), (10035, 4, "A00Z"), (10036, 4, "A010"), (1223055, 4, "ZZZZ"),
+        (1223056, 4, "a000"), (99999, 5, "99999"), (100000, 5, "A0000"), (43770016, 5, "a0000"), (-999, 4, "-999"),
+    ):  # fmt: skip
+        assert decode(text, width) == number
+        assert encode(number, width) == text
+    assert decode("A0", 4) is None and decode("a0B0", 4) is None and decode("****", 4) is None
+    assert encode(10**9, 4) is None and encode(-1000, 4) is None
+
+
+def test_insertion_codes_and_hybrid_36_survive_the_way_through(tmp_path: Path) -> None:
+    serials = ["99999", *(f"A000{digit}" for digit in "0123456789A"), *map(str, range(2, 12))]
+    renamed = {"A   1 ": "AA000 ", "A   2 ": "AA001B", "A   3 ": "AA002 "}
+    lines = []
+    for serial, line in zip(serials, _peptide().splitlines(), strict=True):
+        number = line[21:27].replace(line[21], "A", 1)
+        lines.append(f"ATOM  {serial:>5}{line[11:21]}{renamed[number]}{line[27:]}\n")
+    lines.append(f"CONECT{serials[0]:>5}{serials[1]:>5}\n")
+    scene = prepare(_write(tmp_path / "x.pdb", *lines))
+    assert scene.residue_ids == ("10000", "10001B", "10002")
+    assert scene.provenance["repairs"] == []
+    scene.write_pdb(tmp_path / "again.pdb")
+    assert " A   A000 " not in (tmp_path / "again.pdb").read_text()
+    assert [a.residue_id for a in read_structure(tmp_path / "again.pdb").atoms][:22:10] == ["10000", "10001B", "10002"]
+    assert prepare(str(tmp_path / "again.pdb")).topology_hash == scene.topology_hash
+
+
+def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Negative control of the check around `complete`: a repair that mirrors what it returns is refused."""
+    import systems.repair
+
+    def mirrored(atoms, bonding, *, ph):
+        records, bonds, account = complete(atoms, bonding, ph=ph)
+        flip = [replace(a, position_angstrom=(*a.position_angstrom[:2], -a.position_angstrom[2])) for a in records]
+        return flip, bonds, account
+
+    path = _write(tmp_path / "x.pdb", _peptide(drop=("HB1", "HB2", "HB3")))
+    prepare(path)
+    monkeypatch.setattr(systems.repair, "complete", mirrored)
+    with pytest.raises(PreparationError, match=r"ALA A?2: CA came out inverted"):
+        prepare(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"), [("SdFS", "'d'"), ("ACE-D-ALA-NME", "'D-ALA'"), ("ACE-DAL-NME", "'DAL'")], ids=str
+)
+def test_d_residues_in_sequences_are_refused_with_the_reason(text: str, named: str) -> None:
+    with pytest.raises(PreparationError, match=rf"{named} is a D-residue; sequences are built of L-residues alone"):
+        prepare(f"sequence:{text}")
