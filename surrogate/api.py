@@ -1,8 +1,8 @@
 """The verbs, as plain functions: each does what the command of the same name does, and returns what it printed.
 
 Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton. A `scene` is a `systems.scene.Scene`, or what
-the command line takes: a library name, a path, or `sequence:ACE-ALA-NME`. Everything a user can get wrong raises a
-`systems.errors.SurromdError` whose message is one line.
+the command line takes: a library name, a path, `smiles:CCO` or `sequence:ACE-ALA-NME`. Everything a user can get wrong
+raises a `systems.errors.SurromdError` whose message is one line.
 """
 
 from __future__ import annotations
@@ -62,13 +62,15 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
     return record
 
 
-def _prepare(scene: str | Scene, *, quiet: bool) -> Scene:
+def _prepare(
+    scene: str | Scene, *, ph: float, keep_ligand: bool, drop_ligand: bool, drop_water: bool, quiet: bool
+) -> Scene:
     """Return a Scene for what a user may write; what had to be repaired is said on stderr."""
     if not isinstance(scene, str):
         return scene
     from systems.prepare import prepare
 
-    prepared = prepare(scene)
+    prepared = prepare(scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
     for line in [] if quiet else prepared.provenance.get("repairs", []):
         sys.stderr.write(f"{scene}: {line}\n")
     return prepared
@@ -86,18 +88,23 @@ def plan(
     ensemble: str = "nvt",
     replicas: int = 1,
     platform: str = "auto",
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    drop_water: bool = False,
     time_ps: float | None = None,
 ) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
-    Steps are timed for about a second; with `time_ps` the wall time of a run of that length is estimated. Raises what
-    `reference` raises for settings that cannot be.
+    `ph`, `keep_ligand`, `drop_ligand`, `drop_water`: see `systems.prepare.prepare`. Steps are timed for about a second;
+    with `time_ps` the wall time of a run of that length is estimated. Raises what `reference` raises for settings that
+    cannot be.
     """
     from md_reference.plan import make_plan
 
     _check_ensemble(ensemble)
     return make_plan(
-        _prepare(scene, quiet=False),
+        _prepare(scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=False),
         _force(force_field, solvent, hydrogen_mass_da),
         temperature_k=temperature_k,
         friction_per_ps=friction_per_ps,
@@ -123,6 +130,10 @@ def reference(
     ensemble: str = "nvt",
     replicas: int = 1,
     platform: str = "auto",
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    drop_water: bool = False,
     seed: int = 0,
     resume: bool = False,
     overwrite: bool = False,
@@ -131,7 +142,8 @@ def reference(
     """Simulate a scene with OpenMM (Langevin middle integrator) and return the trajectories written.
 
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
-    `seed + 1`, ... `hydrogen_mass_da=None` keeps natural masses. `resume` goes on from the checkpoint beside `out`.
+    `seed + 1`, ... `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
+    `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.replicas import replica_paths, simulate_replicas
@@ -151,7 +163,9 @@ def reference(
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything is prepared
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
-    molecule = _prepare(scene, quiet=quiet)
+    molecule = _prepare(
+        scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=quiet
+    )
     label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
     with (
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
@@ -179,6 +193,10 @@ def rollout(
     time_ps: float,
     save_every_ps: float | None = None,
     replicas: int = 1,
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    drop_water: bool = False,
     seed: int = 0,
     solver_steps: int | None = None,
     precision: str = "auto",
@@ -199,7 +217,9 @@ def rollout(
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
     file = weights_path(weights)
-    molecule = _prepare(scene, quiet=quiet)
+    molecule = _prepare(
+        scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=quiet
+    )
 
     from surrogate.data.weights import load_weights
     from surrogate.sampling.rollout import RolloutConfig

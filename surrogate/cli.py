@@ -11,12 +11,16 @@ import typer
 from typer.core import TyperGroup
 
 from surrogate.cli_options import (
+    DropLigandOpt,
+    DropWaterOpt,
     EnsembleOpt,
     ForceFieldOpt,
     FrictionOpt,
     HydrogenMassOpt,
     JsonOpt,
+    KeepLigandOpt,
     OverwriteOpt,
+    PhOpt,
     PlatformOpt,
     Precision,
     QuietOpt,
@@ -91,7 +95,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Reference MD with OpenMM, learned surrogate rollouts, and a judge that compares the two.",
-    epilog="SCENE: library name, path (.pdb, .cif) or sequence:ACE-ALA-NME. Durations carry units: 50ns, 10ps, 2fs.",
+    epilog="SCENE: library name, path (.pdb, .cif, .sdf, .mol, .mol2), smiles:CCO or sequence:ACE-ALA-NME. "
+    "Durations carry units: 50ns, 10ps, 2fs.",
 )
 
 
@@ -141,6 +146,10 @@ def plan(
     ensemble: EnsembleOpt = "nvt",
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
+    ph: PhOpt = 7.0,
+    keep_ligand: KeepLigandOpt = False,
+    drop_ligand: DropLigandOpt = False,
+    drop_water: DropWaterOpt = False,
     as_json: JsonOpt = False,
 ) -> None:
     """What a reference run of SCENE will do, what it skips, why, and what that saves."""
@@ -157,6 +166,10 @@ def plan(
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
+        ph=ph,
+        keep_ligand=keep_ligand,
+        drop_ligand=drop_ligand,
+        drop_water=drop_water,
         time_ps=None if time is None else parse_time_ps(time, "--time"),
     )
     if as_json:
@@ -180,6 +193,10 @@ def reference(
     ensemble: EnsembleOpt = "nvt",
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
+    ph: PhOpt = 7.0,
+    keep_ligand: KeepLigandOpt = False,
+    drop_ligand: DropLigandOpt = False,
+    drop_water: DropWaterOpt = False,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -203,6 +220,10 @@ def reference(
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
+        ph=ph,
+        keep_ligand=keep_ligand,
+        drop_ligand=drop_ligand,
+        drop_water=drop_water,
         seed=seed,
         resume=resume,
         overwrite=overwrite,
@@ -273,6 +294,10 @@ def rollout(
     replicas: ReplicasOpt = 1,
     solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
     precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
+    ph: PhOpt = 7.0,
+    keep_ligand: KeepLigandOpt = False,
+    drop_ligand: DropLigandOpt = False,
+    drop_water: DropWaterOpt = False,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -289,6 +314,10 @@ def rollout(
         time_ps=parse_time_ps(time, "--time"),
         save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
         replicas=replicas,
+        ph=ph,
+        keep_ligand=keep_ligand,
+        drop_ligand=drop_ligand,
+        drop_water=drop_water,
         seed=seed,
         solver_steps=solver_steps,
         precision=precision.value,

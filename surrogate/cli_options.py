@@ -16,7 +16,13 @@ class Precision(StrEnum):
     bf16 = "bf16"
 
 
-SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Library name, path or sequence:ACE-ALA-NME.")]
+SceneArg = Annotated[
+    str, typer.Argument(metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.")
+]
+PhOpt = Annotated[float, typer.Option("--ph", min=0.0, max=14.0, help="Where a peptide's hydrogens are added.")]
+KeepLigandOpt = Annotated[bool, typer.Option("--keep-ligand", help="Simulate ligands and ions beside a peptide, too.")]
+DropLigandOpt = Annotated[bool, typer.Option("--drop-ligand", help="Leave ligands and ions beside a peptide out.")]
+DropWaterOpt = Annotated[bool, typer.Option("--drop-water", help="Leave the file's waters out.")]
 ForceFieldOpt = Annotated[str, typer.Option("--force-field", help="ff14SB or ff99SB-ILDN.")]
 SolventOpt = Annotated[str, typer.Option("--solvent", help="obc2, vacuum or amber99-obc.")]
 TemperatureOpt = Annotated[str, typer.Option("--temperature", help="Of the bath.")]

@@ -1,0 +1,51 @@
+"""Options of the command line that say how a SCENE is prepared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from surrogate.cli import app
+from systems import library
+from systems.pdb_text import pdb_text
+
+RUNNER = CliRunner()
+WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
+CHLORIDE = "HETATM  920 CL    CL A 301      30.000  30.000  20.000  1.00  0.00          CL\n"
+
+
+@pytest.fixture
+def wet(tmp_path: Path) -> str:
+    text = pdb_text(library.load("alanine-dipeptide"))
+    atoms = [line for line in text.splitlines(keepends=True) if line.startswith("ATOM")]
+    path = tmp_path / "wet.pdb"
+    path.write_text("".join(atoms) + CHLORIDE + WATER + "END\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("verb", ["plan", "reference", "rollout"])
+def test_water_and_ligands_wait_for_a_word_in_every_verb(tmp_path: Path, wet: str, verb: str) -> None:
+    extra = {
+        "plan": [],
+        "reference": ["--time", "1ps", "-o", str(tmp_path / "x.h5")],
+        "rollout": ["--weights", "alanine-dipeptide", "--time", "1ns", "-o", str(tmp_path / "x.h5")],
+    }[verb]
+    refused = RUNNER.invoke(app, [verb, wet, *extra])
+    assert refused.exit_code == 1
+    assert "add --drop-water" in refused.stderr and refused.stderr.count("\n") == 1
+    refused = RUNNER.invoke(app, [verb, wet, *extra, "--drop-water"])
+    assert refused.exit_code == 1
+    assert "--keep-ligand" in refused.stderr and "--drop-ligand" in refused.stderr
+    refused = RUNNER.invoke(app, [verb, wet, *extra, "--keep-ligand", "--drop-ligand"])
+    assert "exclude each other" in refused.stderr
+    assert RUNNER.invoke(app, [verb, wet, *extra, "--ph", "15"]).exit_code == 2
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_what_was_left_out_is_said_once_a_line(tmp_path: Path, wet: str) -> None:
+    done = RUNNER.invoke(app, ["plan", wet, "--drop-water", "--drop-ligand", "--json"])
+    assert done.exit_code == 0
+    assert f"{wet}: 1 water molecule left out\n" in done.stderr
+    assert f"{wet}: left out, as asked (--drop-ligand): CL A301\n" in done.stderr
