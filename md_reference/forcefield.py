@@ -1,19 +1,23 @@
-"""Scene -> openmm.System: protein force fields, implicit water or none, constraints and hydrogen masses."""
+"""Scene -> openmm.System: which force field and solvent, what goes together, and who builds it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from systems.errors import InputError, PreparationError, UnknownNameError, nearest
-from systems.scene import Scene
+import numpy as np
 
-# OpenMM's own file names, in order of preference.
-FORCE_FIELD_FILES = {
-    "ff14SB": "amber14/protein.ff14SB.xml",
-    "ff99SB-ILDN": "amber99sbildn.xml",
-}
-SOLVENTS = ("obc2", "vacuum", "amber99-obc")
+from systems.errors import PreparationError, UnknownNameError, nearest
+from systems.scene import IntArray, Scene
+
+PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
+QUANTUM = "gfn2-xtb"
+MODEL = "model"
+_WITH_LIGANDS = tuple(f"{name}+gaff2" for name in PROTEIN_FORCE_FIELDS if name != "charmm36")
+FORCE_FIELDS = (*PROTEIN_FORCE_FIELDS, "gaff2", *_WITH_LIGANDS, QUANTUM, MODEL, "auto")
+IMPLICIT_SOLVENTS = ("obc2", "gbn2", "amber99-obc")
+EXPLICIT_SOLVENTS = ("tip3p", "opc")
+SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
 
 
 @dataclass(frozen=True)
@@ -21,8 +25,13 @@ class ForceFieldSpec:
     """What the forces are. `hydrogen_mass_da=None` leaves natural masses; bonds to hydrogen are always constrained
     when `constrain_hydrogens` (needed above 1 fs).
 
-    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi radii as in OpenMM's implicit/obc2.xml), 'amber99-obc' (the
-    radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), or 'vacuum'.
+    `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
+    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite, no constraints); 'model' for scenes with
+    `interactions`; 'auto', which `resolve` settles for a scene.
+
+    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
+    2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
+    for scenes with a periodic cell: `solvation.solvate`), 'vacuum', or 'auto'.
     """
 
     force_field: str = "ff14SB"
@@ -31,11 +40,10 @@ class ForceFieldSpec:
     constrain_hydrogens: bool = True
 
     def __post_init__(self) -> None:
-        if self.force_field not in FORCE_FIELD_FILES:
-            known = list(FORCE_FIELD_FILES)
+        if self.force_field not in FORCE_FIELDS:
             raise UnknownNameError(
-                f"unknown force field {self.force_field!r}; known: {', '.join(known)}."
-                + nearest(self.force_field, known)
+                f"unknown force field {self.force_field!r}; known: {', '.join(FORCE_FIELDS)}."
+                + nearest(self.force_field, list(FORCE_FIELDS))
             )
         if self.solvent not in SOLVENTS:
             raise UnknownNameError(
@@ -44,90 +52,191 @@ class ForceFieldSpec:
             )
         if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
             raise PreparationError("solvent 'amber99-obc' goes with --force-field ff99SB-ILDN; use obc2 otherwise.")
+        if self.force_field in (QUANTUM, MODEL) and self.solvent not in ("vacuum", "auto"):
+            raise PreparationError(f"{self.force_field} has no solvent; leave --solvent out or give vacuum.")
+        if self.force_field == "charmm36" and self.solvent == "opc":
+            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use --solvent tip3p.")
+
+    @property
+    def is_explicit(self) -> bool:
+        """Whether the solvent is made of molecules, in a periodic cell."""
+        return self.solvent in EXPLICIT_SOLVENTS
+
+    @property
+    def is_born(self) -> bool:
+        """Whether there is a generalised Born term."""
+        return self.solvent in IMPLICIT_SOLVENTS
+
+    @property
+    def protein(self) -> str:
+        """The force field of peptides, water and ions."""
+        name = self.force_field.removesuffix("+gaff2")
+        return name if name in PROTEIN_FORCE_FIELDS else "ff14SB"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is known to go badly together, one line each."""
+        found = []
+        name = self.protein
+        if self.is_born and name == "ff19SB":
+            found.append(f"ff19SB is tuned for OPC water; with {self.solvent} helices and turns are off. Use ff14SB.")
+        if self.is_born and name == "charmm36":
+            found.append(f"charmm36 was not made for {self.solvent}, whose radii are Amber's. Use ff14SB, or tip3p.")
+        if self.solvent == "tip3p" and name == "ff19SB":
+            found.append("ff19SB is tuned for OPC water; use --solvent opc.")
+        return tuple(found)
+
+
+def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
+    """Return the spec with 'auto' settled for this scene; this is what a record states.
+
+    Force field: ff14SB where it covers every residue, gaff2 where it covers no molecule but water and ions,
+    ff14SB+gaff2 where it covers some. Solvent: TIP3P where the scene has a cell, vacuum for gaff2 alone, else obc2.
+    Quantum and model scenes have natural masses and no constraints. Raises PreparationError for what contradicts.
+    """
+    name = spec.force_field
+    if (name == MODEL) != (scene.interactions is not None) and name != "auto":
+        if name == MODEL:
+            raise PreparationError(
+                f"scene {scene.name!r} has no law of its own; give a force field instead of 'model'."
+            )
+        raise PreparationError(f"scene {scene.name!r} brings its own law; leave --force-field out.")
+    if name == "auto":
+        name = MODEL if scene.interactions is not None else _choose(scene)
+    solvent = spec.solvent
+    if solvent == "auto":
+        if name in (QUANTUM, MODEL):
+            solvent = "vacuum"
+        elif scene.cell_nm is not None:
+            solvent = "tip3p"
+        else:
+            solvent = "vacuum" if name == "gaff2" else "obc2"
+    changes: dict[str, Any] = {"force_field": name, "solvent": solvent}
+    if name in (QUANTUM, MODEL):
+        changes |= {"hydrogen_mass_da": None, "constrain_hydrogens": False}
+    return replace(spec, **changes)
+
+
+def _choose(scene: Scene) -> str:
+    from md_reference.mixture import is_water, molecules_of, part_of
+    from md_reference.templates import uncovered_residue
+
+    rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene, m)]
+    known = [uncovered_residue(part_of(scene, m), "ff14SB") is None for m in rest]
+    if all(known):
+        return "ff14SB"
+    return "ff14SB+gaff2" if any(known) else "gaff2"
 
 
 def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
-    """Return the `openmm.System` of a scene: no cut-off, no periodic box, no centre-of-mass removal.
+    """Return the `openmm.System` of a scene: without a cell no cut-off, in one PME; no centre-of-mass removal.
 
-    With `native_gb` the OBC2 term is OpenMM's GBSAOBCForce; without it, the CustomGBForce of implicit/obc2.xml, which
-    gives the same energies (a test holds them together) and is several times slower on small scenes.
-    Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
-    tried (`regrouping`): the particles are in the scene's order either way.
-    Raises PreparationError when the force field has no parameters for a residue.
+    Particles are the scene's atoms in its order; virtual sites (OPC) come after them. With `native_gb` the OBC2 term is
+    OpenMM's GBSAOBCForce; without it, the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test
+    holds them together) and is several times slower on small scenes.
+    Raises PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the
+    scene's cell.
     """
-    from md_reference.regrouping import permuted, regroup
+    spec = resolve(scene, spec)
+    if spec.force_field == MODEL:
+        from md_reference.model_systems import build_model_system
 
-    try:
-        return _build(scene, spec, native_gb)
-    except PreparationError:
-        raise
-    except (_Unmatched, InputError):
-        regrouped, order = regroup(scene)
-    try:
-        return permuted(_build(regrouped, spec, native_gb), order)
-    except _Unmatched as error:
-        raise PreparationError(
-            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}; covered so far are "
-            "peptides of the standard amino acids with the caps ACE and NME, every hydrogen in place."
-        ) from error
+        return build_model_system(scene)
+    _check_cell(scene, spec)
+    if spec.force_field == QUANTUM:
+        from md_reference.quantum import build_quantum_system
 
+        return build_quantum_system(scene)
+    from md_reference.templates import build_templated
 
-class _Unmatched(Exception):
-    """No template of the force field has the bonds of this residue."""
-
-    def __init__(self, residue: str) -> None:
-        super().__init__(residue)
-        self.residue = residue
-
-
-def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
-    """Return the System of a scene whose residues the force field knows; raises _Unmatched for one it does not."""
-    from openmm import app, unit
-
-    topology = scene.to_openmm_topology()
-    files = [FORCE_FIELD_FILES[spec.force_field]]
-    if spec.solvent == "amber99-obc":
-        files.append("amber99_obc.xml")
-    elif spec.solvent == "obc2" and not native_gb:
-        files.append("implicit/obc2.xml")
-    force_field = app.ForceField(*files)
-    for residue in force_field.getUnmatchedResidues(topology):
-        raise _Unmatched(_describe(scene, residue.index))
-    try:
-        system = force_field.createSystem(
-            topology,
-            nonbondedMethod=app.NoCutoff,
-            constraints=app.HBonds if spec.constrain_hydrogens else None,
-            rigidWater=True,
-            removeCMMotion=False,
-            hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
-        )
-    except (ValueError, KeyError) as error:
-        reason = (str(error).splitlines() or ["no reason given"])[0]
-        raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
-    if spec.solvent == "obc2" and native_gb:
-        system.addForce(_native_obc2(topology, system))
+    if spec.force_field in PROTEIN_FORCE_FIELDS:
+        system = build_templated(scene, spec, native_gb=native_gb)
+    else:
+        system = _build_mixed(scene, spec, native_gb)
+    if scene.cell_nm is not None:
+        system.setDefaultPeriodicBoxVectors(*(row.tolist() for row in scene.cell_nm))
     return system
 
 
-def _describe(scene: Scene, residue: int) -> str:
-    """`residue UNL 1 (C9 H8 O4)`, for messages."""
-    symbols = [e for e, r in zip(scene.elements, scene.residue_of_atom, strict=True) if r == residue]
-    formula = " ".join(f"{e}{symbols.count(e) if symbols.count(e) > 1 else ''}" for e in sorted(set(symbols)))
-    return f"residue {scene.residue_names[residue]} {scene.residue_ids[residue]} ({formula})"
+def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
+    from md_reference.templates import cutoff_nm
+
+    if spec.is_explicit and scene.cell_nm is None:
+        raise PreparationError(
+            f"scene {scene.name!r} has no periodic cell for {spec.solvent} water; solvate it first (the command line "
+            "and `solvation.solvate` do)."
+        )
+    if not spec.is_explicit and scene.cell_nm is not None:
+        raise PreparationError(
+            f"scene {scene.name!r} has a periodic cell, which {spec.solvent} does not; give --solvent tip3p or opc."
+        )
+    if scene.cell_nm is not None:
+        far_nm, _ = cutoff_nm(spec.protein)
+        # Heights of a reduced cell are its diagonal.
+        smallest = float(np.diag(scene.cell_nm).min())
+        if smallest < 2 * far_nm:
+            raise PreparationError(
+                f"the cell of scene {scene.name!r} is {smallest:.2f} nm wide, less than twice the cut-off of "
+                f"{far_nm:g} nm; use a larger --padding."
+            )
 
 
-def _native_obc2(topology: Any, system: Any) -> Any:
-    """OBC2 as GBSAOBCForce: charges from the NonbondedForce, radii and scales from OpenMM's standard OBC2 table."""
-    from openmm import GBSAOBCForce, NonbondedForce
-    from openmm.app.internal.customgbforces import GBSAOBC2Force
+def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
+    """GAFF2 molecules, alone or beside peptides, water and ions."""
+    from md_reference import born
+    from md_reference.mixture import is_water, merge, molecules_of, part_of
+    from md_reference.templates import build_templated, uncovered_residue
+
+    templated: list[IntArray] = []
+    others: list[IntArray] = []
+    for atoms in molecules_of(scene):
+        known = len(atoms) == 1 or is_water(scene, atoms)
+        if not known and spec.force_field != "gaff2":
+            known = uncovered_residue(part_of(scene, atoms), spec.protein) is None
+        (templated if known else others).append(atoms)
+    parts = []
+    if templated:
+        atoms = np.sort(np.concatenate(templated))
+        dry = spec.solvent if spec.is_explicit else "vacuum"
+        parts.append(
+            (atoms, build_templated(part_of(scene, atoms), replace(spec, force_field=spec.protein, solvent=dry)))
+        )
+    for atoms in others:
+        parts.append((atoms, _build_molecule(part_of(scene, atoms), spec)))
+    system = merge(scene.n_atoms, parts)
+    if spec.is_explicit:
+        _use_pme(system, spec)
+    if spec.is_born:
+        topology = scene.to_openmm_topology()
+        if spec.solvent == "gbn2":
+            molecule_idx = np.sort(np.concatenate(others)) if others else np.empty(0, dtype=np.int64)
+            system.addForce(born.gbn2(scene, topology, system, molecule_idx=molecule_idx))
+        else:
+            system.addForce((born.native_obc2 if native_gb else born.custom_obc2)(topology, system))
+    return system
+
+
+def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
+    """Return the System of one GAFF2 molecule in vacuum."""
+    from openmm import app, unit
+
+    from md_reference.gaff import parameters
+    from md_reference.prmtop import load_openmm
+
+    return load_openmm(parameters(scene)).createSystem(
+        nonbondedMethod=app.NoCutoff,
+        constraints=app.HBonds if spec.constrain_hydrogens else None,
+        rigidWater=False,
+        removeCMMotion=False,
+        hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
+    )
+
+
+def _use_pme(system: Any, spec: ForceFieldSpec) -> None:
+    from openmm import NonbondedForce
+
+    from md_reference.templates import cutoff_nm
 
     nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
-    gb = GBSAOBCForce()
-    gb.setNonbondedMethod(GBSAOBCForce.NoCutoff)
-    gb.setSoluteDielectric(1.0)
-    gb.setSolventDielectric(78.5)
-    for index, (radius_nm, scale) in enumerate(GBSAOBC2Force.getStandardParameters(topology)):
-        charge, _, _ = nonbonded.getParticleParameters(index)
-        gb.addParticle(charge, radius_nm, scale)
-    return gb
+    nonbonded.setNonbondedMethod(NonbondedForce.PME)
+    nonbonded.setCutoffDistance(cutoff_nm(spec.protein)[0])

@@ -34,8 +34,9 @@ def parameters(scene: Scene, *, cached: bool = True) -> str:
 
     Shipped parameters are taken first, then those cached by `molecule_key` and program versions, and only then is
     AmberTools run on the scene's bonds, charge and positions (`cached=False`: at once, and nothing is kept). Stereo
-    plays no part in GAFF2, and positions are left alone. What rounding leaves of the total charge is spread evenly. Raises PreparationError with the reason for what GAFF2 or
-    AM1-BCC cannot describe, and where AmberTools is needed and absent.
+    plays no part in GAFF2, and positions are left alone. What rounding leaves of the total charge is spread evenly.
+    Raises PreparationError with the reason for what GAFF2 or AM1-BCC cannot describe, and where AmberTools is needed
+    and absent.
     """
     return entry(scene, cached=cached).ordered_as(scene)
 

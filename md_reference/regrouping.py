@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
+from md_reference.mixture import moved_site
 from systems.chemistry import backbone_torsions
 from systems.errors import PreparationError
 from systems.scene import Scene
@@ -75,17 +76,21 @@ def regroup(scene: Scene) -> tuple[Scene, IntArray]:
 def permuted(system: Any, order: IntArray) -> Any:
     """Return an `openmm.System` whose particle `order[k]` is particle k of `system`: same masses, forces, constraints.
 
-    Raises PreparationError for virtual sites and for a kind of force not known here, rather than guess its indices.
+    Particles beyond `order` (virtual sites, which come after all atoms) keep their places. Raises PreparationError for
+    a kind of force or of virtual site not known here, rather than guess its indices.
     """
     import openmm
 
     n = system.getNumParticles()
-    if any(system.isVirtualSite(k) for k in range(n)):
-        raise PreparationError("virtual sites cannot be reordered; give the structure with standard residues.")
-    to = [int(i) for i in order]
+    to = [*(int(i) for i in order), *range(len(order), n)]
     out = openmm.System()
-    for k in np.argsort(order):
+    for k in np.argsort(to):
         out.addParticle(system.getParticleMass(int(k)))
+    for k in range(n):
+        if system.isVirtualSite(k):
+            out.setVirtualSite(to[k], moved_site(system.getVirtualSite(k), to))
+    if system.usesPeriodicBoundaryConditions():
+        out.setDefaultPeriodicBoxVectors(*system.getDefaultPeriodicBoxVectors())
     for k in range(system.getNumConstraints()):
         i, j, length = system.getConstraintParameters(k)
         out.addConstraint(to[i], to[j], length)
@@ -123,7 +128,15 @@ def _permuted_force(force: Any, to: list[int]) -> Any:
     elif isinstance(force, openmm.GBSAOBCForce):
         for k in range(force.getNumParticles()):
             new.setParticleParameters(to[k], *force.getParticleParameters(k))
-    elif isinstance(force, openmm.CustomGBForce):
+    elif isinstance(force, openmm.CustomBondForce):
+        for k in range(force.getNumBonds()):
+            i, j, *rest = force.getBondParameters(k)
+            new.setBondParameters(k, to[i], to[j], *rest)
+    elif isinstance(force, openmm.CustomTorsionForce):
+        for k in range(force.getNumTorsions()):
+            a, b, c, d, *rest = force.getTorsionParameters(k)
+            new.setTorsionParameters(k, to[a], to[b], to[c], to[d], *rest)
+    elif isinstance(force, openmm.CustomGBForce | openmm.CustomNonbondedForce):
         for k in range(force.getNumParticles()):
             new.setParticleParameters(to[k], force.getParticleParameters(k))
         for k in range(force.getNumExclusions()):

@@ -1,0 +1,98 @@
+"""GFN2-xTB as an OpenMM force: energies and gradients of tblite, in MD's units.
+
+GFN2-xTB: Bannwarth, Ehlert and Grimme, J. Chem. Theory Comput. 15, 1652 (2019).
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from systems.errors import PreparationError
+from systems.scene import FloatArray, Scene
+
+# CODATA 2018.
+KJ_MOL_PER_HARTREE = 2625.4996394799
+NM_PER_BOHR = 0.0529177210903
+_HEAVIEST = 86
+# A force costs some hundred ms at 50 atoms and grows with the third power.
+LARGEST = 200
+
+
+def build_quantum_system(scene: Scene) -> Any:
+    """Return an `openmm.System` whose one force is GFN2-xTB: natural masses, no constraints, no cell.
+
+    Every force is an SCF from scratch, so that it depends on positions alone and a resumed run repeats an undisturbed
+    one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon and for scenes too
+    large.
+    """
+    import openmm
+
+    if not hasattr(openmm, "PythonForce"):
+        raise PreparationError(f"gfn2-xtb needs OpenMM's PythonForce, which {openmm.__version__} lacks; update OpenMM.")
+    if scene.n_atoms > LARGEST:
+        raise PreparationError(
+            f"scene {scene.name!r} has {scene.n_atoms} atoms; gfn2-xtb is offered up to {LARGEST}. Use a force field."
+        )
+    potential = Potential(scene)
+    potential(scene.positions_nm)  # what the method refuses is known before anything runs
+    system = openmm.System()
+    for mass_da in scene.masses_da.tolist():
+        system.addParticle(mass_da)
+
+    def compute(state: Any) -> tuple[float, FloatArray]:
+        return potential(np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64))
+
+    force = openmm.PythonForce(compute)
+    force.setName("GFN2-xTB")
+    system.addForce(force)
+    return system
+
+
+class Potential:
+    """GFN2-xTB of one molecule: positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm.
+
+    Charge from the scene's formal charges, unpaired electrons from `provenance["multiplicity"]` (where it says nothing,
+    the fewest possible). Raises PreparationError as `build_quantum_system`.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        from openmm.app import Element
+
+        # Read when its libraries load; molecules of this size only lose by more threads.
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        try:
+            from tblite.interface import Calculator
+        except ImportError as error:
+            raise PreparationError("gfn2-xtb needs tblite; install it: `pip install tblite`.") from error
+        numbers = np.array([Element.getBySymbol(e).atomic_number for e in scene.elements])
+        if numbers.max() > _HEAVIEST:
+            heavy = sorted({e for e, z in zip(scene.elements, numbers, strict=True) if z > _HEAVIEST})
+            raise PreparationError(f"GFN2-xTB has no parameters for {', '.join(heavy)} in scene {scene.name!r}.")
+        charge = int(scene.formal_charges.sum())
+        electrons = int(numbers.sum()) - charge
+        unpaired = int(scene.provenance.get("multiplicity", 1 + electrons % 2)) - 1
+        if unpaired % 2 != electrons % 2:
+            raise PreparationError(
+                f"scene {scene.name!r} has {electrons} electrons (charge {charge:+d}), which cannot leave {unpaired} "
+                "unpaired; check hydrogens, charges and multiplicity."
+            )
+        self._calculator: Any = Calculator(
+            "GFN2-xTB", numbers, scene.positions_nm / NM_PER_BOHR, charge=charge, uhf=unpaired
+        )
+        self._calculator.set("verbosity", 0)
+        self._name = scene.name
+
+    def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
+        self._calculator.update(positions=positions_nm / NM_PER_BOHR)
+        try:
+            result = self._calculator.singlepoint()
+        except (RuntimeError, ValueError) as error:
+            raise PreparationError(
+                f"GFN2-xTB finds no electronic ground state for scene {self._name!r} ({str(error).splitlines()[0]})."
+            ) from error
+        energy = float(result.get("energy")) * KJ_MOL_PER_HARTREE
+        gradient = np.asarray(result.get("gradient"), dtype=np.float64)
+        return energy, gradient * (-KJ_MOL_PER_HARTREE / NM_PER_BOHR)
