@@ -1,0 +1,188 @@
+"""The library: what it lists, that each entry is the molecule its name says, and scenes made from names on demand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from systems import library
+from systems.catalogue import ENTRIES, MD17_PROTOCOL
+from systems.chemistry import backbone_torsions, match_atoms
+from systems.errors import UnknownNameError
+from systems.geometry import signed_volumes, torsion
+from systems.prepare import prepare
+from systems.validity import check_frames, geometry_from_scene
+
+MD17 = {"aspirin": ("C9H8O4", 21), "benzene": ("C6H6", 12), "ethanol": ("C2H6O", 9), "malonaldehyde": ("C3H4O2", 9),
+        "naphthalene": ("C10H8", 18), "salicylic-acid": ("C7H6O3", 16), "toluene": ("C7H8", 15),
+        "uracil": ("C4H4N2O2", 12)}  # fmt: skip
+# Atoms and charge of ACE-X-NME: the residue's own atoms plus the 12 of the caps.
+AMINO_ACIDS = {
+    "ALA": (22, 0), "ARG": (36, 1), "ASN": (26, 0), "ASP": (24, -1), "CYS": (23, 0), "GLN": (29, 0), "GLU": (27, -1),
+    "GLY": (19, 0), "HID": (29, 0), "HIE": (29, 0), "HIP": (30, 1), "ILE": (31, 0), "LEU": (31, 0), "LYS": (34, 1),
+    "MET": (29, 0), "PHE": (32, 0), "PRO": (26, 0), "SER": (23, 0), "THR": (26, 0), "TRP": (36, 0), "TYR": (33, 0),
+    "VAL": (28, 0),
+}  # fmt: skip
+PEPTIDES = {"alanine-dipeptide": (22, 0), "ac-ala3-nhme": (42, 0), "chignolin": (138, -2), "cln025": (166, -2)}
+STRUCTURES = [name for name, entry in ENTRIES.items() if entry.smiles or entry.sequence]
+
+
+def test_the_groups_hold_every_name_once() -> None:
+    listed = [name for members in library.groups().values() for name in members]
+    assert sorted(listed) == library.names()
+    sizes = {group: len(members) for group, members in library.groups().items()}
+    assert sizes == {"peptides": 4, "capped amino acids": 22, "MD17 molecules": 8, "n-body systems": 3,
+                     "analytic systems": 2}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MD17)
+def test_molecules_are_what_their_smiles_says(name: str) -> None:
+    from rdkit import Chem
+    from rdkit.Chem.rdMolDescriptors import CalcMolFormula
+
+    from systems.molecule import scene_from_smiles, to_rdkit
+
+    scene = library.load(name)
+    formula, n_atoms = MD17[name]
+    smiles = ENTRIES[name].smiles
+    assert (scene.formula, scene.n_atoms) == (formula, n_atoms)
+    assert CalcMolFormula(Chem.AddHs(Chem.MolFromSmiles(smiles))) == formula
+    from_smiles = scene_from_smiles(smiles)
+    np.testing.assert_array_equal(match_atoms(scene, from_smiles), np.arange(n_atoms))
+    assert scene.molecule_key == from_smiles.molecule_key
+    back = Chem.MolToSmiles(Chem.RemoveHs(to_rdkit(scene)))
+    assert back == Chem.CanonSmiles(smiles)
+
+
+def test_malonaldehyde_is_the_dialdehyde_of_md17() -> None:
+    scene = library.load("malonaldehyde")
+    n_hydrogens = [
+        sum(scene.elements[i + j - k] == "H" for i, j in scene.bonds.tolist() if k in (i, j)) for k in range(3)
+    ]
+    assert scene.elements == ("C", "C", "C", "O", "O", "H", "H", "H", "H")
+    assert n_hydrogens == [1, 2, 1]
+    assert not any(scene.elements[i] == "O" and scene.elements[j] == "H" for i, j in scene.bonds.tolist())
+
+
+def test_ethanol_has_the_atom_order_of_the_published_data(shared_data) -> None:
+    path = shared_data / "md17-ethanol" / "md17_ethanol_first1600.npz"
+    if not path.exists():
+        pytest.skip("no MD17 ethanol")
+    data = np.load(path)
+    scene = library.load("ethanol")
+    symbols = {1: "H", 6: "C", 8: "O"}
+    assert scene.elements == tuple(symbols[int(z)] for z in data["z"])
+    frames = data["R"] / 10.0
+    assert not check_frames(frames, geometry_from_scene(scene)).any()
+    # Negative control: with two atoms exchanged the bonds no longer fit.
+    exchanged = frames[:, [0, 2, 1, *range(3, 9)]]
+    assert check_frames(exchanged, geometry_from_scene(scene)).all()
+
+
+@pytest.mark.parametrize("code", AMINO_ACIDS)
+def test_capped_amino_acids_have_their_atoms_charge_and_handedness(code: str) -> None:
+    scene = library.load(f"ACE-{code}-NME")
+    assert (scene.n_atoms, int(scene.formal_charges.sum())) == AMINO_ACIDS[code]
+    torsions = backbone_torsions(scene)
+    assert [len(torsions[key]) for key in ("phi", "psi", "omega")] == [1, 1, 2]
+    assert (np.abs(torsion(scene.positions_nm, torsions["omega"])) > np.radians(150.0)).all()
+    if code != "GLY":
+        index = {name: i for i, name in enumerate(scene.atom_names) if scene.residue_of_atom[i] == 1}
+        row = [index[name] for name in ("CA", "N", "C", "CB")]
+        assert signed_volumes(scene.positions_nm, [row])[0] > 0
+
+
+def test_the_three_histidines_differ_in_their_hydrogens() -> None:
+    found = {code: {n for n, r in zip(scene.atom_names, scene.residue_of_atom, strict=True) if r == 1}
+             for code in ("HID", "HIE", "HIP") for scene in [library.load(f"ACE-{code}-NME")]}  # fmt: skip
+    assert found["HIP"] - found["HID"] == {"HE2"}
+    assert found["HIP"] - found["HIE"] == {"HD1"}
+
+
+@pytest.mark.parametrize("name", PEPTIDES)
+def test_peptides_have_their_atoms_and_charge(name: str) -> None:
+    scene = library.load(name)
+    assert (scene.n_atoms, int(scene.formal_charges.sum())) == PEPTIDES[name]
+
+
+def test_chignolins_are_told_apart_and_extended() -> None:
+    for name, ends in (("chignolin", ("GLY", "GLY")), ("cln025", ("TYR", "TYR"))):
+        scene = library.load(name)
+        assert len(scene.residue_names) == 10
+        assert (scene.residue_names[0], scene.residue_names[-1]) == ends
+        ca = [i for i, n in enumerate(scene.atom_names) if n == "CA"]
+        # Folded, the ends meet within 0.7 nm.
+        assert np.linalg.norm(scene.positions_nm[ca[0]] - scene.positions_nm[ca[-1]]) > 2.0
+        assert "not folded" in library.describe(name)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_starting_structures_are_valid(name: str) -> None:
+    scene = library.load(name)
+    assert check_frames(scene.positions_nm, geometry_from_scene(scene))[0] == 0
+    assert scene.provenance["library_name"] == name
+    assert len(set(zip(scene.residue_of_atom.tolist(), scene.atom_names, strict=True))) == scene.n_atoms
+
+
+# ---- on demand -----------------------------------------------------------------------------------------------------
+
+
+def test_capped_dipeptides_are_made_from_their_name() -> None:
+    scene = prepare("ACE-SER-GLY-NME")
+    assert scene.residue_names == ("ACE", "SER", "GLY", "NME")
+    assert scene.name == scene.provenance["library_name"] == "ACE-SER-GLY-NME"
+    assert library.protocol("ACE-SER-GLY-NME")["temperature_k"] == 300.0
+
+
+def test_tetrapeptides_are_made_from_one_letter_code() -> None:
+    scene = prepare("SDFS")
+    assert scene.residue_names == ("SER", "ASP", "PHE", "SER")
+    assert int(scene.formal_charges.sum()) == -1
+    assert library.protocol("SDFS") == library.protocol("SER-ASP-PHE-SER")
+    assert library.protocol("SDFS")["temperature_k"] == 350.0
+
+
+def test_a_seed_may_follow_the_name_of_an_n_body_system() -> None:
+    assert library.load("n-body-charged").name == "n-body-charged:0"
+    assert prepare("n-body-charged:12").provenance["seed"] == 12
+    assert library.protocol("n-body-charged:12")["ensemble"] == "nve"
+
+
+@pytest.mark.parametrize("name", ["n-body-charged:", "n-body-charged:x", "n-body-charged:-1", "harmonic-oscillator:1",
+                                  "SDF", "SDFX", "ACE-XXX-NME", "aspirine", "alanine dipeptide"])  # fmt: skip
+def test_other_names_are_refused_in_one_line(name: str) -> None:
+    assert not library.knows(name)
+    with pytest.raises(UnknownNameError) as caught:
+        library.load(name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_near_miss_is_told() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'aspirin'"):
+        library.load("aspirine")
+
+
+# ---- protocols -----------------------------------------------------------------------------------------------------
+
+
+def test_protocols_name_settings_that_runs_have() -> None:
+    from md_reference.forcefield import ForceFieldSpec
+    from md_reference.simulate import MDConfig
+
+    known = {f.name for c in (MDConfig, ForceFieldSpec) for f in dataclasses.fields(c)} | {"ensemble"}
+    for name in library.names():
+        assert set(library.protocol(name)) <= known, name
+        assert library.protocol_source(name), name
+        library.protocol(name).clear()  # a copy
+        assert library.protocol(name)
+
+
+def test_the_md17_protocol_is_the_published_one() -> None:
+    for name in MD17:
+        assert library.protocol(name) == MD17_PROTOCOL
+    published = {"temperature_k": 500.0, "timestep_ps": 0.0005, "save_every_ps": 0.005}
+    assert {key: MD17_PROTOCOL[key] for key in published} == published
+    assert MD17_PROTOCOL["hydrogen_mass_da"] is None
+    assert MD17_PROTOCOL["constrain_hydrogens"] is False
