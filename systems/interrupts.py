@@ -12,16 +12,30 @@ from types import FrameType
 # Pressed again after this long, Ctrl-C means now.
 _PATIENCE_S = 1.0
 
+_thread = threading.local()
+
+
+@contextmanager
+def stop_when(asked: Callable[[], bool]) -> Iterator[None]:
+    """Have `deferred_interrupt` ask `asked` in this thread: how a run outside the main thread is told to stop."""
+    previous = getattr(_thread, "asked", None)
+    _thread.asked = asked
+    try:
+        yield
+    finally:
+        _thread.asked = previous
+
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Yield a function that says whether the user (SIGINT) or the system (SIGTERM) asked to stop.
 
     The caller looks at it where stopping leaves everything whole, and then raises KeyboardInterrupt. A second Ctrl-C, a
-    second later, raises it at once. Outside the main thread, where Python takes no signals, nothing is deferred.
+    second later, raises it at once. Outside the main thread, where Python takes no signals, the question goes to the
+    function given to `stop_when`; without one nothing asks to stop.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield getattr(_thread, "asked", None) or (lambda: False)
         return
     asked_at: float | None = None
 

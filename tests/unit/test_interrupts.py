@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from systems import interrupts
-from systems.interrupts import deferred_interrupt
+from systems.interrupts import deferred_interrupt, stop_when
 
 
 @pytest.fixture(autouse=True)
@@ -61,3 +61,23 @@ def test_outside_the_main_thread_nothing_is_deferred() -> None:
     thread.start()
     thread.join()
     assert seen == [False]
+
+
+def test_a_thread_is_asked_to_stop_by_whoever_runs_it() -> None:
+    asked = threading.Event()
+    seen: list[bool] = []
+
+    def run() -> None:
+        with stop_when(asked.is_set), deferred_interrupt() as asked_to_stop:
+            seen.append(asked_to_stop())
+            asked.set()
+            seen.append(asked_to_stop())
+        with deferred_interrupt() as asked_to_stop:
+            seen.append(asked_to_stop())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [False, True, False]
+    with stop_when(asked.is_set), deferred_interrupt() as asked_to_stop:
+        assert not asked_to_stop(), "the main thread listens to signals"

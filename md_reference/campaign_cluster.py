@@ -1,0 +1,134 @@
+"""Workers for a campaign: processes of this machine, a Dask scheduler that runs already, or jobs of a batch system."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from md_reference.campaign_file import ClusterSpec
+from md_reference.replicas import available_cores
+from systems.errors import InputError, SimulationError, nearest
+
+# dask-jobqueue's classes by the name of the batch system; `local` starts the same jobs as processes, to try a file out.
+_KINDS = {
+    "slurm": "SLURMCluster",
+    "pbs": "PBSCluster",
+    "sge": "SGECluster",
+    "lsf": "LSFCluster",
+    "htcondor": "HTCondorCluster",
+    "moab": "MoabCluster",
+    "oar": "OARCluster",
+    "local": "LocalCluster",
+}
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
+_PRELOAD = "md_reference.campaign_worker"
+
+
+@contextmanager
+def open_client(
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    cluster: ClusterSpec | None = None,
+    retries: int = 2,
+    folder: Path = Path(),
+) -> Iterator[Any]:
+    """Yield a `distributed.Client` and close what was started for it.
+
+    `scheduler` (tcp://host:port) goes before `cluster`, and both before local workers, one thread each (`workers`, as
+    many as there are cores by default). Raises InputError when no scheduler answers or dask-jobqueue is not installed.
+    """
+    _refuse_both(workers, scheduler)
+    import dask
+    from distributed import Client
+
+    with _quiet(), dask.config.set({"distributed.scheduler.allowed-failures": retries}):
+        if scheduler is not None:
+            try:
+                client = Client(scheduler, timeout="20s", set_as_default=False)
+            except (OSError, ValueError) as error:
+                raise InputError(f"no Dask scheduler answers at {scheduler} ({error}).") from error
+            with client:
+                yield client
+            return
+        started = _local(workers or available_cores()) if cluster is None else _jobs(cluster, folder)
+        with started, Client(started, set_as_default=False) as client:
+            yield client
+
+
+def _refuse_both(workers: int | None, scheduler: str | None) -> None:
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers starts workers here, --scheduler uses those that are there; give one of them.")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence Dask's loggers: what matters of them stands in the campaign's own account."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio", "dask_jobqueue")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
+def _local(workers: int) -> Any:
+    from distributed import LocalCluster
+
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        memory_limit=0,
+        silence_logs=logging.CRITICAL,
+        env=_ONE_THREAD,
+        preload=[_PRELOAD],
+    )
+
+
+def _jobs(spec: ClusterSpec, folder: Path) -> Any:
+    started = job_cluster(spec, folder)
+    # Jobs end with their walltime: new ones are asked for as long as there is work.
+    started.adapt(minimum_jobs=0, maximum_jobs=spec.jobs, interval="5s")
+    return started
+
+
+def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
+    """Return dask-jobqueue's cluster for the `[cluster]` table, without any job yet (`job_script()` shows one).
+
+    Each of its jobs holds `cores` worker processes of one thread. Raises InputError for another kind, and where
+    dask-jobqueue is not installed or refuses an entry.
+    """
+    if spec.kind not in _KINDS:
+        raise InputError(
+            f"[cluster] kind {spec.kind!r} is not one of {', '.join(_KINDS)}.{nearest(spec.kind, list(_KINDS))}"
+        )
+    try:
+        import dask_jobqueue
+    except ImportError:
+        raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
+    exports = [f"export {name}={value}" for name, value in _ONE_THREAD.items()]
+    arguments: dict[str, Any] = {
+        "cores": spec.cores,
+        "processes": spec.cores,
+        "memory": spec.memory,
+        "job_extra_directives": list(spec.directives),
+        "job_script_prologue": [*exports, *spec.prologue],
+        "worker_extra_args": ["--preload", _PRELOAD],
+        "log_directory": str((folder / "jobs").resolve()),
+    }
+    named = ("walltime", "queue", "account", "interface", "python")
+    arguments |= {key: value for key in named if (value := getattr(spec, key))}
+    try:
+        return getattr(dask_jobqueue, _KINDS[spec.kind])(scheduler_options={"dashboard_address": None}, **arguments)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
+    except OSError as error:
+        raise SimulationError(f"[cluster] {spec.kind} cannot be started here: {error}.") from error

@@ -1,0 +1,126 @@
+"""Settings of a reference run as a file writes them: `timestep = "4fs"` for MDConfig.timestep_ps, checked and typed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, Field, asdict, dataclass, fields
+from typing import Any
+
+from md_reference.forcefield import ForceFieldSpec
+from md_reference.simulate import MDConfig
+from systems.errors import InputError, nearest
+from systems.units import parse_mass_da, parse_rate_per_ps, parse_temperature_k, parse_time_ps
+
+# The longest ending first: a friction ends in _ps, too.
+_PARSERS: dict[str, Callable[[str, str], float]] = {
+    "_per_ps": parse_rate_per_ps,
+    "_ps": parse_time_ps,
+    "_k": parse_temperature_k,
+    "_da": parse_mass_da,
+}
+# These belong to a run's place in the campaign.
+_NOT_SETTINGS = ("seed", "force")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What one table says: fields of MDConfig and ForceFieldSpec by name, switches of `prepare`, and the axes."""
+
+    values: dict[str, Any]
+    preparation: dict[str, Any]
+    axes: dict[str, Any]
+
+
+def _known_fields() -> dict[str, Field[Any]]:
+    return {f.name: f for kind in (MDConfig, ForceFieldSpec) for f in fields(kind) if f.name not in _NOT_SETTINGS}
+
+
+def key_of(name: str) -> str:
+    """Return the key in a file of a field: `timestep` of `timestep_ps`."""
+    return next((name.removesuffix(ending) for ending in _PARSERS if name.endswith(ending)), name)
+
+
+def read_settings(
+    table: dict[str, Any],
+    *,
+    axes: Sequence[str],
+    preparation: dict[str, Any],
+    others: Sequence[str] = (),
+    where: str = "",
+) -> Settings:
+    """Return a table's settings, in our units. `preparation`: the switches of `prepare` and their defaults.
+
+    Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read), and
+    for values of the wrong kind.
+    """
+    by_key = {key_of(name): (name, f) for name, f in _known_fields().items()}
+    prefix = f"{where}: " if where else ""
+    found = Settings({}, {}, {})
+    for key, value in table.items():
+        if key in axes:
+            found.axes[key] = value
+        elif key in preparation:
+            found.preparation[key] = _switch(key, value, preparation[key], prefix)
+        elif key in by_key:
+            name, known = by_key[key]
+            found.values[name] = _value(key, name, known, value, prefix)
+        else:
+            meant = nearest(key, [*by_key, *preparation, *axes, *others])
+            raise InputError(f"{prefix}unknown key {key!r}.{meant}")
+    return found
+
+
+def _switch(key: str, value: Any, default: Any, prefix: str) -> Any:
+    if isinstance(default, bool) != isinstance(value, bool):
+        raise InputError(
+            f"{prefix}{key} = {value!r} must be {'true or false' if isinstance(default, bool) else 'a number'}."
+        )
+    return value
+
+
+def _value(key: str, name: str, known: Field[Any], value: Any, prefix: str) -> Any:
+    ending = next((ending for ending in _PARSERS if name.endswith(ending)), "")
+    optional = "None" in str(known.type)
+    if optional and value in ("natural", "none"):
+        return None
+    if ending:
+        if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+            raise InputError(f"{prefix}{key} = {value!r} must be a quantity with its unit, as a text.")
+        return _PARSERS[ending](str(value), f"{prefix}{key}")
+    kinds = {"bool": bool, "int": int, "float": float, "str": str}
+    wanted = kinds.get(str(known.type).removesuffix(" | None"))
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if wanted is None or not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
+        meant = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+        raise InputError(
+            f"{prefix}{key} = {value!r} must be {meant.get(wanted, str(known.type)) if wanted else known.type}."
+        )
+    return value
+
+
+def to_config(values: dict[str, Any], *, seed: int) -> MDConfig:
+    """Return a run's settings. Raises InputError where its length is not given, and what the fields refuse."""
+    force = {f.name for f in fields(ForceFieldSpec)}
+    missing = [f.name for f in fields(MDConfig) if f.default is MISSING and f.default_factory is MISSING]
+    for name in missing:
+        if name not in values:
+            raise InputError(f"{key_of(name)} is missing; write, for example, {key_of(name)} = '10ns'.")
+    return MDConfig(
+        **{key: value for key, value in values.items() if key not in force},
+        seed=seed,
+        force=ForceFieldSpec(**{key: value for key, value in values.items() if key in force}),
+    )
+
+
+def flat_settings(config: MDConfig) -> dict[str, Any]:
+    """Return a run's settings as one level of names and plain values, without its seed."""
+    record = asdict(config)
+    record.pop("seed")
+    return {**{k: v for k, v in record.items() if k != "force"}, **record["force"]}
+
+
+def default_of(name: str) -> Any:
+    """Return the default of a setting, or None where it has none."""
+    known = _known_fields().get(name)
+    return None if known is None or known.default is MISSING else known.default
