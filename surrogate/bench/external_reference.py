@@ -4,7 +4,8 @@ Runs alanine dipeptide as the published trajectories of msmbuilder (msmb_data, C
 radii of `amber99_obc.xml`, 300 K, Langevin at 91/ps, 2 fs, bonds to hydrogen rigid, natural masses (at high friction
 the kinetics depend on them), frames 1 ps apart, 10 ns each. Then compares the occupancies of the psi basins and the
 relaxation time of cos psi, trajectory by trajectory: the spread between trajectories is the error bar. Runs that are
-complete are kept, interrupted ones are resumed.
+complete are kept, interrupted ones are resumed. Twenty runs: the ten first made differed in the occupancies by 2.85
+combined standard errors, so ten more were decided on before they were made; both comparisons are printed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from systems.errors import InputError
 from systems.units import parse_time_ps
 
 SCENE = "alanine-dipeptide"
-FIRST_SEED, N_RUNS = 200, 10
+FIRST_SEED, N_FIRST, N_RUNS = 200, 10, 20
 RUN_PS = 10_000.0
 AGREES_BELOW = 2.0
 _N_BINS = 72
@@ -176,9 +177,10 @@ def complete_runs(out_dir: Path, *, n_runs: int, time_ps: float) -> list[Path]:
 def compare_with_published(
     data_dir: Path, out_dir: Path, *, n_runs: int = N_RUNS, time_ps: float = RUN_PS
 ) -> dict[str, Any]:
-    """Compare the complete runs of `out_dir` with the DCDs of `data_dir`; return and write `comparison.json`.
+    """Compare the complete runs of `out_dir` with the DCDs of `data_dir`; return and write `comparison_N.json`.
 
-    Raises InputError when either side has fewer than two trajectories, so that there is no error bar.
+    The file is named after the number of runs asked for. Raises InputError when either side has fewer than two
+    trajectories, so that there is no error bar.
     """
     published = sorted(data_dir.glob("trajectory-*.dcd"))
     runs = complete_runs(out_dir, n_runs=n_runs, time_ps=time_ps)
@@ -199,7 +201,7 @@ def compare_with_published(
         "differences": [asdict(difference(key, unit, a[key], b[key])) for key, unit in units.items()],
     }
     text = json.dumps(result, indent=2)
-    (out_dir / "comparison.json").write_text(text + "\n")
+    (out_dir / f"comparison_{n_runs}.json").write_text(text + "\n")
     return dict(json.loads(text))
 
 
@@ -225,7 +227,7 @@ def table(result: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder with trajectory-*.dcd and ala2.pdb")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the runs and comparison.json")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the runs and the comparisons")
     parser.add_argument("--runs", type=int, default=N_RUNS)
     parser.add_argument("--time", default="10ns", help="of each run")
     parser.add_argument("--workers", type=int, default=None, help="processes at a time; default: the cores")
@@ -234,8 +236,9 @@ def main() -> None:
     time_ps = parse_time_ps(options.time)
     if not options.compare_only:
         run_ours(options.out, n_runs=options.runs, time_ps=time_ps, workers=options.workers)
-    result = compare_with_published(options.data, options.out, n_runs=options.runs, time_ps=time_ps)
-    sys.stdout.write(table(result) + "\n")
+    for n_runs in sorted({min(N_FIRST, options.runs), options.runs}):
+        result = compare_with_published(options.data, options.out, n_runs=n_runs, time_ps=time_ps)
+        sys.stdout.write(table(result) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+# Keys up to which `attend` writes the products out.
+_SHORT = 128
+
 
 def fourier_features(x: Tensor, n_octaves: int) -> Tensor:
     """Return x with sin and cos of 2^k pi x, k = 0..n_octaves-1: `(..., d)` -> `(..., d * (1 + 2 * n_octaves))`.
@@ -32,6 +35,20 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     a, b = x.chunk(2, dim=-1)
     cos, sin = cos.to(x.dtype), sin.to(x.dtype)
     return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `mask` True where allowed.
+
+    On a CPU torch's fused kernel is slower for short sequences than the plain products (its backward twice; measured
+    at 32 frames), so those are written out there.
+    """
+    if q.device.type != "cpu" or k.shape[-2] > _SHORT:
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    scores = (q @ k.transpose(-1, -2)) * q.shape[-1] ** -0.5
+    if mask is not None:
+        scores = scores.masked_fill(~mask, -math.inf)
+    return scores.softmax(-1).to(v.dtype) @ v
 
 
 class TimeEmbedding(nn.Module):
@@ -77,7 +94,7 @@ class ParallelBlock(nn.Module):
         q, k = normalise(q), normalise(k)
         if rope is not None:
             q, k = rotate(q, *rope), rotate(k, *rope)
-        attended = F.scaled_dot_product_attention(q, k, v)
+        attended = attend(q, k, v)
         attended = attended.transpose(1, 2).reshape(batch, groups, length, self.width)
         update = self.attention_out(attended) + self.mlp_out(F.gelu(hidden, approximate="tanh"))
         return x + gate * update
@@ -121,7 +138,7 @@ class CrossAttentionBlock(nn.Module):
         else:
             split = lambda t: t.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # noqa: E731
             mask = None if key_mask is None else key_mask[:, None, None, :]
-            attended = F.scaled_dot_product_attention(split(self.q(normed)), split(k), split(v), attn_mask=mask)
+            attended = attend(split(self.q(normed)), split(k), split(v), mask)
             attended = attended.transpose(1, 2).flatten(-2)
         if self.gate is not None:
             attended = attended * self.gate(normed)

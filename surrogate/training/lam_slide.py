@@ -24,7 +24,7 @@ from systems.errors import InputError
 from systems.validity import geometry_from_frames
 
 # Share of the whole budget that stage one gets.
-STAGE_ONE_SHARE = 0.15
+STAGE_ONE_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,18 @@ class TrainingConfig:
     stage_two_steps: int | None = None
     stage_one_batch: int = 128
     stage_two_batch: int = 64
-    stage_one_rate: float = 1e-3
+    stage_one_rate: float = 2e-3
     stage_two_rate: float = 1e-3
     seed: int = 0
     bf16: bool = True
     device: str = "cpu"
     validate_every_s: float = 60.0
     snapshot_every_s: float | None = None
-    # Compile stage two's network; needs a C++ compiler on the machine.
+    # Compile stage two's network and the decoder; needs a C++ compiler on the machine.
     compile: bool = False
+    # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
+    # reversibility), and each rare event then shows how it begins and how it ends.
+    time_reversal: bool = False
 
     def stages(self) -> tuple[StageConfig, StageConfig]:
         share = STAGE_ONE_SHARE
@@ -156,6 +159,15 @@ def encode_all(model: LamSlide, frames: TrainingFrames, elements: Tensor, block:
     return torch.cat(parts)
 
 
+def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool) -> Tensor:
+    """Return the frames `(b, length)` of windows from their first frames `(b,)`; reversed ones with probability 1/2."""
+    idx = first[:, None] + torch.arange(length)
+    if not time_reversal:
+        return idx
+    backwards = torch.rand(len(idx), 1, generator=generator) < 0.5
+    return torch.where(backwards, idx.flip(1), idx)
+
+
 def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
                resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig) -> float:  # fmt: skip
     length = model.config.approximator.chunk_frames
@@ -163,14 +175,14 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
     starts = torch.from_numpy(frames.window_starts(length, validation=False))
     held = torch.from_numpy(frames.window_starts(length, validation=True))
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
-    offsets = torch.arange(length)
     model.autoencoder.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
+        model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
     cache = encode_all(model, frames, elements).to(device) if model.canonical else None
 
-    def windows(first: Tensor, generator: torch.Generator) -> Tensor:
-        idx = first[:, None] + offsets
+    def windows(first: Tensor, generator: torch.Generator, *, time_reversal: bool = False) -> Tensor:
+        idx = window_frames(first, length, generator, time_reversal=time_reversal)
         if cache is not None:
             return cache[idx.to(device)]
         x = torch.from_numpy(frames.positions_nm(idx.numpy()))
@@ -181,7 +193,8 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
         tau = draw_flow_times(model, stage.batch, generator).to(device)
-        return flow_loss(model, windows(first, generator), n_atoms, tau, generator)
+        batch = windows(first, generator, time_reversal=config.time_reversal)
+        return flow_loss(model, batch, n_atoms, tau, generator)
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
@@ -221,6 +234,7 @@ def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float
         "reference_ns": frames.total_ps * 1e-3,
         "sources": list(frames.sources),
         "seed": config.seed,
+        "time_reversal": config.time_reversal,
         "stage_one_s": round(spent_one, 1),
         "stage_two_s": round(spent_two, 1),
     }

@@ -73,11 +73,13 @@ class Autoencoder(nn.Module):
     def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
         """Latents `(b, n_latents, dim)`, identifiers `(b, n)` -> positions `(b, n, 3)` (scaled), element logits."""
         context = F.layer_norm(latents, (self.config.latent_dim,))
-        h = self.query(self.identifiers(identifiers))
+        # The residual stream and the last layer stay in float32: bf16 would round positions to 0.001 nm.
+        h = self.query(self.identifiers(identifiers)).float()
         for block in self.decoder:
             h = block(h, context)
         logits = self.to_element(h).float() if with_elements else None
-        return Decoded(self.to_position(h).float(), logits)
+        with torch.autocast(h.device.type, enabled=False):
+            return Decoded(self.to_position(h.float()), logits)
 
 
 def pair_distances(x: Tensor) -> Tensor:

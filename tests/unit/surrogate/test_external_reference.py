@@ -84,7 +84,7 @@ def test_two_short_runs_end_to_end(shared_data: Path, tmp_path: Path) -> None:
     bench.run_ours(tmp_path, n_runs=2, time_ps=50.0, workers=2, quiet=True)
     assert {p.name: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == before
     result = bench.compare_with_published(data, tmp_path, n_runs=2, time_ps=50.0)
-    assert json.loads((tmp_path / "comparison.json").read_text()) == result
+    assert json.loads((tmp_path / "comparison_2.json").read_text()) == result
     assert result["ours"] == ["seed200.h5", "seed201.h5"]
     assert result["n_frames_theirs"][:2] == [9999, 10000]
     assert "against 7 published" in bench.table(result)

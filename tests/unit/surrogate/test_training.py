@@ -15,7 +15,7 @@ from surrogate.data.weights import Weights, load_weights, read_header, save_weig
 from surrogate.models.lam_slide.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.training.lam_slide import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.scene import Scene
@@ -198,3 +198,14 @@ def test_rotation_augmentation_trains_without_canonical_frames(tmp_path: Path, h
     assert load_weights(out).model.canonical is False
     with pytest.raises(InputError, match="disagree"):
         train_lam_slide(harmonic_frames, tmp_path / "b.safetensors", config, QUICK)
+
+
+def test_time_reversal_turns_about_every_other_window_round() -> None:
+    first = torch.arange(0, 4000, 10)
+    forward = window_frames(first, 5, torch.Generator().manual_seed(0), time_reversal=False)
+    assert torch.equal(forward, first[:, None] + torch.arange(5))
+    drawn = window_frames(first, 5, torch.Generator().manual_seed(0), time_reversal=True)
+    assert torch.equal(drawn.sort(1).values, forward)
+    steps = drawn.diff(dim=1)
+    assert ((steps == 1).all(1) | (steps == -1).all(1)).all()
+    assert 0.4 < (steps[:, 0] == -1).double().mean() < 0.6
