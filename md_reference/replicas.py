@@ -11,7 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from md_reference.forcefield import resolve
 from md_reference.parent_watch import end_with_parent
+from md_reference.platforms import PlatformChoice, measured_platform
 from md_reference.simulate import MDConfig, simulate
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
@@ -45,14 +47,35 @@ def simulate_replicas(
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
-    Each replica is a process with one thread: on small scenes that is the fastest use of the cores. Ctrl-C and SIGTERM
-    stop them all between two frames, each with a checkpoint: KeyboardInterrupt. When this process is killed outright
-    they stop by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished
-    replicas stay on disk.
+    Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
+    small scenes the fastest use of them. The platform is measured once, for all. Ctrl-C and SIGTERM stop them all with
+    checkpoints: KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises
+    SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     if len(outs) == 1:
-        return [simulate(scene, configs[0], outs[0], resume=resume, overwrite=overwrite, progress=progress)]
+        return [
+            simulate(
+                scene,
+                configs[0],
+                outs[0],
+                resume=resume,
+                overwrite=overwrite,
+                progress=progress,
+                max_threads=available_cores(),
+            )
+        ]
+    width = workers or min(len(outs), available_cores())
+    choice = measured_platform(
+        scene,
+        resolve(scene, config.force),
+        requested=config.platform,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
+        max_threads=max(1, available_cores() // width),
+        side_by_side=width,
+    )
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
     done = context.Array("Q", len(outs), lock=False)
@@ -61,13 +84,12 @@ def simulate_replicas(
     running: dict[int, Any] = {}
     failures: dict[int, str] = {}
     reasons: dict[int, str] = {}
-    width = workers or min(len(outs), available_cores())
     with deferred_interrupt() as asked_to_stop:
         try:
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    args = (scene.to_dict(), configs[k], str(outs[k]), resume, overwrite, done, k, errors)
+                    args = (scene.to_dict(), configs[k], str(outs[k]), resume, overwrite, choice, done, k, errors)
                     running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
                     running[k].start()
                 time.sleep(0.1)
@@ -103,7 +125,15 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
 
 
 def _replica(
-    scene: dict[str, Any], config: MDConfig, out: str, resume: bool, overwrite: bool, done: Any, k: int, errors: Any
+    scene: dict[str, Any],
+    config: MDConfig,
+    out: str,
+    resume: bool,
+    overwrite: bool,
+    choice: PlatformChoice,
+    done: Any,
+    k: int,
+    errors: Any,
 ) -> None:
     end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
@@ -112,7 +142,9 @@ def _replica(
         done[k] = frames
 
     try:
-        simulate(Scene.from_dict(scene), config, out, resume=resume, overwrite=overwrite, progress=report)
+        simulate(
+            Scene.from_dict(scene), config, out, resume=resume, overwrite=overwrite, progress=report, choice=choice
+        )
     except SurromdError as error:
         errors.put((k, str(error)))
         raise SystemExit(1) from None

@@ -2,59 +2,39 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec
-from systems.errors import InputError, SimulationError, StorageError
+from md_reference.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
+from md_reference.engine import Engine, State
+from md_reference.forcefield import build_system, resolve
+from md_reference.integrators import check_ensemble, integrator_name
+from md_reference.platforms import PlatformChoice, measured_platform
+from md_reference.run_config import MDConfig, check_same_run, settings_of
+from md_reference.summary import summarise
+from systems.errors import InputError, SimulationError, TrajectoryError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
-from systems.trajectory import open_writer
-from systems.units import format_time_ps, whole_steps
+from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory_types import TrajectoryWriter
+from systems.units import format_time_ps
+
+__all__ = ["MDConfig", "checkpoint_path", "simulate"]
 
 # (frames done, frames in all) -> None, called after each block that is on disk.
 ProgressFn = Callable[[int, int], None]
 
-# Python sees Ctrl-C only between calls of OpenMM.
-_STEPS_BETWEEN_SIGNALS = 500
-
-
-@dataclass(frozen=True)
-class MDConfig:
-    """One run. Times in ps, temperature in K, friction in 1/ps; Langevin middle integrator (Zhang 2019)."""
-
-    time_ps: float
-    save_every_ps: float = 1.0
-    temperature_k: float = 300.0
-    friction_per_ps: float = 1.0
-    timestep_ps: float = 0.004
-    equilibrate_ps: float = 100.0
-    seed: int = 0
-    platform: str = "auto"
-    force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
-
-    @property
-    def steps_per_frame(self) -> int:
-        return whole_steps(self.save_every_ps, self.timestep_ps, "save interval in time steps")
-
-    @property
-    def n_frames(self) -> int:
-        return whole_steps(self.time_ps, self.save_every_ps, "run length in save intervals")
-
-
-def checkpoint_path(out: Path) -> Path:
-    """Where the checkpoint of a trajectory lies: beside it, until the run is complete."""
-    return out.with_name(out.name + ".checkpoint")
+# Python sees Ctrl-C only between calls of OpenMM: about so long may pass until it does.
+_SIGNAL_S = 0.25
+# Held in memory, then flushed together with a checkpoint: what a `kill -9` costs at most, or one frame if that is more.
+_BLOCK_S = 0.5
 
 
 def simulate(
@@ -66,199 +46,305 @@ def simulate(
     overwrite: bool = False,
     progress: ProgressFn | None = None,
     checkpoint_every_s: float = 20.0,
+    max_threads: int = 1,
+    choice: PlatformChoice | None = None,
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
 
-    A `kill -9` loses at most the frames since the last checkpoint (`checkpoint_every_s` of wall time); `resume=True`
-    cuts the file back to that checkpoint and goes on with the same random stream. Ctrl-C and SIGTERM stop between two
-    frames, with a checkpoint: KeyboardInterrupt. Raises SimulationError when coordinates stop being finite or the
-    system blows up (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
+    A checkpoint stands behind every block of frames on disk and, in frames that take longer, every
+    `checkpoint_every_s` of wall time, when it is also forced onto the medium. So a `kill -9` or a full disk loses at
+    most one save interval, or half a second of work where that is more; `resume=True` goes on from there with the same
+    random stream, on the same platform. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with
+    a checkpoint, inside a frame if need be: KeyboardInterrupt.
+
+    With `platform='auto'` the platform is measured (`platforms.measured_platform`, at most `max_threads`), unless
+    `choice` says what has been. Raises SimulationError when coordinates stop being finite or the system blows up
+    (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
-    n_frames, steps_per_frame = config.n_frames, config.steps_per_frame
+    _ = config.n_frames, config.steps_per_frame
+    config = replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
     chk = checkpoint_path(out)
     if resume and not chk.exists() and out.exists():
         return _already_complete(out, config)
-    resuming = resume and chk.exists() and out.exists()
-    started = time.monotonic()
-    with Engine(
-        scene,
-        config.force,
-        temperature_k=config.temperature_k,
-        friction_per_ps=config.friction_per_ps,
-        timestep_ps=config.timestep_ps,
-        seed=config.seed,
-        platform=config.platform,
-    ) as engine:
-        record = _record(config, engine)
-        if resuming:
-            header, blob = _read_checkpoint(chk)
-            _check_same_run(header["config"], _settings(config), out)
-            engine.restore(blob)
-            done, spent_s = int(header["n_frames"]), float(header["wall_s"])
-        else:
-            done, spent_s = 0, 0.0
-            _equilibrate(engine, config, scene.name)
-
-        def save_checkpoint(wall_s: float) -> None:
-            header = {"config": _settings(config), "n_frames": done, "wall_s": wall_s}
-            _write_checkpoint(chk, header, engine.checkpoint())
-
-        with (
-            open_writer(out, scene, record, append=resuming, overwrite=overwrite) as writer,
-            deferred_interrupt() as asked_to_stop,
-        ):
-            if resuming:
-                writer.truncate(done)
-            else:
-                # At once, so that a run killed in its first seconds can be resumed like any other.
-                save_checkpoint(spent_s + time.monotonic() - started)
-            last_saved = time.monotonic()
-            # A block is what is held in memory and flushed together: about half a second of work, found as we go.
-            block = 1
-            while done < n_frames:
-                size = min(block, n_frames - done)
-                block_began = time.monotonic()
-                frames = np.empty((size, scene.n_atoms, 3), dtype=np.float32)
-                scalars = {name: np.empty(size) for name in ("potential_kj_mol", "temperature_k")}
-                filled, failure = 0, ""
-                for k in range(size):
-                    if asked_to_stop():
-                        break
-                    try:
-                        engine.step(steps_per_frame)
-                        state = engine.state()
-                    except SimulationError as error:
-                        failure = str(error)
-                        break
-                    frames[k] = state.positions_nm
-                    scalars["potential_kj_mol"][k] = state.potential_kj_mol
-                    scalars["temperature_k"][k] = state.temperature_k
-                    filled += 1
-                times = (done + 1 + np.arange(filled)) * config.save_every_ps
-                writer.append(frames[:filled], times, scalars={k: v[:filled] for k, v in scalars.items()})
-                done += filled
-                wall_s = spent_s + time.monotonic() - started
-                if failure:
-                    writer.update_record({"completed": False, "failure": failure, "cost": _cost(wall_s, done, config)})
-                    raise SimulationError(
-                        f"{scene.name}: {failure} after {format_time_ps(done * config.save_every_ps)}; {done} good "
-                        f"frames are in {out}. {_advice(config)}"
-                    )
-                if progress is not None:
-                    progress(done, n_frames)
-                if asked_to_stop() and done < n_frames:
-                    save_checkpoint(wall_s)
-                    writer.update_record({"cost": _cost(wall_s, done, config)})
-                    raise KeyboardInterrupt
-                if time.monotonic() - last_saved > checkpoint_every_s and done < n_frames:
-                    save_checkpoint(wall_s)
-                    last_saved = time.monotonic()
-                per_frame_s = max((time.monotonic() - block_began) / size, 1e-6)
-                block = min(max(1, round(0.5 / per_frame_s)), 1000, 2 * block)
-            wall_s = spent_s + time.monotonic() - started
-            # A resumed run may have become longer than the one that wrote the record.
-            writer.update_record({"completed": True, "time_ps": config.time_ps, "cost": _cost(wall_s, done, config)})
+    if out.exists() and not (resume or overwrite):
+        raise TrajectoryError(f"{out} exists already; overwrite it, resume it, or choose another name.")
+    header, blob = read_checkpoint(chk) if resume and chk.exists() else ({}, b"")
+    equilibrating = "equilibrated_steps" in header
+    if header and not equilibrating and not out.exists():
+        header = {}
+    if header:
+        check_same_run(header["config"], config, out)
+        choice = _recorded_platform(header, out)
+        overwrite = overwrite or bool(header.get("overwrite"))
+    run = _Run(scene, config, out, checkpoint_every_s, header, overwrite=overwrite)
+    with deferred_interrupt() as asked_to_stop:
+        run.asked_to_stop = asked_to_stop
+        run.prepare(choice, max_threads)
+        engine = run.resumed(blob) if header and not equilibrating else run.equilibrated(blob)
+        with engine, open_writer(
+            out, scene, run.record(engine), append=run.resuming, overwrite=overwrite, columns=config.columns
+        ) as writer:  # fmt: skip
+            run.produce(engine, writer, progress)
     chk.unlink(missing_ok=True)
     return out
 
 
-def _equilibrate(engine: Engine, config: MDConfig, name: str) -> None:
-    """Minimise, draw velocities, run for `equilibrate_ps`, set the clock to 0. Raises SimulationError."""
-    try:
-        engine.minimise()
-        engine.thermalise()
-        n_steps = max(1, round(config.equilibrate_ps / config.timestep_ps))
-        for start in range(0, n_steps, _STEPS_BETWEEN_SIGNALS):
-            engine.step(min(_STEPS_BETWEEN_SIGNALS, n_steps - start))
+class _Run:
+    """One run on its way: what is done, since when, and where its checkpoint goes."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: MDConfig,
+        out: Path,
+        checkpoint_every_s: float,
+        header: dict[str, Any],
+        *,
+        overwrite: bool,
+    ) -> None:
+        self.scene, self.config, self.out = scene, config, out
+        self.checkpoint_every_s, self.header, self.overwrite = checkpoint_every_s, header, overwrite
+        self.resuming = bool(header) and "equilibrated_steps" not in header
+        self.asked_to_stop: Callable[[], bool] = lambda: False
+        self.done = int(header.get("n_frames", 0))
+        self.steps_into_frame = int(header.get("steps_into_frame", 0))
+        self.spent_s = float(header.get("wall_s", 0.0))
+        self.started = self.synced_at = time.monotonic()
+        self.piece = 10
+        self.system: Any = None
+
+    @property
+    def wall_s(self) -> float:
+        return self.spent_s + time.monotonic() - self.started
+
+    def prepare(self, choice: PlatformChoice | None, max_threads: int) -> None:
+        """Build the forces and settle the platform."""
+        self.system = build_system(self.scene, self.config.force)
+        self.choice = choice or measured_platform(
+            self.scene,
+            self.config.force,
+            requested=self.config.platform,
+            temperature_k=self.config.temperature_k,
+            friction_per_ps=self.config.friction_per_ps,
+            timestep_ps=self.config.timestep_ps,
+            max_threads=max_threads,
+            system=lambda: self.system,
+        )
+
+    def engine(self, ensemble: str) -> Engine:
+        return Engine(
+            self.scene,
+            self.config.force,
+            temperature_k=self.config.temperature_k,
+            friction_per_ps=self.config.friction_per_ps,
+            timestep_ps=self.config.timestep_ps,
+            seed=self.config.seed,
+            platform=self.choice.name,
+            threads=self.choice.threads,
+            ensemble=ensemble,
+            pressure_bar=self.config.pressure_bar,
+            system=self.system,
+        )
+
+    def resumed(self, blob: bytes) -> Engine:
+        engine = self.engine(self.config.ensemble)
+        engine.restore(blob)
+        return engine
+
+    def equilibrated(self, blob: bytes) -> Engine:
+        """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
+
+        A model system that brings its own velocities starts from them as it stands, if nothing is to heat it.
+        """
+        config = self.config
+        if config.ensemble == "nve" and self.scene.velocities_nm_ps is not None:
+            engine = self.engine("nve")
+            engine.set_velocities(self.scene.velocities_nm_ps)
+            return engine
+        bath = self.engine("nvt" if config.ensemble == "nve" else config.ensemble)
+        try:
+            self._equilibrate(bath, blob)
+            if config.ensemble != "nve":
+                bath.reset_clock()
+                return bath
+            state = bath.state(velocities=True)
+        except SimulationError as error:
+            checkpoint_path(self.out).unlink(missing_ok=True)
+            raise SimulationError(f"{self.scene.name}: {error} before the first frame. {_advice(config)}") from error
+        bath.close()
+        engine = self.engine("nve")
+        engine.take_over(state)
+        return engine
+
+    def _equilibrate(self, engine: Engine, blob: bytes) -> None:
+        n_steps = max(1, round(self.config.equilibrate_ps / self.config.timestep_ps))
+        done = int(self.header.get("equilibrated_steps", 0))
+        if blob:
+            engine.restore(blob)
+        else:
+            engine.minimise()
+            engine.thermalise()
+        while done < n_steps:
+            done += self._advance(engine, n_steps - done)
+            stop = self.asked_to_stop()
+            if stop or time.monotonic() - self.synced_at > self.checkpoint_every_s:
+                self.save(engine, sync=True, equilibrated_steps=done, overwrite=self.overwrite)
+            if stop:
+                raise KeyboardInterrupt
         engine.state()
-    except SimulationError as error:
-        raise SimulationError(f"{name}: {error} before the first frame. {_advice(config)}") from error
-    engine.reset_clock()
+
+    def _advance(self, engine: Engine, n_steps: int) -> int:
+        """Take steps until somebody may want to look whether to stop, and return how many."""
+        taken = min(self.piece, n_steps)
+        began = time.monotonic()
+        engine.step(taken)
+        seconds = max(time.monotonic() - began, 1e-9)
+        self.piece = max(1, min(2 * self.piece, math.ceil(taken * _SIGNAL_S / seconds), 100_000))
+        return taken
+
+    def save(self, engine: Engine, *, sync: bool, **more: Any) -> None:
+        """Write the checkpoint."""
+        header = {
+            "config": settings_of(self.config),
+            "n_frames": self.done,
+            "wall_s": self.wall_s,
+            "platform": engine.platform_name,
+            "threads": engine.threads,
+            **more,
+        }
+        write_checkpoint(checkpoint_path(self.out), header, engine.checkpoint(), sync=sync)
+        if sync:
+            self.synced_at = time.monotonic()
+
+    def produce(self, engine: Engine, writer: TrajectoryWriter, progress: ProgressFn | None) -> None:
+        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
+        config, n_frames = self.config, self.config.n_frames
+        if self.resuming:
+            writer.truncate(self.done)
+        else:
+            # At once, so that a run killed in its first seconds can be resumed like any other.
+            self.save(engine, sync=True)
+        block = 1
+        while self.done < n_frames:
+            size = min(block, n_frames - self.done)
+            began = time.monotonic()
+            states, failure = self._frames(engine, size)
+            self._write(writer, states)
+            self.done += len(states)
+            if failure:
+                writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+                raise SimulationError(
+                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
+                    f"{self.done} good frames are in {self.out}. {_advice(config)}"
+                )
+            stop = self.asked_to_stop() and self.done < n_frames
+            if self.done < n_frames:
+                due = time.monotonic() - self.synced_at > self.checkpoint_every_s
+                self.save(engine, sync=stop or due, steps_into_frame=self.steps_into_frame)
+            if progress is not None:
+                progress(self.done, n_frames)
+            if stop:
+                writer.update_record({"cost": self.cost()})
+                raise KeyboardInterrupt
+            per_frame_s = max((time.monotonic() - began) / max(len(states), 1), 1e-6)
+            block = min(max(1, round(_BLOCK_S / per_frame_s)), 1000, 2 * block)
+        time_ps, scalars = writer.series()
+        summary = summarise(
+            self.scene,
+            time_ps,
+            scalars,
+            ensemble=config.ensemble,
+            temperature_k=config.temperature_k,
+            n_dof=engine.n_dof,
+        )
+        # A resumed run may have become longer than the one that wrote the record.
+        writer.update_record({"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary})
+
+    def _frames(self, engine: Engine, n: int) -> tuple[list[State], str]:
+        """Return up to `n` frames, fewer when somebody asked to stop or the run failed, and why it failed."""
+        states: list[State] = []
+        config, per_frame = self.config, self.config.steps_per_frame
+        while len(states) < n:
+            try:
+                while self.steps_into_frame < per_frame:
+                    if self.asked_to_stop():
+                        return states, ""
+                    self.steps_into_frame += self._advance(engine, per_frame - self.steps_into_frame)
+                    if not states and time.monotonic() - self.synced_at > self.checkpoint_every_s:
+                        self.save(engine, sync=True, steps_into_frame=self.steps_into_frame)
+                states.append(engine.state(velocities=config.save_velocities, forces=config.save_forces))
+                self.steps_into_frame = 0
+            except SimulationError as error:
+                return states, str(error)
+        return states, ""
+
+    def _write(self, writer: TrajectoryWriter, states: list[State]) -> None:
+        if not states:
+            return
+        config, periodic = self.config, self.scene.cell_nm is not None
+        scalars = {
+            "potential_kj_mol": np.array([s.potential_kj_mol for s in states]),
+            "temperature_k": np.array([s.temperature_k for s in states]),
+        }
+        cells = np.array([s.cell_nm for s in states]) if periodic else None
+        if cells is not None and config.ensemble == "npt":
+            scalars["volume_nm3"] = np.linalg.det(cells)
+        writer.append(
+            np.array([s.positions_nm for s in states], dtype=np.float32),
+            (self.done + 1 + np.arange(len(states))) * config.save_every_ps,
+            scalars=scalars,
+            velocities_nm_ps=np.array([s.velocities_nm_ps for s in states]) if config.save_velocities else None,
+            forces_kj_mol_nm=np.array([s.forces_kj_mol_nm for s in states]) if config.save_forces else None,
+            cell_nm=cells,
+        )
+
+    def cost(self) -> dict[str, float]:
+        """Cost of what is in the file; equilibration is in the wall time and not in the count of production steps."""
+        simulated_ps = self.done * self.config.save_every_ps
+        return {
+            "wall_s": self.wall_s,
+            "energy_evaluations": self.done * self.config.steps_per_frame,
+            "ns_per_day": simulated_ps * 1e-3 / self.wall_s * 86400.0,
+        }
+
+    def record(self, engine: Engine) -> dict[str, Any]:
+        import openmm
+
+        return {
+            "kind": "reference",
+            "integrator": integrator_name(self.config.ensemble, self.scene),
+            "program": {"openmm": openmm.__version__},
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "completed": False,
+            **settings_of(self.config),
+            "platform": engine.platform_name,
+            "threads": engine.threads,
+            "platform_reason": self.choice.reason,
+        }
+
+
+def _recorded_platform(header: dict[str, Any], out: Path) -> PlatformChoice:
+    """Return the platform of the run that wrote a checkpoint; older ones leave it to the trajectory's record."""
+    name = header.get("platform")
+    if name is None:
+        with open_trajectory(out) as reader:
+            name = reader.record["platform"]
+    return PlatformChoice(str(name), int(header.get("threads", 1)), "as before it was resumed")
 
 
 def _advice(config: MDConfig) -> str:
     return f"Try a shorter --timestep (now {config.timestep_ps * 1000:g} fs)."
 
 
-def _cost(wall_s: float, n_frames: int, config: MDConfig) -> dict[str, float]:
-    """Cost of what is in the file; equilibration is in the wall time and not in the count of production steps."""
-    return {
-        "wall_s": wall_s,
-        "energy_evaluations": n_frames * config.steps_per_frame,
-        "ns_per_day": n_frames * config.save_every_ps * 1e-3 / wall_s * 86400.0,
-    }
-
-
-def _record(config: MDConfig, engine: Engine) -> dict[str, Any]:
-    import openmm
-
-    return {
-        "kind": "reference",
-        "integrator": "LangevinMiddle",
-        "program": {"openmm": openmm.__version__},
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "completed": False,
-        **_settings(config),
-        "platform": engine.platform_name,
-    }
-
-
-def _settings(config: MDConfig) -> dict[str, Any]:
-    """The settings of a run as one level of names and plain values."""
-    flat = asdict(config)
-    force = flat.pop("force")
-    return {**flat, **force}
-
-
 def _already_complete(out: Path, config: MDConfig) -> Path:
-    from systems.trajectory import open_trajectory
-
     with open_trajectory(out) as reader:
         record, n_frames = reader.record, reader.n_frames
-    asked = _settings(config)
     # The record names the platform that ran, which "auto" leaves open.
-    asked.pop("platform")
-    _check_same_run({key: record.get(key) for key in asked}, asked, out)
+    check_same_run(record, config, out, ignoring=("platform",))
     if record.get("completed") and n_frames == config.n_frames:
         return out
     raise InputError(
         f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
         "--overwrite, or keep it under another name."
     )
-
-
-def _check_same_run(old: dict[str, Any], new: dict[str, Any], out: Path) -> None:
-    for key, value in json.loads(json.dumps(new)).items():
-        # A run may be resumed to become longer.
-        if key != "time_ps" and old.get(key) != value:
-            raise InputError(
-                f"{out} was started with {key} = {old.get(key)!r}, not {value!r}; resume with the same settings "
-                "or write to another file."
-            )
-
-
-def _write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
-    temporary = path.with_name(path.name + ".new")
-    header = {**header, "sha256": hashlib.sha256(blob).hexdigest()}
-    try:
-        with open(temporary, "wb") as handle:
-            handle.write(json.dumps(header).encode() + b"\n" + blob)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise StorageError(f"cannot write checkpoint {path}: {error.strerror}; free space and --resume.") from error
-
-
-def _read_checkpoint(path: Path) -> tuple[dict[str, Any], bytes]:
-    try:
-        line, _, blob = path.read_bytes().partition(b"\n")
-        header = json.loads(line)
-        # OpenMM loads a truncated checkpoint without a word.
-        if hashlib.sha256(blob).hexdigest() != header["sha256"]:
-            raise ValueError("its checksum is wrong")
-        return header, blob
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"checkpoint {path} is damaged ({error}); start again with --overwrite.") from error

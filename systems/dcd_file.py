@@ -29,7 +29,14 @@ from systems.frame_store import (
 from systems.hdf5_file import read_columns
 from systems.pdb_text import pdb_text
 from systems.scene import Scene
-from systems.trajectory_types import Float32Array, FrameBlock, TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory_types import (
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    TrajectoryReader,
+    TrajectoryWriter,
+    check_same_topology,
+)
 
 _OUR_PDB = b"REMARK   1 surromd scene"
 
@@ -137,6 +144,10 @@ class DcdWriter(TrajectoryWriter):
         except OSError as error:
             raise self._store.failed(error) from error
         self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+
+    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
+        self._refuse_closed()
+        return self._store.series()
 
     def update_record(self, entries: dict[str, Any]) -> None:
         self._refuse_closed()

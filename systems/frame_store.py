@@ -234,6 +234,11 @@ class FrameStore:
         times: npt.NDArray[np.float64] = self._columns["time"][: min(self.n_frames, 2)]
         return times
 
+    def series(self) -> tuple[npt.NDArray[np.float64], dict[str, npt.NDArray[np.float64]]]:
+        """Return the times `(n_frames,)` ps and all scalars by name."""
+        scalars = {name.rpartition("/")[2]: c[:] for name, c in self._columns.items() if "/scalars/" in name}
+        return self._columns["time"][:], scalars
+
     def append(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
         """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError."""
         n, start = len(block), self.n_frames

@@ -90,6 +90,10 @@ class Hdf5Writer(TrajectoryWriter):
         self._store.truncate(n_frames)
         self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
 
+    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
+        self._refuse_closed()
+        return self._store.series()
+
     def update_record(self, entries: dict[str, Any]) -> None:
         self._refuse_closed()
         self._store.update_record(entries)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -54,7 +54,7 @@ class TrajectoryWriter(ABC):
         *,
         flags: npt.ArrayLike | None = None,
         chunk_idx: int | npt.ArrayLike | None = -1,
-        scalars: dict[str, npt.ArrayLike] | None = None,
+        scalars: Mapping[str, npt.ArrayLike] | None = None,
         velocities_nm_ps: npt.ArrayLike | None = None,
         forces_kj_mol_nm: npt.ArrayLike | None = None,
         cell_nm: npt.ArrayLike | None = None,
@@ -107,6 +107,10 @@ class TrajectoryWriter(ABC):
         """Cut the file to its first `n_frames` frames, to resume from there. Raises InputError, StorageError."""
 
     @abstractmethod
+    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
+        """Return the times `(n_frames,)` ps and the scalars by name of all frames written so far."""
+
+    @abstractmethod
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge JSON-able `entries` into the record (top-level keys are replaced). Raises InputError, StorageError."""
 
@@ -127,7 +131,7 @@ class TrajectoryWriter(ABC):
         time_ps: npt.ArrayLike,
         flags: npt.ArrayLike | None,
         chunk_idx: int | npt.ArrayLike | None,
-        scalars: dict[str, npt.ArrayLike],
+        scalars: Mapping[str, npt.ArrayLike],
     ) -> FrameBlock:
         where = f"{self.path}, after frame {self.n_frames}"
         positions = np.ascontiguousarray(positions_nm, dtype=np.float32)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference import simulate as module
+from md_reference import checkpoint as module
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, StorageError, TrajectoryError, UnitError, UnknownNameError

@@ -1,0 +1,49 @@
+"""Checkpoint files: one line of JSON about the run, then OpenMM's own binary state, found whole or refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError, StorageError
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Where the checkpoint of a trajectory lies: beside it, until the run is complete."""
+    return out.with_name(out.name + ".checkpoint")
+
+
+def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes, *, sync: bool) -> None:
+    """Replace the checkpoint as a whole. A process may be killed at any moment.
+
+    With `sync` it is on the medium when this returns; without, in the system's hands, which a kill does not touch, at a
+    hundredth of the cost. Raises StorageError; the checkpoint before then stays.
+    """
+    temporary = path.with_name(path.name + ".new")
+    header = {**header, "sha256": hashlib.sha256(blob).hexdigest()}
+    try:
+        with open(temporary, "wb") as handle:
+            handle.write(json.dumps(header).encode() + b"\n" + blob)
+            if sync:
+                handle.flush()
+                os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageError(f"cannot write checkpoint {path}: {error.strerror}; free space and --resume.") from error
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, Any], bytes]:
+    """Return the header and OpenMM's state. Raises InputError when they are damaged."""
+    try:
+        line, _, blob = path.read_bytes().partition(b"\n")
+        header = json.loads(line)
+        # OpenMM loads a truncated checkpoint without a word.
+        if hashlib.sha256(blob).hexdigest() != header["sha256"]:
+            raise ValueError("its checksum is wrong")
+        return header, blob
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"checkpoint {path} is damaged ({error}); start again with --overwrite.") from error
