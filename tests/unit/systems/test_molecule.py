@@ -1,0 +1,269 @@
+"""Molecules through RDKit: SMILES and MOL files to scenes and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rdkit import Chem, rdBase
+from rdkit.Chem import rdDepictor
+
+from surrogate.bench.smiles import Case, cases, what_is_wrong
+from systems import library
+from systems.embedding import refuse_changed_stereo, stereo_labels
+from systems.errors import InputError, PreparationError
+from systems.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles, to_rdkit
+from systems.prepare import prepare
+from systems.scene import Scene
+
+ACCEPTED = [c for c in cases() if not c.refusal]
+REFUSED = [c for c in cases() if c.refusal]
+PEPTIDE_LIKE = "C[C@H]([NH3+])C(=O)N/C=C/c1ccccc1"
+
+
+def _canonical(molecule: Any) -> str:
+    with rdBase.BlockLogs():
+        return Chem.MolToSmiles(Chem.RemoveHs(molecule))
+
+
+def _hill_counts(formula: str) -> list[tuple[str, str]]:
+    import re
+
+    return sorted(re.findall(r"([A-Z][a-z]?)(\d*)", formula))
+
+
+# ---- the list of fifty --------------------------------------------------------------------------------------------
+
+
+def test_the_list_has_fifty_varied_molecules() -> None:
+    assert len(cases()) == len({c.name for c in cases()}) == len({c.smiles for c in cases()}) == 50
+    kinds = {c.kind for c in cases()}
+    assert {"charged", "zwitterion", "halogen", "sulfur", "phosphorus", "macrocycle", "stereo"} <= kinds
+    assert {"radical", "salt", "metal", "element"} <= kinds
+
+
+@pytest.mark.parametrize("case", ACCEPTED, ids=lambda c: c.name)
+def test_each_is_prepared_as_it_is_known(case: Case) -> None:
+    scene = prepare(f"smiles:{case.smiles}")
+    assert _hill_counts(scene.formula) == _hill_counts(case.formula)
+    assert int(scene.formal_charges.sum()) == case.charge
+    assert (scene.provenance["multiplicity"], n_unpaired_electrons(scene)) == (case.multiplicity, case.multiplicity - 1)
+    given = Chem.AddHs(Chem.MolFromSmiles(case.smiles))
+    asked, drawn = stereo_labels(given), stereo_labels(to_rdkit(scene))
+    assert "".join(sorted(asked.values())) == case.stereo
+    assert {k: drawn.get(k) for k in asked} == asked
+    said = [line for line in scene.provenance["repairs"] if "not specified: drawn as" in line]
+    assert len(said) == len(set(drawn) - set(asked))
+    assert [a.GetFormalCharge() for a in given.GetAtoms()] == scene.formal_charges.tolist()
+    assert len(set(scene.atom_names)) == scene.n_atoms and max(map(len, scene.atom_names)) <= 4
+    assert set(scene.residue_names) == {"MOL"}
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=lambda c: c.name)
+def test_each_refusal_names_its_reason_in_one_line(case: Case) -> None:
+    with pytest.raises(PreparationError) as caught:
+        prepare(f"smiles:{case.smiles}")
+    assert case.refusal in str(caught.value)
+    assert case.smiles in str(caught.value) and "\n" not in str(caught.value)
+
+
+# ---- SMILES -------------------------------------------------------------------------------------------------------
+
+
+def test_one_seed_gives_one_geometry_and_another_seed_another() -> None:
+    first, again, other = (scene_from_smiles("CCCCO", seed=s) for s in (3, 3, 4))
+    assert (first.positions_nm == again.positions_nm).all()
+    assert np.abs(first.positions_nm - other.positions_nm).max() > 1e-3
+    assert first.molecule_key == other.molecule_key
+
+
+def test_enantiomers_keep_their_hands() -> None:
+    left, right = (scene_from_smiles(s) for s in ("N[C@@H](C)C(=O)O", "N[C@H](C)C(=O)O"))
+    assert (list(stereo_labels(to_rdkit(left)).values()), list(stereo_labels(to_rdkit(right)).values())) == (
+        ["S"],
+        ["R"],
+    )
+    mirrored = left.with_positions(left.positions_nm * [1, 1, -1])
+    assert stereo_labels(to_rdkit(mirrored)) == stereo_labels(to_rdkit(right))
+
+
+def test_changed_stereo_is_refused() -> None:
+    left, right = (to_rdkit(scene_from_smiles(s)) for s in ("N[C@@H](C)C(=O)O", "N[C@H](C)C(=O)O"))
+    refuse_changed_stereo(left, left)
+    with pytest.raises(PreparationError, match="stereocentre C1 is S in the input and R in 3-D"):
+        refuse_changed_stereo(left, right)
+    trans, cis = (to_rdkit(scene_from_smiles(s)) for s in ("C/C=C/C", r"C/C=C\C"))
+    with pytest.raises(PreparationError, match="double bond C2=C3 is E in the input and Z in 3-D"):
+        refuse_changed_stereo(trans, cis)
+
+
+def test_what_is_left_out_is_said() -> None:
+    assert scene_from_smiles("[2H]CO").provenance["repairs"] == [
+        "isotope labels (2H) left out: all atoms have natural masses"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("smiles", "expected"),
+    [
+        ("", "empty"),
+        ("C1CC", "cannot be read"),
+        ("c1cncc1", "kekulize"),
+        ("C(C)(C)(C)(C)C", "valence"),
+        ("CC>>CO", "reaction"),
+        ("*CC", "wildcard"),
+        ("[Na+]", "metals"),
+        ("[Ar]", "it holds Ar"),
+        ("C" * 1200, "embedded up to 999"),
+        ("CC1(C)[C@@H]2CC[C@]1(C)C(=O)C2", "no 3-D geometry"),
+    ],
+)
+def test_impossible_smiles_are_refused_in_one_line(smiles: str, expected: str) -> None:
+    with pytest.raises(PreparationError, match=expected) as caught:
+        prepare(f"smiles:{smiles}")
+    assert "\n" not in str(caught.value)
+
+
+# ---- to RDKit and back --------------------------------------------------------------------------------------------
+
+
+def test_to_rdkit_is_exact_for_bonds_charges_and_aromaticity() -> None:
+    for smiles in (
+        PEPTIDE_LIKE,
+        "c1ccc2[nH]ccc2c1",
+        "C[S@](=O)c1ccncc1",
+        "[O-][n+]1ccccc1",
+        "CP(=O)([O-])[O-]",
+        "[C-]#[O+]",
+    ):
+        scene = scene_from_smiles(smiles)
+        back = to_rdkit(scene)
+        assert _canonical(back) == Chem.CanonSmiles(smiles)
+        assert back.GetConformer().GetPositions() == pytest.approx(scene.positions_nm * 10)
+        assert [a.GetPDBResidueInfo().GetName().strip() for a in back.GetAtoms()] == list(scene.atom_names)
+
+
+def test_to_rdkit_reads_a_peptide() -> None:
+    scene = library.load("alanine-dipeptide")
+    assert _canonical(to_rdkit(scene)) == Chem.CanonSmiles("CC(=O)N[C@@H](C)C(=O)NC")
+
+
+def test_to_rdkit_refuses_what_it_cannot_know() -> None:
+    scene = scene_from_smiles("CC")
+    with pytest.raises(PreparationError, match="order of the bond C1 - C2 is not known"):
+        to_rdkit(replace(scene, bond_orders=np.zeros(7)))
+    with pytest.raises(PreparationError, match="no molecule RDKit accepts"):
+        to_rdkit(replace(scene, bond_orders=np.full(7, 3.0)))
+
+
+# ---- MOL files ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def molecule() -> Any:
+    return to_rdkit(scene_from_smiles(PEPTIDE_LIKE))
+
+
+def _flat(whole: Any) -> str:
+    drawing = Chem.MolFromSmiles(PEPTIDE_LIKE)
+    rdDepictor.Compute2DCoords(drawing)
+    Chem.WedgeMolBonds(drawing, drawing.GetConformer())
+    return Chem.MolToMolBlock(drawing)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "write", "notes"),
+    [
+        ("mol", Chem.MolToMolBlock, []),
+        ("sdf", lambda m: Chem.MolToV3KMolBlock(m) + "$$$$\n", []),
+        ("sdf", lambda m: (Chem.MolToMolBlock(m) + "$$$$\n") * 2, ["2 molecules in the file: the first is taken"]),
+        ("mol", lambda m: Chem.MolToMolBlock(Chem.RemoveHs(m)), ["hydrogens added: 15"]),
+        ("mol", _flat, ["hydrogens added: 15", "a flat drawing: 3-D coordinates embedded, stereo from its wedges"]),
+    ],
+    ids=["mol", "v3000", "two", "no-hydrogens", "flat"],
+)
+def test_mol_files_keep_stereo_and_charge(
+    tmp_path: Path, molecule: Any, suffix: str, write: Callable[[Any], str], notes: list[str]
+) -> None:
+    path = tmp_path / f"x.{suffix}"
+    path.write_text(write(molecule))
+    scene = prepare(str(path))
+    assert scene.provenance["repairs"] == notes
+    assert (scene.formula, int(scene.formal_charges.sum())) == ("C11H15N2O", 1)
+    assert _canonical(to_rdkit(scene)) == Chem.CanonSmiles(PEPTIDE_LIKE)
+    if not notes:
+        assert scene.positions_nm * 10 == pytest.approx(molecule.GetConformer().GetPositions(), abs=1e-3)
+
+
+MOL2 = """@<TRIPOS>MOLECULE
+methylammonium
+ 8 7 1
+SMALL
+{kind}
+@<TRIPOS>ATOM
+1 C1  0.0000  0.0000  0.0000 C.3 1 MOL {c}
+2 N1  1.4900  0.0000  0.0000 N.4 1 MOL {n}
+3 H1 -0.3600  1.0300  0.0000 H 1 MOL {h}
+4 H2 -0.3600 -0.5100  0.8900 H 1 MOL {h}
+5 H3 -0.3600 -0.5100 -0.8900 H 1 MOL {h}
+6 H4  1.8300 -0.9600  0.0000 H 1 MOL {h}
+7 H5  1.8300  0.4800  0.8300 H 1 MOL {h}
+8 H6  1.8300  0.4800 -0.8300 H 1 MOL {h}
+@<TRIPOS>BOND
+1 1 2 1
+2 1 3 1
+3 1 4 1
+4 1 5 1
+5 2 6 1
+6 2 7 1
+7 2 8 1
+"""
+
+
+def test_mol2_charges_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "x.mol2"
+    path.write_text(MOL2.format(kind="USER_CHARGES", c=-0.2, n=-0.3, h=0.25))
+    assert int(scene_from_mol_file(path).formal_charges.sum()) == 1
+    path.write_text(MOL2.format(kind="NO_CHARGES", c=0, n=0, h=0))
+    assert int(scene_from_mol_file(path).formal_charges.sum()) == 1
+    path.write_text(MOL2.format(kind="USER_CHARGES", c=-0.2, n=-1.3, h=0.25))
+    with pytest.raises(PreparationError, match=r"add up to \+0.00, the charges its atom types imply to \+1"):
+        scene_from_mol_file(path)
+
+
+def test_broken_mol_files_are_refused_in_one_line(tmp_path: Path, molecule: Any) -> None:
+    block = Chem.MolToMolBlock(molecule)
+    lines = block.splitlines()
+    twice = [*lines[:5], lines[4][:30] + lines[5][30:], *lines[6:]]
+    for name, text, expected in (
+        ("empty.sdf", "", "is empty"),
+        ("prose.mol", "This is not\na molecule.\n", "no molecule that can be read"),
+        ("cut.mol", block[: len(block) // 2], "no molecule that can be read"),
+        ("x.mol2", block, "no @<TRIPOS>MOLECULE"),
+        ("twice.mol", "\n".join(twice), "stand on one point"),
+        ("salt.mol", Chem.MolToMolBlock(Chem.MolFromSmiles("CC(=O)[O-].[K+]")), "2 fragments"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=expected) as caught:
+            prepare(str(tmp_path / name))
+        assert name in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="does not exist"):
+        prepare(str(tmp_path / "missing.sdf"))
+
+
+# ---- the judge of the benchmark -----------------------------------------------------------------------------------
+
+
+def test_the_benchmark_sees_what_a_run_may_lose() -> None:
+    scene: Scene = scene_from_smiles("F[C@H](Cl)/C=C/C")
+    x = scene.positions_nm
+    assert what_is_wrong(scene, x) == ""
+    stretched = x.copy()
+    stretched[0] += 0.5 * (x[0] - x[1])
+    assert what_is_wrong(scene, stretched) == "the bond F1-C1 broke"
+    assert "was" in what_is_wrong(scene, x * [1, 1, -1])
+    assert what_is_wrong(scene, np.full_like(x, np.nan)) == "positions are not finite"
