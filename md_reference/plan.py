@@ -8,9 +8,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system
-from md_reference.platforms import choose_platform
+from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.integrators import check_ensemble
+from md_reference.platforms import PlatformChoice, choose_platform, measured_platform
 from md_reference.replicas import available_cores
+from md_reference.timing import as_records
 from systems.scene import Scene
 from systems.units import format_time_ps
 
@@ -32,8 +34,11 @@ class Skip:
 class Plan:
     """A run before it starts. `terms` counts the interactions of each force; what was not measured is None.
 
-    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free.
+    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `line` says
+    it all in one; `timings` is the table the platform was chosen by.
     """
+
+    line: str
 
     scene: str
     formula: str
@@ -43,6 +48,7 @@ class Plan:
     integrator: str
     platform: str
     platform_reason: str
+    timings: tuple[dict[str, Any], ...]
     threads: int
     parallel: str
     hydrogen_mass: str
@@ -71,36 +77,61 @@ def make_plan(
     replicas: int = 1,
     time_ps: float | None = None,
     equilibrate_ps: float = 100.0,
+    ensemble: str = "nvt",
+    pressure_bar: float = 1.0,
+    save_velocities: bool = False,
     measure_s: float = 0.3,
 ) -> Plan:
     """Return the plan of a run with these settings (units as in `simulate.MDConfig`).
 
-    For `measure_s` of wall time each, steps are timed as planned and as OpenMM would do it unasked; 0 times nothing.
+    The platform is the one that `reference` would measure. For `measure_s` of wall time each, steps are timed as
+    planned and as OpenMM would do it unasked; 0 times nothing, and the size of the scene decides.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
+    ensemble = check_ensemble(ensemble, scene)
+    spec = resolve(scene, spec)
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
+    side_by_side = min(replicas, cores)
+    if measure_s > 0:
+        choice = measured_platform(
+            scene,
+            spec,
+            requested=platform,
+            temperature_k=temperature_k,
+            friction_per_ps=friction_per_ps,
+            timestep_ps=timestep_ps,
+            max_threads=max(1, cores // side_by_side),
+            side_by_side=side_by_side,
+            system=lambda: system,
+        )
+    else:
+        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
     planned = default = None
     if measure_s > 0:
         bath = (temperature_k, friction_per_ps, timestep_ps)
-        planned = _time_step_s(scene, spec, bath, measure_s, platform=platform, native_gb=True)
-        default = _time_step_s(scene, spec, bath, measure_s, platform="CPU", native_gb=False)
+        planned = _time_step_s(scene, spec, bath, measure_s, choice, native_gb=True)
+        if spec.force_field not in ("gfn2-xtb", "model"):
+            alone = PlatformChoice("CPU", 1, "OpenMM's own")
+            default = _time_step_s(scene, spec, bath, measure_s, alone, native_gb=False)
     wall_s = None
     if planned is not None and time_ps is not None:
         wall_s = math.ceil(replicas / cores) * (time_ps + equilibrate_ps) / timestep_ps * planned
+    integrator = _integrator(scene, ensemble, timestep_ps, temperature_k, friction_per_ps, pressure_bar)
     return Plan(
+        line=_line(scene, spec, choice, integrator, n_constraints, planned, timestep_ps),
         scene=scene.name,
         formula=scene.formula,
         n_atoms=scene.n_atoms,
         force_field=spec.force_field,
         solvent=spec.solvent,
-        integrator=f"Langevin middle, {timestep_ps * 1000:g} fs, {temperature_k:g} K, {friction_per_ps:g}/ps",
+        integrator=integrator,
         platform=choice.name,
         platform_reason=choice.reason,
+        timings=tuple(as_records(list(choice.timings))),
         threads=choice.threads,
-        parallel=_parallel(replicas, cores),
+        parallel=_parallel(replicas, cores, choice.threads),
         hydrogen_mass="natural"
         if spec.hydrogen_mass_da is None
         else f"{spec.hydrogen_mass_da:g} Da, taken from the atom it is bonded to",
@@ -110,8 +141,8 @@ def make_plan(
         ns_per_day=None if planned is None else timestep_ps * 1e-3 * 86_400.0 / planned,
         length=None if time_ps is None else format_time_ps(time_ps),
         wall_s=wall_s,
-        skipped=_skips(scene, spec, n_constraints, planned, default),
-        warnings=_warnings(scene, spec, timestep_ps),
+        skipped=_skips(scene, spec, ensemble, n_constraints, planned, default, save_velocities=save_velocities),
+        warnings=(*spec.warnings, *_warnings(scene, spec, timestep_ps)),
     )
 
 
@@ -120,14 +151,14 @@ def _time_step_s(
     spec: ForceFieldSpec,
     bath: tuple[float, float, float],
     wall_s: float,
+    choice: PlatformChoice,
     *,
-    platform: str,
     native_gb: bool,
 ) -> float:
-    """Return the seconds of one step on one thread: the fastest of all batches, measured for `wall_s`.
+    """Return the seconds of one step: the fastest of all batches, measured for `wall_s`.
 
-    On a CPU it is processor time, which other work on the machine does not lengthen; `bath`: temperature in K, friction
-    in 1/ps, time step in ps.
+    On one core it is processor time, which other work on the machine does not lengthen; `bath`: temperature in K,
+    friction in 1/ps, time step in ps.
     """
     temperature_k, friction_per_ps, timestep_ps = bath
     with Engine(
@@ -136,27 +167,68 @@ def _time_step_s(
         temperature_k=temperature_k,
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
-        platform=platform,
+        platform=choice.name,
+        threads=choice.threads,
         native_gb=native_gb,
     ) as engine:
         engine.minimise(max_iterations=100)
         engine.thermalise()
-        engine.step(_STEPS_AT_ONCE)
-        clock = time.process_time if engine.platform_name in ("Reference", "CPU") else time.perf_counter
+        began = time.perf_counter()
+        engine.step(1)
+        at_once = max(1, min(_STEPS_AT_ONCE, round(0.25 * wall_s / max(time.perf_counter() - began, 1e-9))))
+        engine.step(at_once)
+        on_one_core = engine.platform_name in ("Reference", "CPU") and engine.threads == 1
+        clock = time.process_time if on_one_core else time.perf_counter
         fastest = math.inf
         began = time.perf_counter()
         while math.isinf(fastest) or time.perf_counter() - began < wall_s:
             start = clock()
-            engine.step(_STEPS_AT_ONCE)
-            fastest = min(fastest, (clock() - start) / _STEPS_AT_ONCE)
+            engine.step(at_once)
+            fastest = min(fastest, (clock() - start) / at_once)
         return fastest
 
 
-def _parallel(replicas: int, cores: int) -> str:
+def _integrator(
+    scene: Scene, ensemble: str, timestep_ps: float, temperature_k: float, friction_per_ps: float, pressure_bar: float
+) -> str:
+    step = f"{timestep_ps * 1000:g} fs"
+    if ensemble == "nve":
+        name = "velocity Verlet" if scene.interactions is None else "the scene's own"
+        return f"{name}, {step}, no bath (started at {temperature_k:g} K)"
+    text = f"Langevin middle, {step}, {temperature_k:g} K, {friction_per_ps:g}/ps"
+    return text + (f"; Monte Carlo barostat at {pressure_bar:g} bar" if ensemble == "npt" else "")
+
+
+def _line(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    choice: PlatformChoice,
+    integrator: str,
+    n_constraints: int,
+    step_s: float | None,
+    timestep_ps: float,
+) -> str:
+    """Return the plan in one line."""
+    threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
+    pairs = "all pairs" if scene.cell_nm is None else "PME"
+    parts = [
+        f"{scene.n_atoms} atoms, {spec.force_field} in {spec.solvent}",
+        f"{choice.name} on {threads}",
+        integrator,
+        f"{n_constraints} constraints" if n_constraints else "no constraints",
+        pairs,
+    ]
+    if step_s is not None:
+        parts.append(f"about {timestep_ps * 1e-3 * 86_400.0 / step_s:.3g} ns/day")
+    return "; ".join(parts)
+
+
+def _parallel(replicas: int, cores: int, threads: int) -> str:
+    each = "one thread" if threads == 1 else f"{threads} threads"
     if replicas == 1:
-        return "one replica, one thread"
+        return f"one replica, {each}"
     side_by_side = min(replicas, cores)
-    return f"{replicas} replicas, {side_by_side} side by side, one process and one thread each"
+    return f"{replicas} replicas, {side_by_side} side by side, one process and {each} each"
 
 
 def _terms(system: Any) -> dict[str, int]:
@@ -176,15 +248,31 @@ def _terms(system: Any) -> dict[str, int]:
 
 
 def _skips(
-    scene: Scene, spec: ForceFieldSpec, n_constraints: int, planned: float | None, default: float | None
+    scene: Scene,
+    spec: ForceFieldSpec,
+    ensemble: str,
+    n_constraints: int,
+    planned: float | None,
+    default: float | None,
+    *,
+    save_velocities: bool,
 ) -> tuple[Skip, ...]:
-    skips = [
-        Skip("periodic box, PME, neighbour lists", "the scene has no periodic cell; all pairs are computed exactly"),
-        Skip("barostat", "there is no volume to control"),
-        Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"),
-        Skip("velocities on disk", "neither the surrogate nor the judge reads them", "half of the file"),
-        Skip("energies and copies between saved frames", "nobody keeps them"),
-    ]
+    skips = []
+    if scene.cell_nm is None:
+        skips.append(
+            Skip("periodic box, PME, neighbour lists", "the scene has no periodic cell; all pairs are computed exactly")
+        )
+        skips.append(Skip("barostat", "there is no volume to control"))
+    elif ensemble != "npt":
+        skips.append(Skip("barostat", f"the ensemble is {ensemble}; npt has one"))
+    if ensemble == "nve":
+        skips.append(Skip("thermostat", "the ensemble is nve"))
+        skips.append(Skip("removal of centre-of-mass motion", "it is put at rest once and stays there"))
+    else:
+        skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
+    if not save_velocities:
+        skips.append(Skip("velocities on disk", "nobody asked for them (--save-velocities)", "half of the file"))
+    skips.append(Skip("energies and copies between saved frames", "nobody keeps them"))
     if spec.solvent == "vacuum":
         skips.append(Skip("generalised Born term", "the solvent is vacuum"))
     elif spec.solvent == "obc2":
