@@ -6,6 +6,7 @@ import contextlib
 import io
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -13,12 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.bonding import Bonding, Residue
+from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
 from systems.residues import template_for
 from systems.structure import atom_label
 
+_C_OXT_ANGSTROM = 1.25
+_HYDROGEN_ANGSTROM = {"C": 1.09, "N": 1.01, "O": 0.96, "S": 1.34}
 # Hydrogens (in OpenMM's names) whose presence tells the protonation state.
 _TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}
 _STATES = {
@@ -63,6 +67,8 @@ def complete(
     positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
     _refuse_lost_bonds(records, bonds, atoms, bonding)
+    names = {(r.key, a) for r in residues for a in r.heavy}
+    records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
     account = _account(residues, records)
     account += protonation_account([r.label for r in residues], [r.key for r in residues], variants, records, ph)
@@ -194,24 +200,57 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
                 head = f"ATOM  {len(lines) % 100000:5d} {padded:<4s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
                 x, y, z = atom.position_angstrom
                 lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00          {atom.element.upper():>2s}")
-            if "CB" in residue.missing:
-                x, y, z = _natural_cb(residue, atoms)
-                head = f"ATOM  {len(lines) % 100000:5d}  CB  {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
-                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           C")
+            for name, (x, y, z) in _built(residue, atoms).items():
+                head = f"ATOM  {len(lines) % 100000:5d}  {name:<3s} {residue_name[:3]:>3s} {letter}{number % 10000:4d}"
+                lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {name[0]}")
         lines.append("TER")
     return "\n".join([*lines, "END", ""])
 
 
-def _natural_cb(residue: Residue, atoms: Sequence[AtomRecord]) -> list[float]:
-    """CB of an L residue in Å, from N, CA and C: PDBFixer superposes its template on N, CA, C and O, which are nearly
-    in one plane, and then and now comes out with a D residue.
+def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[float]]:
+    """Positions in Å of a missing CB (of an L residue) and OXT, from the backbone.
 
-    The coefficients are those of ideal geometry (Dauparas et al., Science 378, 49, 2022, code of ProteinMPNN).
+    PDBFixer superposes its template on N, CA, C and O, which are nearly in one plane, and then and now comes out with a
+    D residue; an OXT it adds may stand 3 Å from its carbon.
     """
-    n, ca, c = (np.array(atoms[residue.heavy[a]].position_angstrom) for a in ("N", "CA", "C"))
-    b, d = ca - n, c - ca
-    position: list[float] = (-0.58273431 * np.cross(b, d) + 0.56802827 * b - 0.54067466 * d + ca).tolist()
-    return position
+    heavy = {a: np.array(atoms[i].position_angstrom) for a, i in residue.heavy.items()}
+    out: dict[str, list[float]] = {}
+    if "CB" in residue.missing and {"N", "CA", "C"} <= set(heavy):
+        b, d = heavy["CA"] - heavy["N"], heavy["C"] - heavy["CA"]
+        # Ideal geometry: the coefficients of ProteinMPNN (Dauparas et al., Science 378, 49, 2022).
+        out["CB"] = (-0.58273431 * np.cross(b, d) + 0.56802827 * b - 0.54067466 * d + heavy["CA"]).tolist()
+    if "OXT" in residue.missing and {"CA", "C", "O"} <= set(heavy):
+        away = sum((heavy["C"] - heavy[a]) / np.linalg.norm(heavy["C"] - heavy[a]) for a in ("CA", "O"))
+        out["OXT"] = (heavy["C"] + _C_OXT_ANGSTROM * away / np.linalg.norm(away)).tolist()
+    return out
+
+
+def _with_usual_lengths(
+    records: list[AtomRecord], bonds: npt.NDArray[np.int64], kept: set[tuple[tuple[str, str, str], str]]
+) -> list[AtomRecord]:
+    """Put each added hydrogen at the usual distance from its atom (Modeller leaves some 10 % too much); refuse heavy
+    atoms that were put nowhere near theirs. `kept`: residue and name of the atoms that the file had.
+    """
+    out = list(records)
+    for i, j in bonds.tolist():
+        if records[i].element == "H":
+            i, j = j, i
+        if {(records[k].residue_key, records[k].name) for k in (i, j)} <= kept:
+            continue
+        x, y = (np.array(records[k].position_angstrom) for k in (i, j))
+        length = float(np.linalg.norm(y - x))
+        usual = _HYDROGEN_ANGSTROM.get(records[i].element)
+        if records[j].element == "H" and usual is not None and length > 0:
+            x_new, y_new, z_new = (x + usual / length * (y - x)).tolist()
+            out[j] = replace(records[j], position_angstrom=(x_new, y_new, z_new))
+            continue
+        expected = 10.0 * (covalent_radius_nm(records[i].element) + covalent_radius_nm(records[j].element))
+        if not 0.75 * expected < length < 1.25 * expected:
+            raise PreparationError(
+                f"{atom_label(records[i])} and {atom_label(records[j])} came out {length:.2f} Å apart when missing "
+                "atoms were added; give the residue with all its heavy atoms."
+            )
+    return out
 
 
 def _refuse_lost_bonds(
@@ -235,8 +274,6 @@ def _keep_hydrogens(
     records: list[AtomRecord], bonds: npt.NDArray[np.int64], atoms: Sequence[AtomRecord], bonding: Bonding
 ) -> list[AtomRecord]:
     """Put the file's hydrogens back where a heavy atom has as many as before."""
-    from dataclasses import replace
-
     whole = {r.key: r for r in bonding.residues if r.heavy and not r.lacks_hydrogens}
     old_at: dict[int, list[int]] = {}
     for i, j in bonding.bonds.tolist():

@@ -11,6 +11,7 @@ import pytest
 from systems import library
 from systems.bonding import find_bonds
 from systems.errors import InputError, PreparationError
+from systems.geometry import signed_volumes
 from systems.handedness import compare, handedness, say_inverted
 from systems.heterogens import ligand_atoms
 from systems.hybrid36 import decode, encode
@@ -18,7 +19,7 @@ from systems.modified_residues import standardise
 from systems.pdb_records import AtomRecord, read_structure
 from systems.pdb_text import pdb_text
 from systems.prepare import prepare
-from systems.repair import complete, protonation_account
+from systems.repair import _with_usual_lengths, complete, protonation_account
 
 ALA2 = library.load("alanine-dipeptide")
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
@@ -124,6 +125,39 @@ def test_a_missing_cb_is_built_l_whatever_psi(shared_data: Path) -> None:
     index = {n: i for i, n in enumerate(scene.atom_names[:11])}
     heavy = {a: _record(a, "ALA", "1", *(scene.positions_nm[index[a]] * 10), a[0]) for a in ("N", "CA", "C", "CB")}
     assert handedness([(("A", "1", "ALA"), "ALA", heavy)]) == {(("A", "1", "ALA"), "CA"): 1}
+
+
+def test_added_atoms_stand_at_their_usual_distances(tmp_path: Path) -> None:
+    heavy = ("CH3", "C", "O", "N", "CA", "CB")  # ACE and ALA without hydrogens: OXT has to be added, too
+    lines = [ln for ln in _peptide().splitlines() if ln[17:20] != "NME" and ln[12:16].strip() in heavy]
+    scene = prepare(_write(tmp_path / "x.pdb", "\n".join(lines) + "\n"))
+    names = scene.atom_names
+    length = {
+        (names[i], names[j]): float(np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j]))
+        for i, j in scene.bonds.tolist()
+    }
+    assert length["C", "OXT"] == pytest.approx(0.125, abs=1e-4)
+    assert length["N", "H"] == pytest.approx(0.101, abs=1e-4)
+    assert [length["CB", f"HB{k}"] for k in (1, 2, 3)] == pytest.approx([0.109] * 3, abs=1e-4)
+    at = {
+        n: scene.positions_nm[i] for i, n in enumerate(names) if scene.residue_names[scene.residue_of_atom[i]] == "ALA"
+    }
+    flat = signed_volumes(np.array([at[a] for a in ("C", "CA", "O", "OXT")]), [[0, 1, 2, 3]])
+    assert abs(float(flat[0])) < 2e-5
+
+
+def test_atoms_put_nowhere_near_theirs_are_refused() -> None:
+    """PDBFixer 1.12 put the OXT of a free proline 3.1 Å from its carbon."""
+    key = ("A", "1", "PRO")
+    for x, fits in ((1.25, True), (3.1, False)):
+        atoms = [_record("C", "PRO", "1", 0, 0, 0, "C"), _record("OXT", "PRO", "1", x, 0, 0, "O")]
+        bonds = np.array([[0, 1]])
+        assert _with_usual_lengths(atoms, bonds, {(key, "C"), (key, "OXT")}) == atoms
+        if fits:
+            assert _with_usual_lengths(atoms, bonds, {(key, "C")}) == atoms
+        else:
+            with pytest.raises(PreparationError, match=r"PRO A1 C and PRO A1 OXT came out 3.10 Å apart"):
+                _with_usual_lengths(atoms, bonds, {(key, "C")})
 
 
 def test_inverted_centres_are_seen_said_and_refused() -> None:
