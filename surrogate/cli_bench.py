@@ -1,0 +1,65 @@
+"""The verb `bench`: parsing and printing of benchmarks; each is a function of `surrogate.bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogate.cli_options import JsonOpt, QuietOpt
+from surrogate.cli_printing import print_json
+from systems.units import parse_wall_s
+
+if TYPE_CHECKING:
+    from surrogate.bench.reference import Row
+
+bench = typer.Typer(no_args_is_help=True, help="Benchmarks: what is fast, and by how much, on this machine.")
+
+
+@bench.callback()
+def _benchmarks() -> None:
+    """Keep `bench` a group, however many benchmarks it has."""
+
+
+@bench.command()
+def reference(
+    quick: Annotated[bool, typer.Option("--quick", help="Three sizes, short timings: a minute or two.")] = False,
+    case: Annotated[list[str] | None, typer.Option("--case", help="Only this scene; may be repeated.")] = None,
+    rounds: Annotated[
+        int | None, typer.Option("--rounds", min=1, help="How often each is timed: 7; 3 if quick.")
+    ] = None,
+    seconds: Annotated[str | None, typer.Option("--seconds", help="Of each timing: 3s; 0.3s if quick.")] = None,
+    cores: Annotated[int | None, typer.Option("--cores", min=1, help="Cores to use; all.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the result here, .json.")] = None,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Our OpenMM set-up against OpenMM's plain defaults: same model, time step and cores. Wants an idle machine."""
+    from surrogate.bench.reference import run_benchmark, select_cases, table_head, table_line, write_json
+
+    cases = select_cases(case, quick=quick)
+    shown = not (quiet or as_json)
+
+    def report(row: Row) -> None:
+        if shown:
+            typer.echo(table_line(row))
+
+    if shown:
+        typer.echo("ns/day of all cores together; ratio: ours over the faster of OpenMM's two ways, [least, greatest]")
+        typer.echo(table_head())
+    result = run_benchmark(
+        cases,
+        rounds=rounds or (3 if quick else 7),
+        seconds=parse_wall_s(seconds, "--seconds") if seconds is not None else (0.3 if quick else 3.0),
+        cores=cores,
+        report=report,
+        skipped=lambda line: typer.echo(f"left out: {line}", err=True),
+    )
+    if out is not None:
+        write_json(result, out)
+    if as_json:
+        print_json(result)
+    if not result["rows"] or not all(row["equal_energies"] for row in result["rows"]):
+        typer.echo("error: no case ran, or energies differ: see above.", err=True)
+        raise typer.Exit(1)
