@@ -11,29 +11,34 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, find_trajectories, guarded_outputs
 from surrogate.progress import progress_bar
 from systems.errors import InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
-    from md_reference.forcefield import ForceFieldSpec
+    from md_reference.simulate import MDConfig
     from surrogate.judge.comparison import Comparison
     from systems.scene import Scene
 
 PathLike = str | Path
 Trajectories = PathLike | Sequence[PathLike]
+# Where None says something itself.
+Default = Literal["default"]
 
 
 def systems(name: str | None = None) -> list[dict[str, Any]]:
-    """Return what the library holds: one record per named scene, or the one asked for, with its atoms and torsions.
+    """Return what the library holds: one record per named scene, or the one asked for, with its protocol and atoms.
 
     Raises UnknownNameError (with the nearest name).
     """
     from systems import library
 
-    return [_describe(each, whole=name is not None) for each in ([name] if name is not None else library.names())]
+    if name is not None:
+        return [_describe(name, whole=True)]
+    groups = library.groups()
+    return [_describe(each, whole=False) | {"group": group} for group in groups for each in groups[group]]
 
 
 def _describe(name: str, *, whole: bool) -> dict[str, Any]:
@@ -55,10 +60,14 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
             "atoms": list(scene.atom_names),
             "mass_da": float(scene.masses_da.sum()),
             "charge_e": int(scene.formal_charges.sum()),
-            "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items()},
+            "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
             "topology_hash": scene.topology_hash,
             "molecule_key": scene.molecule_key,
+            "protocol": {k: "natural" if v is None else v for k, v in library.protocol(name).items()},
+            "protocol_source": library.protocol_source(name),
         }
+        if scene.interactions is not None:
+            record["law"] = scene.interactions
     return record
 
 
@@ -79,13 +88,13 @@ def _prepare(
 def plan(
     scene: str | Scene,
     *,
-    force_field: str = "ff14SB",
-    solvent: str = "obc2",
-    temperature_k: float = 300.0,
-    friction_per_ps: float = 1.0,
-    timestep_ps: float = 0.004,
-    hydrogen_mass_da: float | None = 3.0,
-    ensemble: str = "nvt",
+    force_field: str | None = None,
+    solvent: str | None = None,
+    temperature_k: float | None = None,
+    friction_per_ps: float | None = None,
+    timestep_ps: float | None = None,
+    hydrogen_mass_da: float | Default | None = "default",
+    ensemble: str | None = None,
     replicas: int = 1,
     platform: str = "auto",
     ph: float = 7.0,
@@ -102,17 +111,34 @@ def plan(
     """
     from md_reference.plan import make_plan
 
-    _check_ensemble(ensemble)
-    return make_plan(
-        _prepare(scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=False),
-        _force(force_field, solvent, hydrogen_mass_da),
+    molecule = _prepare(
+        scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=False
+    )
+    config, protocol = _settle(
+        molecule,
+        time_ps=1.0 if time_ps is None else time_ps,
+        seed=0,
+        force_field=force_field,
+        solvent=solvent,
         temperature_k=temperature_k,
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
+        hydrogen_mass_da=hydrogen_mass_da,
+        ensemble=ensemble,
+        platform=platform,
+    )
+    found = make_plan(
+        molecule,
+        config.force,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
         platform=platform,
         replicas=replicas,
         time_ps=time_ps,
+        equilibrate_ps=config.equilibrate_ps,
     ).to_dict()
+    return found | ({"protocol": protocol} if protocol else {})
 
 
 def reference(
@@ -120,14 +146,14 @@ def reference(
     out: PathLike,
     *,
     time_ps: float,
-    save_every_ps: float = 1.0,
-    force_field: str = "ff14SB",
-    solvent: str = "obc2",
-    temperature_k: float = 300.0,
-    friction_per_ps: float = 1.0,
-    timestep_ps: float = 0.004,
-    hydrogen_mass_da: float | None = 3.0,
-    ensemble: str = "nvt",
+    save_every_ps: float | None = None,
+    force_field: str | None = None,
+    solvent: str | None = None,
+    temperature_k: float | None = None,
+    friction_per_ps: float | None = None,
+    timestep_ps: float | None = None,
+    hydrogen_mass_da: float | Default | None = "default",
+    ensemble: str | None = None,
     replicas: int = 1,
     platform: str = "auto",
     ph: float = 7.0,
@@ -142,47 +168,62 @@ def reference(
     """Simulate a scene with OpenMM (Langevin middle integrator) and return the trajectories written.
 
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
-    `seed + 1`, ... `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
+    `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
+    (`systems(name)`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs,
+    3 Da, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
     `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.replicas import replica_paths, simulate_replicas
-    from md_reference.simulate import MDConfig
 
-    _check_ensemble(ensemble)
-    config = MDConfig(
-        time_ps=time_ps,
-        save_every_ps=save_every_ps,
-        temperature_k=temperature_k,
-        friction_per_ps=friction_per_ps,
-        timestep_ps=timestep_ps,
-        seed=seed,
-        platform=platform,
-        force=_force(force_field, solvent, hydrogen_mass_da),
-    )
-    _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything is prepared
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
     molecule = _prepare(
         scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=quiet
     )
+    config, protocol = _settle(
+        molecule,
+        time_ps=time_ps,
+        save_every_ps=save_every_ps,
+        seed=seed,
+        force_field=force_field,
+        solvent=solvent,
+        temperature_k=temperature_k,
+        friction_per_ps=friction_per_ps,
+        timestep_ps=timestep_ps,
+        hydrogen_mass_da=hydrogen_mass_da,
+        ensemble=ensemble,
+        platform=platform,
+    )
+    if protocol and not quiet:
+        sys.stderr.write(f"{molecule.name}: {protocol}\n")
     label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
     with (
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
-        progress_bar(label, quiet=quiet, ps_per_frame=save_every_ps) as progress,
+        progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
         return simulate_replicas(molecule, config, outs, resume=resume, overwrite=overwrite, progress=progress)
 
 
-def _force(force_field: str, solvent: str, hydrogen_mass_da: float | None) -> ForceFieldSpec:
-    from md_reference.forcefield import ForceFieldSpec
+def _settle(
+    scene: Scene, *, time_ps: float, seed: int, hydrogen_mass_da: float | Default | None, **given: Any
+) -> tuple[MDConfig, str]:
+    """Return the settings of a run, and a line about what the library's protocol decided.
 
-    return ForceFieldSpec(force_field=force_field, solvent=solvent, hydrogen_mass_da=hydrogen_mass_da)
+    `given`: fields of MDConfig and ForceFieldSpec, None where the user leaves them open. Raises InputError.
+    """
+    from md_reference.campaign_settings import to_config
+    from md_reference.integrators import check_ensemble
+    from md_reference.protocol import settle
 
-
-def _check_ensemble(ensemble: str) -> None:
-    if ensemble.lower() != "nvt":
-        raise InputError(f"ensemble {ensemble!r} is not available; only nvt (Langevin) is, so far.")
+    asked = {key: value for key, value in given.items() if value is not None}
+    if hydrogen_mass_da != "default":
+        asked["hydrogen_mass_da"] = hydrogen_mass_da
+    settings, protocol = settle(scene, asked)
+    settings |= {"time_ps": time_ps, "ensemble": check_ensemble(settings["ensemble"], scene)}
+    config = to_config(settings, seed=seed)
+    _ = config.steps_per_frame  # uneven intervals are refused before anything runs
+    return config, protocol
 
 
 def rollout(

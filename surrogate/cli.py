@@ -33,7 +33,7 @@ from surrogate.cli_options import (
     TimestepOpt,
     parse_hydrogen_mass_da,
 )
-from surrogate.cli_printing import print_comparison, print_json, print_pairs, print_written
+from surrogate.cli_printing import print_comparison, print_json, print_library, print_pairs, print_written
 from systems.errors import SurromdError
 from systems.units import (
     parse_rate_per_ps,
@@ -127,8 +127,7 @@ def systems(
     if as_json:
         print_json(found)
     elif name is None:
-        for entry in found:
-            typer.echo(f"{entry['name']:<24} {entry['n_atoms']:>5} atoms  {entry['formula']:<14} {entry['title']}")
+        print_library(found)
     else:
         print_pairs(found[0])
 
@@ -137,13 +136,13 @@ def systems(
 def plan(
     scene: SceneArg,
     time: Annotated[str | None, typer.Option("--time", help="Estimate the wall time of a run this long.")] = None,
-    force_field: ForceFieldOpt = "ff14SB",
-    solvent: SolventOpt = "obc2",
-    temperature: TemperatureOpt = "300K",
-    friction: FrictionOpt = "1/ps",
-    timestep: TimestepOpt = "4fs",
-    hydrogen_mass: HydrogenMassOpt = "3Da",
-    ensemble: EnsembleOpt = "nvt",
+    force_field: ForceFieldOpt = None,
+    solvent: SolventOpt = None,
+    temperature: TemperatureOpt = None,
+    friction: FrictionOpt = None,
+    timestep: TimestepOpt = None,
+    hydrogen_mass: HydrogenMassOpt = None,
+    ensemble: EnsembleOpt = None,
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
     ph: PhOpt = 7.0,
@@ -159,10 +158,10 @@ def plan(
         scene,
         force_field=force_field,
         solvent=solvent,
-        temperature_k=parse_temperature_k(temperature, "--temperature"),
-        friction_per_ps=parse_rate_per_ps(friction, "--friction"),
-        timestep_ps=parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da=parse_hydrogen_mass_da(hydrogen_mass),
+        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
+        friction_per_ps=None if friction is None else parse_rate_per_ps(friction, "--friction"),
+        timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
+        hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,
@@ -183,14 +182,16 @@ def reference(
     scene: SceneArg,
     time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
-    save_every: Annotated[str, typer.Option("--save-every", help="Interval between saved frames.")] = "1ps",
-    force_field: ForceFieldOpt = "ff14SB",
-    solvent: SolventOpt = "obc2",
-    temperature: TemperatureOpt = "300K",
-    friction: FrictionOpt = "1/ps",
-    timestep: TimestepOpt = "4fs",
-    hydrogen_mass: HydrogenMassOpt = "3Da",
-    ensemble: EnsembleOpt = "nvt",
+    save_every: Annotated[
+        str | None, typer.Option("--save-every", help="Interval between saved frames. [default: 1ps]")
+    ] = None,
+    force_field: ForceFieldOpt = None,
+    solvent: SolventOpt = None,
+    temperature: TemperatureOpt = None,
+    friction: FrictionOpt = None,
+    timestep: TimestepOpt = None,
+    hydrogen_mass: HydrogenMassOpt = None,
+    ensemble: EnsembleOpt = None,
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
     ph: PhOpt = 7.0,
@@ -210,13 +211,13 @@ def reference(
         scene,
         out,
         time_ps=parse_time_ps(time, "--time"),
-        save_every_ps=parse_time_ps(save_every, "--save-every"),
+        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
         force_field=force_field,
         solvent=solvent,
-        temperature_k=parse_temperature_k(temperature, "--temperature"),
-        friction_per_ps=parse_rate_per_ps(friction, "--friction"),
-        timestep_ps=parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da=parse_hydrogen_mass_da(hydrogen_mass),
+        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
+        friction_per_ps=None if friction is None else parse_rate_per_ps(friction, "--friction"),
+        timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
+        hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
         replicas=replicas,
         platform=platform,

@@ -23,13 +23,21 @@ PhOpt = Annotated[float, typer.Option("--ph", min=0.0, max=14.0, help="Where a p
 KeepLigandOpt = Annotated[bool, typer.Option("--keep-ligand", help="Simulate ligands and ions beside a peptide, too.")]
 DropLigandOpt = Annotated[bool, typer.Option("--drop-ligand", help="Leave ligands and ions beside a peptide out.")]
 DropWaterOpt = Annotated[bool, typer.Option("--drop-water", help="Leave the file's waters out.")]
-ForceFieldOpt = Annotated[str, typer.Option("--force-field", help="ff14SB or ff99SB-ILDN.")]
-SolventOpt = Annotated[str, typer.Option("--solvent", help="obc2, vacuum or amber99-obc.")]
-TemperatureOpt = Annotated[str, typer.Option("--temperature", help="Of the bath.")]
-FrictionOpt = Annotated[str, typer.Option("--friction", help="Of the Langevin bath.")]
-TimestepOpt = Annotated[str, typer.Option("--timestep", help="Integration step.")]
-HydrogenMassOpt = Annotated[str, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'.")]
-EnsembleOpt = Annotated[str, typer.Option("--ensemble", help="nvt.")]
+# What a verb is not told comes from the protocol of a library scene, else from what the help calls the default.
+ForceFieldOpt = Annotated[
+    str | None,
+    typer.Option("--force-field", help="ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb. [default: auto]"),
+]
+SolventOpt = Annotated[
+    str | None, typer.Option("--solvent", help="obc2, gbn2, tip3p, opc, vacuum, amber99-obc. [default: auto]")
+]
+TemperatureOpt = Annotated[str | None, typer.Option("--temperature", help="Of the bath. [default: 300K]")]
+FrictionOpt = Annotated[str | None, typer.Option("--friction", help="Of the Langevin bath. [default: 1/ps]")]
+TimestepOpt = Annotated[str | None, typer.Option("--timestep", help="Integration step. [default: 4fs]")]
+HydrogenMassOpt = Annotated[
+    str | None, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'. [default: 3Da]")
+]
+EnsembleOpt = Annotated[str | None, typer.Option("--ensemble", help="nvt, nve or npt. [default: nvt]")]
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
 ]

@@ -49,6 +49,20 @@ def _plain(value: Any, digits: int = 6) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
+def print_library(entries: list[dict[str, Any]]) -> None:
+    """Print the named scenes in their groups, a line each, and what can be had besides."""
+    from systems.library import on_demand
+
+    group = ""
+    for entry in entries:
+        if entry["group"] != group:
+            typer.echo(f"{chr(10) if group else ''}{entry['group']}")
+            group = entry["group"]
+        size = f"{entry['n_atoms']:>4} atoms  {entry['formula']}"
+        typer.echo(f"  {entry['name']:<20} {size:<26} {entry['title']}")
+    typer.echo(f"{chr(10)}{on_demand()}")
+
+
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
     """Say what was written: its length and what it cost."""
     from surrogate import api

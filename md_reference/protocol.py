@@ -1,0 +1,71 @@
+"""The settings of a run: what the user gave, else the protocol of a library scene, else the program's defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from typing import Any
+
+from md_reference.forcefield import ForceFieldSpec
+from md_reference.run_config import MDConfig
+from systems import library
+from systems.scene import Scene
+from systems.units import format_time_ps
+
+# Bonds to hydrogen of natural mass swing in 9 fs; a longer step than this needs them rigid.
+LONGEST_FLEXIBLE_STEP_PS = 0.001
+_WORDS = {
+    "force_field": "force field",
+    "temperature_k": "temperature",
+    "friction_per_ps": "friction",
+    "timestep_ps": "time step",
+    "hydrogen_mass_da": "hydrogen mass",
+    "save_every_ps": "saved every",
+    "equilibrate_ps": "equilibration",
+}
+
+
+def defaults() -> dict[str, Any]:
+    """Return the program's own settings: those of MDConfig and ForceFieldSpec but the seed, the forces left open."""
+    found: dict[str, Any] = {f.name: f.default for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)
+                             if f.default is not MISSING and f.name != "seed"}  # fmt: skip
+    return found | {"force_field": "auto", "solvent": "auto"}
+
+
+def settle(scene: Scene, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Return all settings of a run of `scene`, and a line about what its protocol decided, empty where nothing.
+
+    `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec. A protocol goes with scenes of
+    the library (`systems.library.protocol`). Its solvent goes with its force field and is left out when the user names
+    another one; its flexible bonds are left out above a time step of 1 fs.
+    """
+    name = scene.provenance.get("library_name")
+    protocol = library.protocol(name) if isinstance(name, str) and library.knows(name) else {}
+    if "force_field" in given:
+        protocol.pop("solvent", None)
+    own = defaults()
+    settings = own | protocol | dict(given)
+    if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:
+        settings["constrain_hydrogens"] = True
+    # Force field and solvent are said even where `auto` comes to the same: they are what a protocol is about.
+    decided = {key: settings[key] for key in protocol if key not in given and settings[key] != own[key]}
+    changed = set(decided) - {"force_field", "solvent"}
+    if not changed and protocol.get("solvent", "obc2") == "obc2":
+        return settings, ""
+    words = ", ".join(_say(key, value) for key, value in decided.items())
+    return settings, f"by the library's protocol: {words} ({library.protocol_source(str(name))})"
+
+
+def _say(key: str, value: Any) -> str:
+    word = _WORDS.get(key, key)
+    if key.endswith("_per_ps"):
+        return f"{word} {value:g}/ps"
+    if key.endswith("_ps"):
+        return f"no {word}" if value == 0 else f"{word} {format_time_ps(value)}"
+    if key.endswith("_k"):
+        return f"{word} {value:g} K"
+    if key == "hydrogen_mass_da":
+        return "natural hydrogen mass" if value is None else f"{word} {value:g} Da"
+    if key == "constrain_hydrogens":
+        return f"bonds to hydrogen {'rigid' if value else 'flexible'}"
+    return f"{word} {value}"
