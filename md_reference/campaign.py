@@ -34,7 +34,6 @@ from systems.manifest import (
 )
 
 _TICK_S = 0.25
-_POLL_S = 1.0
 _WRITE_EVERY_S = 2.0
 # Runs that were asked to stop have so long to come to the end of a frame.
 _STOP_PATIENCE_S = 60.0
@@ -96,17 +95,19 @@ def run_campaign(
     *,
     progress: Callable[[CampaignProgress], None] | None = None,
     failed: Callable[[str, str], None] | None = None,
+    poll_every_s: float = 1.0,
 ) -> Manifest:
     """Run what is not yet complete on a Dask client's workers and return the manifest, which is on disk.
 
-    `progress` is called several times a second, `failed(name, reason)` when a scene or a run is given up: after
-    `retries` further attempts, or at once where its input is at fault. The others run on.
+    `progress` is called several times a second with what the workers said when last asked. `failed(name, reason)` is
+    called when a scene or a run is given up: after `retries` further attempts, or at once where its input is at fault.
+    The others run on.
     Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt with an account.
     Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
     """
     with _only_process(campaign.folder):
         state = _State(open_campaign(campaign))
-        job = _Job(campaign, client, state, failed or (lambda name, reason: None))
+        job = _Job(campaign, client, state, failed or (lambda name, reason: None), poll_every_s)
         with deferred_interrupt() as asked_to_stop, job.polling():
             try:
                 job.start()
@@ -136,8 +137,16 @@ def _account(manifest: Manifest, folder: Path) -> str:
 class _Job:
     """The tasks of one campaign: handed out, collected, tried again."""
 
-    def __init__(self, campaign: Campaign, client: Any, state: _State, failed: Callable[[str, str], None]) -> None:
+    def __init__(
+        self,
+        campaign: Campaign,
+        client: Any,
+        state: _State,
+        failed: Callable[[str, str], None],
+        poll_every_s: float,
+    ) -> None:
         self._campaign, self._client, self._state, self._failed = campaign, client, state, failed
+        self._poll_every_s = poll_every_s
         self._token = uuid.uuid4().hex
         self._ended: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._runs: dict[str, list[Run]] = {}
@@ -154,7 +163,7 @@ class _Job:
     def tick(self) -> None:
         """Wait a moment for tasks that end, take their results, and write the manifest now and then."""
         with suppress(queue.Empty):
-            self._collect(*self._ended.get(timeout=_TICK_S))
+            self._collect(*self._ended.get(timeout=min(_TICK_S, self._poll_every_s)))
             while True:
                 self._collect(*self._ended.get_nowait())
         for name in {name for runs in self._state.active.values() for name in runs}:
@@ -201,8 +210,8 @@ class _Job:
         over = threading.Event()
 
         def ask() -> None:
-            while not over.wait(_POLL_S):
-                with suppress(Exception):  # asked again in a second
+            while not over.wait(self._poll_every_s):
+                with suppress(Exception):  # asked again soon
                     found = self._client.run(poll, self._token, on_error="ignore")
                     reports = [report for report in found.values() if isinstance(report, dict)]
                     self._state.active = {report["pid"]: report["frames"] for report in reports}

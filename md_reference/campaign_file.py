@@ -5,13 +5,15 @@ from __future__ import annotations
 import inspect
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from md_reference.campaign_settings import Settings, read_settings, to_config
-from md_reference.simulate import MDConfig
+from md_reference.protocol import settle_by_name
+from md_reference.run_config import MDConfig
 from systems.errors import InputError, SurromdError, nearest
 from systems.units import parse_temperature_k, parse_wall_s
 
@@ -144,11 +146,17 @@ def _own_settings(table: dict[str, Any], others: tuple[str, ...], where: str) ->
 
 
 def _preparation_defaults() -> dict[str, Any]:
-    """The switches of `prepare`, with their defaults: a campaign takes what the command line takes."""
+    """The switches of `prepare` and `solvate`, with their defaults: a campaign takes what the command line takes."""
+    from md_reference.solvation import solvate
     from systems.prepare import prepare
 
-    parameters = inspect.signature(prepare).parameters.values()
-    return {p.name: p.default for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
+    return keyword_defaults(prepare) | keyword_defaults(solvate)
+
+
+def keyword_defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the parameters of a function that have defaults, but its seed."""
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not p.empty and p.name != "seed"}
 
 
 def _scene_tables(table: dict[str, Any], base: Path) -> list[dict[str, Any]]:
@@ -176,9 +184,9 @@ def _scene_tables(table: dict[str, Any], base: Path) -> list[dict[str, Any]]:
 
 
 def _kind(text: str) -> str:
-    """`sequence` of `sequence:ALA`, else nothing."""
+    """`sequence` of `sequence:ACE-ALA-NME`, `smiles` of `smiles:CCO`, else nothing."""
     kind, colon, _ = text.partition(":")
-    return kind if colon and kind.isalpha() and len(kind) > 1 else ""
+    return kind if colon and kind.lower() in ("sequence", "smiles") else ""
 
 
 def _scene_spec(entry: dict[str, Any], shared: Settings, base: Path, where: str) -> SceneSpec:
@@ -212,8 +220,8 @@ def _name_of(source: str) -> str:
 
 
 def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix: str) -> list[Run]:
-    protocol = _protocol(spec.source)
-    values = {**protocol, **shared.values, **own.values}
+    given = {**shared.values, **own.values}
+    values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.
     if "temperature_k" in own.values and "temperatures" not in own.axes:
@@ -221,10 +229,10 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix
     elif "temperatures" in axes and "temperature_k" in (own if "temperatures" in own.axes else shared).values:
         raise InputError("give temperature or temperatures, not both.")
     replicas = _whole(axes, "replicas", 1, least=1)
-    temperatures = _temperatures(axes["temperatures"]) if "temperatures" in axes else [values.get("temperature_k")]
+    temperatures = _temperatures(axes["temperatures"]) if "temperatures" in axes else [values["temperature_k"]]
     runs = []
     for temperature_k in temperatures:
-        asked = values if temperature_k is None else {**values, "temperature_k": temperature_k}
+        asked = {**values, "temperature_k": temperature_k}
         base = to_config(asked, seed=0)
         first = first_seed(seed, spec.name, base.temperature_k)
         for replica in range(replicas):
@@ -236,23 +244,6 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix
     if len({run.name for run in runs}) < len(runs):
         raise InputError("a temperature is listed twice.")
     return runs
-
-
-def _protocol(source: str) -> dict[str, Any]:
-    """The settings that a library entry brings along; the user's own go before them."""
-    from systems import library
-
-    known = getattr(library, "protocol", None)
-    if known is None or _kind(source) or source not in library.names():
-        return {}
-    allowed = {f.name for f in fields(MDConfig)} | _force_names()
-    return {key: value for key, value in known(source).items() if key in allowed}
-
-
-def _force_names() -> set[str]:
-    from md_reference.forcefield import ForceFieldSpec
-
-    return {f.name for f in fields(ForceFieldSpec)}
 
 
 def first_seed(seed: int, scene: str, temperature_k: float) -> int:

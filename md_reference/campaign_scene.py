@@ -3,65 +3,83 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign_file import SceneSpec
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig
+from md_reference.campaign_file import SceneSpec, keyword_defaults
+from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.platforms import PlatformChoice, measured_platform
+from md_reference.run_config import MDConfig
 from systems.errors import InputError
 from systems.scene import Scene
 
 
-def prepared_scene(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> dict[str, Any]:
-    """Write the prepared scene to `path`, unless it is there, and return its account for the manifest.
+@dataclass(frozen=True)
+class PreparedScene:
+    """What replicas share: the scene, the force field settled for it, and the platform they run on."""
 
-    The platform is chosen and the force field's parameters are made here, once for all replicas.
-    Raises what `prepare` and the force field refuse.
+    scene: Scene
+    force: ForceFieldSpec
+    platform: PlatformChoice
+
+    def account(self) -> dict[str, Any]:
+        """Return what the manifest says of it."""
+        return {
+            "n_atoms": self.scene.n_atoms,
+            "formula": self.scene.formula,
+            "topology_hash": self.scene.topology_hash,
+            "molecule_key": self.scene.molecule_key,
+            "platform": self.platform.name,
+            "force": asdict(self.force),
+            "repairs": list(self.scene.provenance.get("repairs", [])),
+        }
+
+
+def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> PreparedScene:
+    """Return the prepared scene, from `path` where it lies there already, else made and written to `path`.
+
+    Prepared, solvated where the solvent is made of molecules (`seed`), its forces built, so that parameters which take
+    long are in the cache, and its platform chosen. Raises what `prepare` and the force field refuse.
     """
-    if not path.is_file():
-        _prepare(path, spec, config, seed)
-    record = _read(path)
-    scene = Scene.from_dict(record["scene"])
-    return {
-        "n_atoms": scene.n_atoms,
-        "formula": scene.formula,
-        "topology_hash": scene.topology_hash,
-        "molecule_key": scene.molecule_key,
-        "platform": record["platform"],
-        "force": record["force"],
-        "repairs": list(scene.provenance.get("repairs", [])),
-    }
-
-
-def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> None:
-    from md_reference.engine import Engine
+    if path.is_file():
+        return load_prepared(path)
+    from md_reference.solvation import solvate
     from systems.prepare import prepare
     from systems.whole_file import create_whole
 
-    scene = replace(prepare(spec.source, **spec.preparation), name=spec.name)
-    with Engine(scene, config.force, timestep_ps=config.timestep_ps, platform=config.platform) as engine:
-        chosen = engine.platform_name
-    record = {"scene": scene.to_dict(), "force": asdict(config.force), "platform": chosen}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    switches = keyword_defaults(prepare)
+    scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})
+    force = resolve(scene, config.force)
+    if force.is_explicit and scene.cell_nm is None:
+        of_water = {key: value for key, value in spec.preparation.items() if key not in switches}
+        scene = solvate(scene, force, seed=seed, **of_water)
+    system = build_system(scene, force)
+    platform = measured_platform(
+        scene,
+        force,
+        requested=config.platform,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
+        system=lambda: system,
+    )
+    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
+    record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
 
     def fill(temporary: Path) -> None:
         temporary.write_text(json.dumps(record), encoding="utf-8")
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     create_whole(path, fill)
+    return prepared
 
 
-def _read(path: Path) -> dict[str, Any]:
+def load_prepared(path: Path) -> PreparedScene:
+    """Read what `prepare_once` wrote. Raises InputError when it cannot be read."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        platform = PlatformChoice(**{**record["platform"], "timings": ()})
+        return PreparedScene(Scene.from_dict(record["scene"]), ForceFieldSpec(**record["force"]), platform)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
-
-
-def load_prepared(path: Path, config: MDConfig) -> tuple[Scene, MDConfig]:
-    """Return the prepared scene and a run's settings with what was decided for all replicas of the scene."""
-    record = _read(path)
-    return Scene.from_dict(record["scene"]), replace(
-        config, force=ForceFieldSpec(**record["force"]), platform=record["platform"]
-    )

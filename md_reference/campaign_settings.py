@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, Field, asdict, dataclass, fields
+from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any
 
 from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig
+from md_reference.run_config import MDConfig, settings_of
 from systems.errors import InputError, nearest
 from systems.units import parse_mass_da, parse_rate_per_ps, parse_temperature_k, parse_time_ps
 
@@ -20,6 +20,8 @@ _PARSERS: dict[str, Callable[[str, str], float]] = {
 }
 # These belong to a run's place in the campaign.
 _NOT_SETTINGS = ("seed", "force")
+# As on the command line: what the user leaves open is settled for the scene.
+_OPEN = {"force_field": "auto", "solvent": "auto"}
 
 
 @dataclass(frozen=True)
@@ -109,15 +111,13 @@ def to_config(values: dict[str, Any], *, seed: int) -> MDConfig:
     return MDConfig(
         **{key: value for key, value in values.items() if key not in force},
         seed=seed,
-        force=ForceFieldSpec(**{key: value for key, value in values.items() if key in force}),
+        force=ForceFieldSpec(**{**_OPEN, **{key: value for key, value in values.items() if key in force}}),
     )
 
 
 def flat_settings(config: MDConfig) -> dict[str, Any]:
     """Return a run's settings as one level of names and plain values, without its seed."""
-    record = asdict(config)
-    record.pop("seed")
-    return {**{k: v for k, v in record.items() if k != "force"}, **record["force"]}
+    return {key: value for key, value in settings_of(config).items() if key != "seed"}
 
 
 def default_of(name: str) -> Any:

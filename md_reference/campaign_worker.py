@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +103,10 @@ def prepare_scene(task: SceneTask) -> dict[str, Any]:
     """
 
     def work() -> dict[str, Any]:
-        from md_reference.campaign_scene import prepared_scene
+        from md_reference.campaign_scene import prepare_once
 
-        return prepared_scene(scene_path(Path(task.folder), task.spec.name), task.spec, task.run.config, task.seed)
+        path = scene_path(Path(task.folder), task.spec.name)
+        return prepare_once(path, task.spec, task.run.config, task.seed).account()
 
     return _guarded(task.token, Path(task.folder), work)
 
@@ -153,19 +154,21 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     def report(done: int, _: int) -> None:
         session.frames[task.run.name] = done
 
-    scene, config = load_prepared(scene_path(folder, task.run.scene), task.run.config)
+    prepared = load_prepared(scene_path(folder, task.run.scene))
+    config = replace(task.run.config, force=prepared.force)
     out = folder / task.run.file
     out.parent.mkdir(parents=True, exist_ok=True)
     # Killed between its first byte and its first checkpoint, a run has nothing to go on from.
     husk = out.exists() and not checkpoint_path(out).exists() and not _is_complete(out, config.n_frames)
     simulate(
-        scene,
+        prepared.scene,
         config,
         out,
         resume=not husk,
         overwrite=husk,
         progress=report,
         checkpoint_every_s=task.checkpoint_every_s,
+        choice=prepared.platform,
     )
     with open_trajectory(out) as reader:
         record, n_frames = dict(reader.record), reader.n_frames

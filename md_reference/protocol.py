@@ -40,7 +40,12 @@ def settle(scene: Scene, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]
     another one; its flexible bonds are left out above a time step of 1 fs.
     """
     name = scene.provenance.get("library_name")
-    protocol = library.protocol(name) if isinstance(name, str) and library.knows(name) else {}
+    return settle_by_name(name if isinstance(name, str) else "", given)
+
+
+def settle_by_name(name: str, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Return what `settle` does for the scene of this name, or any other if the library does not know it."""
+    protocol = library.protocol(name) if library.knows(name) else {}
     if "force_field" in given:
         protocol.pop("solvent", None)
     own = defaults()
@@ -53,7 +58,7 @@ def settle(scene: Scene, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]
     if not changed and protocol.get("solvent", "obc2") == "obc2":
         return settings, ""
     words = ", ".join(_say(key, value) for key, value in decided.items())
-    return settings, f"by the library's protocol: {words} ({library.protocol_source(str(name))})"
+    return settings, f"by the library's protocol: {words} ({library.protocol_source(name)})"
 
 
 def _say(key: str, value: Any) -> str:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from surrogate.api import compare, demo, info, plan, reference, rollout, systems, train, windows
+    from surrogate.api import campaign, compare, demo, info, plan, reference, rollout, systems, train, windows
 
 __version__ = "0.1.0"
 
-__all__ = ["compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows"]
+__all__ = ["campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows"]
 
 
 def __getattr__(name: str) -> Any:

@@ -368,13 +368,42 @@ def compare(
     return result
 
 
+def campaign(
+    file: PathLike,
+    *,
+    out: PathLike | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    dry_run: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Simulate many scenes, temperatures and replicas as a TOML file says, on Dask, and return `info` of the folder.
+
+    Runs on `workers` processes of this machine (one per core), on a Dask `scheduler` (tcp://host:port), or on the jobs
+    of the file's [cluster]. What is finished is not done again; what fails stands in the result's `failed`. `dry_run`:
+    return what would be run, and start nothing. `out` replaces the folder that the file names.
+    Raises InputError for a file that cannot be meant, and for the folder of another campaign.
+    """
+    from md_reference.campaign_file import read_campaign
+    from surrogate.campaigns import list_runs, run_campaign
+
+    asked = read_campaign(file, folder=out)
+    if dry_run:
+        return list_runs(asked)
+    return run_campaign(asked, workers=workers, scheduler=scheduler, quiet=quiet)
+
+
 def info(path: PathLike) -> dict[str, Any]:
-    """Return what a trajectory, a windows file or a weights file is and where it came from (JSON-able).
+    """Return what a trajectory, a windows or weights file or a campaign's folder is and where it came from (JSON-able).
 
     Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
     """
     from surrogate.describe import describe_file
 
+    if Path(path).is_dir():
+        from surrogate.campaigns import describe_campaign
+
+        return describe_campaign(Path(path))
     return describe_file(Path(path))
 
 
@@ -389,7 +418,7 @@ def windows(
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=overwrite)
-    collect_frames(find_trajectories(references), canonical=canonical).save(out)
+    collect_frames(find_trajectories(references, verify=True), canonical=canonical).save(out)
     return out
 
 
@@ -427,7 +456,7 @@ def train(
         raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
     if resume and out.exists() and not states:
         return out
-    paths = find_trajectories(references)
+    paths = find_trajectories(references, verify=True)
 
     from surrogate.data.frames import collect_frames, load_frames
     from surrogate.describe import is_windows

@@ -34,7 +34,8 @@ def run_campaign(campaign: Campaign, *, workers: int | None, scheduler: str | No
         return describe_campaign(campaign.folder)
 
     def failed(name: str, reason: str) -> None:
-        sys.stderr.write(f"{name}: {reason}\n")
+        if not quiet:
+            sys.stderr.write(f"{name}: {reason}\n")
 
     with (
         open_client(
@@ -67,6 +68,21 @@ class _Meter:
         failed = f", {progress.runs_failed} failed" if progress.runs_failed else ""
         note = f"{progress.runs_complete}/{progress.runs_total} runs{failed}, {len(progress.active)} workers, "
         self._advance(progress.frames_done, max(progress.frames_total, 1), f"{note}{speed:.3g} frames/s")
+
+
+def list_runs(campaign: Campaign) -> dict[str, Any]:
+    """Return what a campaign will run, before anything is started (JSON-able)."""
+    from systems.units import format_time_ps
+
+    lengths = {run.name: format_time_ps(run.config.time_ps) for run in campaign.runs}
+    return {
+        "file": str(campaign.folder),
+        "type": "campaign (not started)",
+        "summary": f"{len(campaign.runs)} runs of {len(campaign.scenes)} scenes, "
+        f"{format_time_ps(sum(run.config.time_ps for run in campaign.runs))} in all",
+        "scenes": {scene.name: scene.source for scene in campaign.scenes},
+        "runs": {run.name: f"{lengths[run.name]}, seed {run.config.seed}" for run in campaign.runs},
+    }
 
 
 def describe_campaign(folder: Path) -> dict[str, Any]:
@@ -104,5 +120,5 @@ def describe_campaign(folder: Path) -> dict[str, Any]:
             + (f", {scene.n_atoms} atoms, {scene.formula}" if scene.n_atoms else "")
             for name, scene in manifest.scenes.items()
         },
-        "failed": {run.name: run.reason for run in runs if run.status == FAILED},
+        "failed": {run.name: run.reason for run in runs if run.status == FAILED} or None,
     }

@@ -234,6 +234,32 @@ def reference(
 
 
 @app.command()
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder, instead of the one that FILE names.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes here; one per core.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Of Dask, such as tcp://host:8786.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and start nothing.")] = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run it again to go on."""
+    from surrogate import api
+
+    result = api.campaign(file, out=out, workers=workers, scheduler=scheduler, dry_run=dry_run, quiet=quiet)
+    if as_json:
+        print_json(result)
+    elif dry_run:
+        print_pairs(result)
+    elif not quiet:
+        typer.echo(f"{result['file']}: {result['summary']}")
+    if result.get("failed"):
+        for name, reason in result["failed"].items():
+            typer.echo(f"failed: {name}: {reason}", err=True)
+        raise typer.Exit(1)
+
+
+@app.command()
 def windows(
     references: Annotated[
         list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
@@ -360,7 +386,9 @@ def compare(
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="A trajectory, a windows file or weights.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A trajectory, a windows file, weights or a campaign's folder.")
+    ],
     as_json: JsonOpt = False,
 ) -> None:
     """What a file is and where it came from."""

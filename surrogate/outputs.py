@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from systems.errors import InputError, SurromdError
+from systems.errors import InputError, StorageError, SurromdError
+from systems.manifest import campaign_folder, campaign_trajectories
 
 TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
 
@@ -36,6 +38,8 @@ def check_outputs(
 def guarded_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
     """Run a verb that writes trajectories: on failure remove files without frames; on Ctrl-C say what is kept.
 
+    A checkpoint of an equilibration is kept on Ctrl-C, too, and on a full disk.
+
     `resumable`: what the user does to go on, said when there is something to go on from. Files that were there before
     are never removed. Raises KeyboardInterrupt with the account as its message.
     """
@@ -43,8 +47,12 @@ def guarded_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[N
     try:
         yield
     except KeyboardInterrupt:
-        counts = {path: frames for path in paths if (frames := _sweep(path, before)) is not None}
+        counts = {path: frames for path in paths if (frames := _sweep(path, before, resumable=True)) is not None}
         raise KeyboardInterrupt(f"{_kept(counts)}; {resumable}" if counts else "nothing was written") from None
+    except StorageError:
+        for path in paths:
+            _sweep(path, before, resumable=True)
+        raise
     except BaseException:
         for path in paths:
             _sweep(path, before)
@@ -60,8 +68,11 @@ def _kept(counts: dict[Path, int]) -> str:
     return f"{first} to {last.name} hold {frames} frames each"
 
 
-def _sweep(path: Path, before: set[Path]) -> int | None:
-    """Return the number of frames of a trajectory, or remove it and its companions (None) if it holds none."""
+def _sweep(path: Path, before: set[Path], *, resumable: bool = False) -> int | None:
+    """Return the number of frames of a trajectory, or remove it and its companions (None) if it holds none.
+
+    With `resumable` a checkpoint keeps them: there are no frames, and something to go on from.
+    """
     from systems.trajectory import open_trajectory
 
     if not path.exists():
@@ -72,7 +83,7 @@ def _sweep(path: Path, before: set[Path]) -> int | None:
                 n_frames = reader.n_frames
         except SurromdError:
             n_frames = 0
-    if n_frames:
+    if n_frames or (resumable and checkpoint_of(path).exists()):
         return n_frames
     for member in _family(path):
         if member not in before:
@@ -80,9 +91,14 @@ def _sweep(path: Path, before: set[Path]) -> int | None:
     return None
 
 
+def checkpoint_of(path: Path) -> Path:
+    """Where a reference run keeps what it goes on from (`md_reference.checkpoint`)."""
+    return path.with_name(path.name + ".checkpoint")
+
+
 def _family(path: Path) -> list[Path]:
     """A trajectory file and what the writers put beside it."""
-    members = [path, path.with_name(path.name + ".checkpoint")]
+    members = [path, checkpoint_of(path)]
     if path.suffix.lower() == ".dcd":
         from systems.dcd_file import companions
 
@@ -90,15 +106,21 @@ def _family(path: Path) -> list[Path]:
     return members
 
 
-def find_trajectories(spec: str | Path | Sequence[str | Path]) -> list[Path]:
+def find_trajectories(spec: str | Path | Sequence[str | Path], *, verify: bool = False) -> list[Path]:
     """Return the files that a user means by a path, a folder, a glob pattern, a comma-separated list or a sequence.
 
-    A folder stands for the trajectories in it (HDF5 before DCD, if it holds both). Raises InputError when nothing is
-    found.
+    A folder stands for the trajectories in it (HDF5 before DCD, if it holds both); one of a campaign, or within it, for
+    the runs that its manifest calls complete, whose hashes are checked if `verify`. Raises InputError when nothing is
+    found, TrajectoryError when a hash differs.
     """
     if not isinstance(spec, (str, Path)):
-        return [path for part in spec for path in find_trajectories(part)]
+        return [path for part in spec for path in find_trajectories(part, verify=verify)]
     path = Path(spec)
+    if path.is_dir() and campaign_folder(path) is not None:
+        found, left_out = campaign_trajectories(path, verify=verify)
+        if left_out:
+            sys.stderr.write(f"{path}: {left_out} runs of this campaign are not complete and left out\n")
+        return found
     if path.is_dir():
         files = [p for p in sorted(path.iterdir()) if not p.name.endswith(".meta.h5")]
         for suffixes in ((".h5", ".hdf5"), (".dcd",), (".xtc",)):
@@ -110,7 +132,8 @@ def find_trajectories(spec: str | Path | Sequence[str | Path]) -> list[Path]:
         return [path]
     text = str(spec)
     if "," in text:
-        return [p for part in text.split(",") if part.strip() for p in find_trajectories(part.strip())]
+        parts = [part.strip() for part in text.split(",") if part.strip()]
+        return [p for part in parts for p in find_trajectories(part, verify=verify)]
     if any(c in text for c in "*?["):
         import glob
 

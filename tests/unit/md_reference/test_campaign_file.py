@@ -170,3 +170,14 @@ def test_what_cannot_be_meant_is_refused_in_one_line(tmp_path: Path, text: str, 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_campaign(tmp_path / "none.toml")
+
+
+def test_a_library_scene_brings_its_protocol_which_the_file_outweighs(tmp_path: Path) -> None:
+    text = 'scenes = ["ethanol", "alanine-dipeptide", "smiles:CCO"]\ntime = "1ps"\n'
+    published, own, smiles = (run.config for run in _read(tmp_path, text).runs)
+    assert (published.temperature_k, published.timestep_ps, published.save_every_ps) == (500.0, 0.0005, 0.005)
+    assert (published.force.force_field, published.force.hydrogen_mass_da) == ("gaff2", None)
+    assert (own.temperature_k, own.timestep_ps) == (300.0, 0.004)
+    assert (smiles.force.force_field, smiles.force.solvent, smiles.timestep_ps) == ("auto", "auto", 0.004)
+    hot = _read(tmp_path, text + 'temperatures = ["400K"]\nsave_every = "100fs"\n').runs[0].config
+    assert (hot.temperature_k, hot.save_every_ps, hot.timestep_ps) == (400.0, 0.1, 0.0005)
