@@ -12,6 +12,7 @@ from md_reference.forcefield import ForceFieldSpec, build_system, resolve
 from md_reference.integrators import check_ensemble
 from md_reference.platforms import PlatformChoice, choose_platform, measured_platform
 from md_reference.replicas import available_cores
+from md_reference.run_config import MDConfig
 from md_reference.timing import as_records
 from systems.scene import Scene
 from systems.units import format_time_ps
@@ -120,7 +121,9 @@ def make_plan(
         wall_s = math.ceil(replicas / cores) * (time_ps + equilibrate_ps) / timestep_ps * planned
     integrator = _integrator(scene, ensemble, timestep_ps, temperature_k, friction_per_ps, pressure_bar)
     return Plan(
-        line=_line(scene, spec, choice, integrator, n_constraints, planned, timestep_ps),
+        line=plan_line(
+            scene, spec, choice, integrator=integrator, timestep_ps=timestep_ps, step_s=planned, wall_s=wall_s
+        ),
         scene=scene.name,
         formula=scene.formula,
         n_atoms=scene.n_atoms,
@@ -199,28 +202,64 @@ def _integrator(
     return text + (f"; Monte Carlo barostat at {pressure_bar:g} bar" if ensemble == "npt" else "")
 
 
-def _line(
+def plan_line(
     scene: Scene,
     spec: ForceFieldSpec,
     choice: PlatformChoice,
+    *,
     integrator: str,
-    n_constraints: int,
-    step_s: float | None,
     timestep_ps: float,
+    step_s: float | None = None,
+    wall_s: float | None = None,
 ) -> str:
-    """Return the plan in one line."""
+    """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known."""
+    periodic = scene.cell_nm is not None
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
-    pairs = "all pairs" if scene.cell_nm is None else "PME"
+    law = spec.force_field if scene.interactions is None else str(scene.interactions.get("kind"))
+    born = " (native GBSAOBCForce)" if spec.solvent == "obc2" else ""
+    rigid = spec.constrain_hydrogens and "H" in scene.elements
     parts = [
-        f"{scene.n_atoms} atoms, {spec.force_field} in {spec.solvent}",
-        f"{choice.name} on {threads}",
+        f"{scene.n_atoms} atoms, {law} in {spec.solvent}{born}",
+        f"{choice.name} on {threads} ({choice.reason})",
         integrator,
-        f"{n_constraints} constraints" if n_constraints else "no constraints",
-        pairs,
+        "bonds to hydrogen rigid" if rigid else "no constraints",
+        "PME in a cell" if periodic else "all pairs; no cut-off, cell, PME or barostat without a cell",
     ]
     if step_s is not None:
         parts.append(f"about {timestep_ps * 1e-3 * 86_400.0 / step_s:.3g} ns/day")
+    if wall_s is not None:
+        parts.append(f"about {format_wall(wall_s)}")
     return "; ".join(parts)
+
+
+def format_wall(seconds: float) -> str:
+    """Return a wall time for people: 12 s, 5 min, 3.2 h, 2.1 days."""
+    for unit, size, limit in (("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172_800.0)):
+        if seconds < limit:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 86_400.0:.3g} days"
+
+
+def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:
+    """Return the line of a run whose platform has been chosen, by the timing that chose it."""
+    spec, ensemble = resolve(scene, config.force), check_ensemble(config.ensemble, scene)
+    timed = next(
+        (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads)), None
+    )
+    step_s = None if timed is None else timed * 1e-6
+    rounds = math.ceil(replicas / available_cores())
+    n_steps = (config.time_ps + config.equilibrate_ps) / config.timestep_ps
+    return plan_line(
+        scene,
+        spec,
+        choice,
+        integrator=_integrator(
+            scene, ensemble, config.timestep_ps, config.temperature_k, config.friction_per_ps, config.pressure_bar
+        ),
+        timestep_ps=config.timestep_ps,
+        step_s=step_s,
+        wall_s=None if step_s is None else rounds * n_steps * step_s,
+    )
 
 
 def _parallel(replicas: int, cores: int, threads: int) -> str:

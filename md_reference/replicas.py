@@ -14,7 +14,7 @@ from typing import Any
 from md_reference.forcefield import resolve
 from md_reference.parent_watch import end_with_parent
 from md_reference.platforms import PlatformChoice, measured_platform
-from md_reference.simulate import MDConfig, simulate
+from md_reference.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -43,39 +43,41 @@ def simulate_replicas(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
+    announce: Callable[[str], None] | None = None,
     workers: int | None = None,
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
-    small scenes the fastest use of them. The platform is measured once, for all. Ctrl-C and SIGTERM stop them all with
+    small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in one
+    line. Ctrl-C and SIGTERM stop them all with
     checkpoints: KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises
     SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
+    width = workers or min(len(outs), available_cores())
+    # What goes on keeps its platform.
+    fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
+    choice = None
+    if fresh:
+        choice = measured_platform(
+            scene,
+            resolve(scene, config.force),
+            requested=config.platform,
+            temperature_k=config.temperature_k,
+            friction_per_ps=config.friction_per_ps,
+            timestep_ps=config.timestep_ps,
+            max_threads=max(1, available_cores() // width),
+            side_by_side=width,
+        )
+        if announce is not None:
+            from md_reference.plan import line_of_run
+
+            announce(line_of_run(scene, config, choice, replicas=len(outs)))
     if len(outs) == 1:
         return [
-            simulate(
-                scene,
-                configs[0],
-                outs[0],
-                resume=resume,
-                overwrite=overwrite,
-                progress=progress,
-                max_threads=available_cores(),
-            )
+            simulate(scene, configs[0], outs[0], resume=resume, overwrite=overwrite, progress=progress, choice=choice)
         ]
-    width = workers or min(len(outs), available_cores())
-    choice = measured_platform(
-        scene,
-        resolve(scene, config.force),
-        requested=config.platform,
-        temperature_k=config.temperature_k,
-        friction_per_ps=config.friction_per_ps,
-        timestep_ps=config.timestep_ps,
-        max_threads=max(1, available_cores() // width),
-        side_by_side=width,
-    )
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
     done = context.Array("Q", len(outs), lock=False)
@@ -130,7 +132,7 @@ def _replica(
     out: str,
     resume: bool,
     overwrite: bool,
-    choice: PlatformChoice,
+    choice: PlatformChoice | None,
     done: Any,
     k: int,
     errors: Any,

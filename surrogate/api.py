@@ -95,6 +95,7 @@ def plan(
     timestep_ps: float | None = None,
     hydrogen_mass_da: float | Default | None = "default",
     ensemble: str | None = None,
+    pressure_bar: float | None = None,
     replicas: int = 1,
     platform: str = "auto",
     ph: float = 7.0,
@@ -125,6 +126,7 @@ def plan(
         timestep_ps=timestep_ps,
         hydrogen_mass_da=hydrogen_mass_da,
         ensemble=ensemble,
+        pressure_bar=pressure_bar,
         platform=platform,
     )
     found = make_plan(
@@ -137,6 +139,8 @@ def plan(
         replicas=replicas,
         time_ps=time_ps,
         equilibrate_ps=config.equilibrate_ps,
+        ensemble=config.ensemble,
+        pressure_bar=config.pressure_bar,
     ).to_dict()
     return found | ({"protocol": protocol} if protocol else {})
 
@@ -154,18 +158,24 @@ def reference(
     timestep_ps: float | None = None,
     hydrogen_mass_da: float | Default | None = "default",
     ensemble: str | None = None,
+    pressure_bar: float | None = None,
     replicas: int = 1,
     platform: str = "auto",
     ph: float = 7.0,
     keep_ligand: bool = False,
     drop_ligand: bool = False,
     drop_water: bool = False,
+    save_velocities: bool = False,
+    save_forces: bool = False,
     seed: int = 0,
     resume: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
 ) -> list[Path]:
-    """Simulate a scene with OpenMM (Langevin middle integrator) and return the trajectories written.
+    """Simulate a scene with OpenMM and return the trajectories written; each record ends with a `summary` of its run.
+
+    `ensemble`: 'nvt' (Langevin middle integrator), 'nve' (velocity Verlet) or 'npt' (Monte Carlo barostat at
+    `pressure_bar`; periodic scenes only). `save_velocities` (nm/ps) and `save_forces` (kJ/mol/nm) need an .h5.
 
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
     `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
@@ -193,6 +203,7 @@ def reference(
         timestep_ps=timestep_ps,
         hydrogen_mass_da=hydrogen_mass_da,
         ensemble=ensemble,
+        pressure_bar=pressure_bar,
         platform=platform,
     )
     if protocol and not quiet:
@@ -202,7 +213,23 @@ def reference(
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
         progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
-        return simulate_replicas(molecule, config, outs, resume=resume, overwrite=overwrite, progress=progress)
+        return simulate_replicas(
+            molecule,
+            replace(
+                config,
+                save_velocities=save_velocities or config.save_velocities,
+                save_forces=save_forces or config.save_forces,
+            ),
+            outs,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            announce=None if quiet else lambda line: _tell(molecule.name, line),
+        )
+
+
+def _tell(name: str, line: str) -> None:
+    sys.stderr.write(f"{name}: {line}\n")
 
 
 def _settle(

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from surrogate.cli_bench import bench
 from surrogate.cli_options import (
     DropLigandOpt,
     DropWaterOpt,
@@ -23,9 +24,12 @@ from surrogate.cli_options import (
     PhOpt,
     PlatformOpt,
     Precision,
+    PressureOpt,
     QuietOpt,
     ReplicasOpt,
     ResumeOpt,
+    SaveForcesOpt,
+    SaveVelocitiesOpt,
     SceneArg,
     SeedOpt,
     SolventOpt,
@@ -98,6 +102,7 @@ app = typer.Typer(
     epilog="SCENE: library name, path (.pdb, .cif, .sdf, .mol, .mol2), smiles:CCO or sequence:ACE-ALA-NME. "
     "Durations carry units: 50ns, 10ps, 2fs.",
 )
+app.add_typer(bench, name="bench")
 
 
 @app.command()
@@ -143,6 +148,7 @@ def plan(
     timestep: TimestepOpt = None,
     hydrogen_mass: HydrogenMassOpt = None,
     ensemble: EnsembleOpt = None,
+    pressure: PressureOpt = None,
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
     ph: PhOpt = 7.0,
@@ -163,6 +169,7 @@ def plan(
         timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
         hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
+        pressure_bar=pressure,
         replicas=replicas,
         platform=platform,
         ph=ph,
@@ -192,12 +199,15 @@ def reference(
     timestep: TimestepOpt = None,
     hydrogen_mass: HydrogenMassOpt = None,
     ensemble: EnsembleOpt = None,
+    pressure: PressureOpt = None,
     replicas: ReplicasOpt = 1,
     platform: PlatformOpt = "auto",
     ph: PhOpt = 7.0,
     keep_ligand: KeepLigandOpt = False,
     drop_ligand: DropLigandOpt = False,
     drop_water: DropWaterOpt = False,
+    save_velocities: SaveVelocitiesOpt = False,
+    save_forces: SaveForcesOpt = False,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -219,12 +229,15 @@ def reference(
         timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
         hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
         ensemble=ensemble,
+        pressure_bar=pressure,
         replicas=replicas,
         platform=platform,
         ph=ph,
         keep_ligand=keep_ligand,
         drop_ligand=drop_ligand,
         drop_water=drop_water,
+        save_velocities=save_velocities,
+        save_forces=save_forces,
         seed=seed,
         resume=resume,
         overwrite=overwrite,

@@ -14,7 +14,11 @@ from systems.units import parse_wall_s
 if TYPE_CHECKING:
     from surrogate.bench.reference import Row
 
-bench = typer.Typer(no_args_is_help=True, help="Benchmarks: what is fast, and by how much, on this machine.")
+bench = typer.Typer(
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Benchmarks: what is fast, and by how much, on this machine.",
+)
 
 
 @bench.callback()

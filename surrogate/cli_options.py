@@ -38,6 +38,9 @@ HydrogenMassOpt = Annotated[
     str | None, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'. [default: 3Da]")
 ]
 EnsembleOpt = Annotated[str | None, typer.Option("--ensemble", help="nvt, nve or npt. [default: nvt]")]
+PressureOpt = Annotated[float | None, typer.Option("--pressure", help="Of the barostat (npt), in bar. [default: 1]")]
+SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep them with each frame (.h5).")]
+SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them with each frame (.h5).")]
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
 ]

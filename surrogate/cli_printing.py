@@ -64,7 +64,7 @@ def print_library(entries: list[dict[str, Any]]) -> None:
 
 
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
-    """Say what was written: its length and what it cost."""
+    """Say what was written: its length, what it cost, and how the run went."""
     from surrogate import api
 
     records = [api.info(path) for path in paths] if as_json or not quiet else []
@@ -73,6 +73,8 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
     for path, record in zip(paths, records, strict=False):
         if not as_json:
             typer.echo(f"{path}: {record['summary']}")
+            for line in record.get("account", []):
+                typer.echo(f"  {line}")
 
 
 def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool) -> None:

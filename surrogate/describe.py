@@ -26,6 +26,7 @@ def describe_file(path: Path) -> dict[str, Any]:
 def _trajectory(path: Path) -> dict[str, Any]:
     import numpy as np
 
+    from md_reference.summary import summary_lines
     from systems.trajectory import open_trajectory
     from systems.validity import INVALID
 
@@ -41,6 +42,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
+        "account": summary_lines(record.get("summary") or {}),
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
