@@ -18,6 +18,7 @@ from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError, StorageError
+from systems.residues import template_for
 from systems.scene import FloatArray, Scene
 
 METHOD = "gaff2-am1bcc"
@@ -103,9 +104,14 @@ def refuse(scene: Scene) -> None:
             "AM1-BCC are made for closed shells. Check hydrogens and charges, or use --level gfn2-xtb."
         )
     if scene.n_atoms > LARGEST:
+        residues = zip(scene.residue_names, scene.residue_ids, strict=True)
+        unknown = [f"{name} {number}" for name, number in residues if template_for(name) is None]
+        culprits = (
+            f", which does not know {', '.join(unknown[:4])}" if 0 < len(unknown) < len(scene.residue_ids) else ""
+        )
         raise PreparationError(
-            f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field; AM1-BCC charges for more "
-            f"than {LARGEST} take hours. Give a smaller molecule."
+            f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field{culprits}; AM1-BCC "
+            f"charges for more than {LARGEST} take hours. Give a smaller molecule, or one of standard residues."
         )
 
 
