@@ -35,9 +35,11 @@ class Surrogate(Protocol):
         """Shape of one replica's noise."""
         ...
 
-    def next_chunk(self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int) -> Tensor:
+    def next_chunk(
+        self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int, solver: str | None = None
+    ) -> Tensor:
         """Frames `(b, n_conditioning, n_atoms, 3)` nm, atomic numbers `(n_atoms,)`, noise `(b, *noise_shape)` ->
-        `(b, n_new, n_atoms, 3)` nm. Inputs are left untouched."""
+        `(b, n_new, n_atoms, 3)` nm. Inputs are left untouched; `solver` None is the model's own choice."""
         ...
 
 

@@ -10,7 +10,7 @@ import time
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.models.interface import draw_noise
+from surrogate.models.lam_slide.flow import SOLVERS, default_solver
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.domain import match_scene
 from systems.errors import InputError, SimulationError
@@ -42,18 +43,22 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """One rollout. `save_every_ps` None keeps every model frame. `precision`: 'fp32', 'bf16' (autocast of the network;
+    """One rollout. `save_every_ps` None keeps every model frame. `solver` None is the one that suits the weights, else
+    'multistep' or 'euler' (models.lam_slide.flow). `precision`: 'fp32', 'bf16' (autocast of the network;
     coordinates and integration stay fp32) or 'auto' (bf16 where the processor multiplies it in hardware)."""
 
     time_ps: float
     save_every_ps: float | None = None
     seed: int = 0
     solver_steps: int = 20
+    solver: str | None = None
     precision: str = "auto"
 
     def __post_init__(self) -> None:
         if self.solver_steps < 1:
             raise InputError(f"solver steps must be at least 1, not {self.solver_steps}.")
+        if self.solver not in (None, *SOLVERS):
+            raise InputError(f"solver {self.solver!r} is unknown; choose {' or '.join(SOLVERS)}.")
         if self.precision not in ("auto", "fp32", "bf16"):
             raise InputError(f"precision {self.precision!r} is unknown; choose auto, fp32 or bf16.")
 
@@ -103,6 +108,10 @@ def rollout(
     use_bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_in_hardware())
     if use_bf16:
         model = with_bf16_weights(model)
+    solver = config.solver or default_solver(model.config.approximator.interpolant)
+    if solver == "multistep" and model.config.approximator.interpolant != "linear":
+        raise InputError("the multistep solver integrates the linear interpolant only; use --solver euler.")
+    config = replace(config, solver=solver)
     settings = {**asdict(config), "bf16": use_bf16, "weights_hash": weights.hash, "replicas": len(outs)}
     del settings["time_ps"]  # a rollout may be resumed to become longer
     state_path = outs[0].with_name(outs[0].name + ".checkpoint")
@@ -183,7 +192,11 @@ def _next_chunk(model: LamSlide, state: _Progress, target: npt.NDArray[np.float6
     noise = draw_noise(model, n_atoms, generators)
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=use_bf16):
         frames = model.next_chunk(
-            torch.from_numpy(canonical.astype(np.float32)), elements, noise, solver_steps=config.solver_steps
+            torch.from_numpy(canonical.astype(np.float32)),
+            elements,
+            noise,
+            solver_steps=config.solver_steps,
+            solver=config.solver,
         )
     moved = frames.double().numpy() - translation[:, None, None, :]
     return np.einsum("rji,rtnj->rtni", rotation, moved).astype(np.float32)
@@ -197,8 +210,8 @@ def _seed(seed: int, replica: int, chunk: int) -> int:
 def with_bf16_weights(model: LamSlide) -> LamSlide:
     """Return a copy whose matrix weights are bf16 already: autocast would round them anew in every evaluation."""
     copied = copy.deepcopy(model)
-    for module in copied.modules():
-        if isinstance(module, torch.nn.Linear):
+    for name, module in copied.named_modules():
+        if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers):
             module.to(torch.bfloat16)
     return copied
 
@@ -237,6 +250,7 @@ def _record(weights: Weights, config: RolloutConfig, settings: dict[str, Any], s
         "save_every_ps": save_every_ps,
         "lag_ps": weights.domain.lag_ps,
         "precision": "bf16" if settings["bf16"] else "fp32",
+        "solver": settings["solver"],
         "solver_steps": config.solver_steps,
         "chunk_frames": weights.model.n_new,
         **weights.domain.conditions,

@@ -61,3 +61,37 @@ def euler(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str
             return prediction
         o = o + (end - start) * velocity(o, prediction, tau, interpolant)
     raise ValueError(f"n_steps must be at least 1, not {n_steps}")
+
+
+def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
+    """Integrate the linear interpolant from noise to data with the prediction extrapolated in the flow time.
+
+    Second order at one evaluation a step: between two grid points the prediction is the line through the last two, for
+    which dx/dtau = (o1 - x) / (1 - tau) is integrated exactly (the idea of DPM-Solver++ 2M, Lu 2022, in tau). The grid
+    1 - tau = (1 - k / n)^2 spends its steps near the data, where narrow directions (bond lengths) are decided: Euler's
+    20 even steps leave a direction of one tenth of the data's width 20 % too narrow, 10 of these steps 0.1 % (exact
+    predictions of Gaussian data; a test holds this).
+    """
+    if interpolant != "linear":
+        raise ValueError(f"the multistep solver integrates the linear interpolant, not {interpolant!r}")
+    o = noise
+    grid = [1.0 - (1.0 - k / n_steps) ** 2 for k in range(n_steps + 1)]
+    before: tuple[float, Tensor] | None = None
+    for start, end in pairwise(grid):
+        prediction = predict(o, torch.full((o.shape[0],), start, device=o.device, dtype=torch.float32))
+        left, right = 1.0 - start, 1.0 - end
+        step = prediction + (right / left) * (o - prediction)
+        if before is not None:
+            slope = (prediction - before[1]) / (start - before[0])
+            log_term = right * math.log(left / right) if right > 0.0 else 0.0
+            step = step + (left - right - log_term) * slope
+        o, before = step, (start, prediction)
+    return o
+
+
+SOLVERS: dict[str, Callable[[DataPrediction, Tensor, int, str], Tensor]] = {"multistep": multistep, "euler": euler}
+
+
+def default_solver(interpolant: str) -> str:
+    """Return the better solver that integrates this interpolant."""
+    return "multistep" if interpolant == "linear" else "euler"

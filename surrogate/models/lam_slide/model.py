@@ -20,6 +20,8 @@ class LamSlide(nn.Module):
 
     latent_mean: Tensor
     latent_scale: Tensor
+    # Layers that compute in float32 under autocast too.
+    float32_layers = ("autoencoder.to_position",)
 
     def __init__(self, config: LamSlideConfig) -> None:
         super().__init__()
@@ -66,12 +68,15 @@ class LamSlide(nn.Module):
         ae = self.config.autoencoder
         return (self.config.approximator.chunk_frames, ae.n_latents, ae.latent_dim)
 
-    def next_chunk(self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int) -> Tensor:
+    def next_chunk(self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int,
+                   solver: str | None = None) -> Tensor:  # fmt: skip
         """See `Surrogate.next_chunk`."""
+        interpolant = self.config.approximator.interpolant
         known = self.encode(last_frames_nm, elements)
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
             return self.approximator(o, tau, known)
 
-        latents = flow.euler(predict, noise, solver_steps, self.config.approximator.interpolant)
+        integrate = flow.SOLVERS[solver or flow.default_solver(interpolant)]
+        latents = integrate(predict, noise, solver_steps, interpolant)
         return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])

@@ -14,12 +14,12 @@ from surrogate.models.lam_slide import flow
 MEAN, STD = 1.5, 0.4
 
 
-def gaussian_posterior(interpolant: str):
-    """E[o1 | o_tau] for data N(MEAN, STD^2): the exact data prediction."""
+def gaussian_posterior(interpolant: str, std: float = STD):
+    """E[o1 | o_tau] for data N(MEAN, std^2): the exact data prediction."""
 
     def predict(o: Tensor, tau: Tensor) -> Tensor:
         alpha, sigma, _, _ = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
-        gain = alpha * STD**2 / (alpha**2 * STD**2 + sigma**2)
+        gain = alpha * std**2 / (alpha**2 * std**2 + sigma**2)
         return MEAN + gain * (o - alpha * MEAN)
 
     return predict
@@ -102,3 +102,30 @@ def test_rotations_are_uniform_over_so3() -> None:
     angle = torch.arccos(((r.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
     expected = math.pi / 2 + 2 / math.pi  # density (1 - cos angle) / pi on [0, pi]
     assert float(angle.mean()) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("width", [1.0, 0.4, 0.1, 0.05])
+def test_multistep_keeps_narrow_directions_wide(width: float) -> None:
+    """Linear in the noise, so that the ratio of the widths is the exact answer: how much too narrow a direction comes."""
+    noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def error(sample: Tensor) -> float:
+        return abs(float(sample.std() / noise.std()) / width - 1.0)
+
+    predict = gaussian_posterior("linear", width)
+    errors = [error(flow.multistep(predict, noise, n, "linear")) for n in (10, 20, 40, 80)]
+    assert errors[0] < 0.05 and errors[1] < 0.011
+    # Second order once the steps are fine enough.
+    assert errors[3] < 0.35 * errors[2], errors
+    # Negative control: Euler's even steps.
+    assert error(flow.euler(predict, noise, 20, "linear")) > 6 * errors[1]
+    sample = flow.multistep(predict, noise, 40, "linear")
+    assert abs(float(sample.mean()) - MEAN - width * float(noise.mean())) < 0.002
+
+
+def test_one_multistep_lands_on_the_prediction_as_eulers_does() -> None:
+    noise = torch.randn(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    predict = gaussian_posterior("linear")
+    torch.testing.assert_close(flow.multistep(predict, noise, 1, "linear"), flow.euler(predict, noise, 1, "linear"))
+    with pytest.raises(ValueError, match="gvp"):
+        flow.multistep(predict, noise, 4, "gvp")
