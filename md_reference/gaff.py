@@ -13,7 +13,7 @@ import networkx as nx
 import numpy as np
 
 from md_reference import parameter_cache
-from md_reference.ambertools import ambertools, complaint, find_ambertools, run
+from md_reference.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
 from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from systems.element_data import covalent_radius_nm
@@ -28,6 +28,9 @@ _ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl
 LARGEST = 250
 _CHARGE_TOLERANCE_E = 0.01
 _BOND_STRETCH = 1.3
+# The angle of hydrogen cyanide in gaff2.dat; `_run_parmchk2` says what it is for.
+_CANARY = "ha-c1-n1"
+_PARMCHK2_RUNS = 100
 
 
 def parameters(scene: Scene, *, cached: bool = True) -> str:
@@ -105,10 +108,9 @@ def refuse(scene: Scene) -> None:
         )
     if scene.n_atoms > LARGEST:
         residues = zip(scene.residue_names, scene.residue_ids, strict=True)
-        unknown = [f"{name} {number}" for name, number in residues if template_for(name) is None]
-        culprits = (
-            f", which does not know {', '.join(unknown[:4])}" if 0 < len(unknown) < len(scene.residue_ids) else ""
-        )
+        unknown = list(dict.fromkeys(f"{name} {number}" for name, number in residues if template_for(name) is None))
+        mixed = any(template_for(name) is not None for name in scene.residue_names)
+        culprits = f", which lacks {', '.join(unknown[:4])}" if unknown and mixed else ""
         raise PreparationError(
             f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field{culprits}; AM1-BCC "
             f"charges for more than {LARGEST} take hours. Give a smaller molecule, or one of standard residues."
@@ -160,15 +162,53 @@ def _charges_and_types(scene: Scene, folder: Path) -> list[str]:
 
 def _missing_terms(scene: Scene, folder: Path) -> None:
     """Run parmchk2; raise PreparationError for what it could not even guess."""
-    run("parmchk2", ["-i", "typed.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"], folder)
-    unknown = [
-        line.split("ATTN")[0].strip() for line in (folder / "extra.frcmod").read_text().splitlines() if "ATTN" in line
-    ]
+    listed = _run_parmchk2(folder)
+    unknown = [line.split("ATTN")[0].strip() for line in listed.splitlines() if "ATTN" in line]
     if unknown:
         terms = "; ".join(" ".join(term.split()) for term in unknown[:3])
         raise PreparationError(
             f"GAFF2 has no parameters for {len(unknown)} of its terms ({terms}); use --level gfn2-xtb"
         )
+
+
+def _run_parmchk2(folder: Path) -> str:
+    """Write what GAFF2's tables lack into `extra.frcmod`, and return it.
+
+    parmchk2 of AmberTools 26 reads memory it has not set: on the same input it misses some of the tables in about every
+    second run, says that an angle which is there needs revision, and gives other impropers (aspirin's ring 1.1 or 10.5
+    kcal/mol). Beside the molecule it is therefore shown hydrogen cyanide, whose angle the tables hold, and is run again
+    until it finds that. Where the tables do not hold it, two runs must agree.
+    """
+    arguments = ["-i", "checked.mol2", "-f", "mol2", "-o", "extra.frcmod", "-s", "gaff2"]
+    typed = (folder / "typed.mol2").read_text()
+    has_canary = any(line.startswith(_CANARY) for line in gaff2_table().read_text(errors="replace").splitlines())
+    (folder / "checked.mol2").write_text(_with_canary(typed) if has_canary else typed)
+    earlier: set[str] = set()
+    for attempt in range(_PARMCHK2_RUNS):
+        # The layout of the stack, on which the outcome hangs, follows the length of the environment.
+        run("parmchk2", arguments, folder, SURROMD_PADDING="x" * (37 * attempt))
+        listed = (folder / "extra.frcmod").read_text()
+        if _CANARY not in listed if has_canary else listed in earlier:
+            return listed
+        earlier.add(listed)
+    raise PreparationError(f"parmchk2 gave no reliable answer in {_PARMCHK2_RUNS} runs; try another AmberTools")
+
+
+def _with_canary(mol2: str) -> str:
+    """Return a mol2 file with a molecule of hydrogen cyanide added to its atoms and bonds."""
+    lines = mol2.splitlines()
+    head = lines.index("@<TRIPOS>MOLECULE") + 2
+    n_atoms, n_bonds = (int(word) for word in lines[head].split()[:2])
+    lines[head] = f"{n_atoms + 3} {n_bonds + 2} 1 0 0"
+    end = lines.index("@<TRIPOS>ATOM") + 1 + n_atoms
+    lines[end:end] = [
+        f"{n_atoms + 1} C9Z 90.000 0.0 0.0 c1 1 MOL 0.0",
+        f"{n_atoms + 2} N9Z 91.160 0.0 0.0 n1 1 MOL 0.0",
+        f"{n_atoms + 3} H9Z 88.930 0.0 0.0 ha 1 MOL 0.0",
+    ]
+    end = lines.index("@<TRIPOS>BOND") + 1 + n_bonds
+    lines[end:end] = [f"{n_bonds + 1} {n_atoms + 1} {n_atoms + 2} 3", f"{n_bonds + 2} {n_atoms + 1} {n_atoms + 3} 1"]
+    return "\n".join([*lines, ""])
 
 
 def _assemble(folder: Path) -> str:
