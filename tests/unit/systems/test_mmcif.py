@@ -1,0 +1,94 @@
+"""mmCIF files as the Protein Data Bank writes them: author numbering, alternates, models, waters, ligands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from systems import library
+from systems.errors import InputError, PreparationError
+from systems.prepare import prepare
+
+ALA2 = library.load("alanine-dipeptide")
+COLUMNS = (
+    "group_PDB id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id label_entity_id label_seq_id",
+    "pdbx_PDB_ins_code Cartn_x Cartn_y Cartn_z occupancy B_iso_or_equiv pdbx_formal_charge auth_seq_id auth_comp_id",
+    "auth_asym_id auth_atom_id pdbx_PDB_model_num",
+)
+
+
+def _row(
+    serial: int,
+    name: str,
+    residue: str,
+    number: str,
+    at: tuple[float, float, float],
+    element: str,
+    *,
+    alt: str = ".",
+    insertion: str = "?",
+    occupancy: float = 1.0,
+    group: str = "ATOM",
+    model: int = 1,
+) -> str:
+    place = " ".join(f"{x:.3f}" for x in at)
+    return (
+        f"{group} {serial} {element} {name} {alt} {residue} A 1 7 {insertion} {place} {occupancy:.2f} "
+        f"20.0 ? {number} {residue} X {name} {model}"
+    )
+
+
+def _peptide(model: int = 1, shift: float = 0.0) -> list[str]:
+    rows = []
+    for i, (name, element) in enumerate(zip(ALA2.atom_names, ALA2.elements, strict=True)):
+        residue = int(ALA2.residue_of_atom[i])
+        x, y, z = ALA2.positions_nm[i] * 10 + shift
+        rows.append(
+            _row(i + 1, name, ALA2.residue_names[residue], str(100 + residue), (x, y, z), element,
+                 insertion="B" if residue == 1 else "?", model=model)
+        )  # fmt: skip
+    return rows
+
+
+def _write(path: Path, rows: list[str]) -> str:
+    head = ["data_TEST", "_entry.id TEST", "loop_", *(f"_atom_site.{c}" for c in " ".join(COLUMNS).split())]
+    tail = ["#", "loop_", "_atom_type.symbol", "C", "H", ""]
+    path.write_text("\n".join([*head, *rows, *tail]))
+    return str(path)
+
+
+def test_author_numbers_models_and_insertion_codes(tmp_path: Path) -> None:
+    scene = prepare(_write(tmp_path / "x.cif", [*_peptide(), *_peptide(model=2, shift=1.0)]))
+    assert scene.residue_ids == ("100", "101B", "102")
+    assert set(scene.chain_of_residue) == {"X"}
+    assert scene.provenance["repairs"] == ["2 models in the file: the first is taken"]
+    assert scene.positions_nm == pytest.approx(ALA2.positions_nm, abs=1e-4)
+    assert scene.molecule_key == ALA2.molecule_key
+
+
+def test_waters_ligands_and_alternates_as_in_pdb_files(tmp_path: Path) -> None:
+    rows = _peptide()
+    x, y, z = ALA2.positions_nm[5] * 10
+    oxygen = ALA2.atom_names[5]
+    rows[5] = _row(6, oxygen, "ACE", "100", (x, y, z), "O", alt="A", occupancy=0.4)
+    rows.append(_row(30, oxygen, "ACE", "100", (x + 0.1, y, z), "O", alt="B", occupancy=0.6))
+    rows.append(_row(31, "O", "HOH", "301", (30, 30, 30), "O", group="HETATM"))
+    rows.append(_row(32, "ZN", "ZN", "302", (30, 30, 36), "ZN", group="HETATM"))
+    path = _write(tmp_path / "x.cif", rows)
+    with pytest.raises(PreparationError, match="--drop-water"):
+        prepare(path)
+    with pytest.raises(PreparationError, match=r"ZN X302; add --keep-ligand"):
+        prepare(path, drop_water=True)
+    scene = prepare(path, drop_water=True, keep_ligand=True)
+    assert scene.provenance["repairs"][:1] == [
+        "alternate locations in 1 residues: the most occupied kept (X100:B), 1 atoms left out"
+    ]
+    assert (scene.n_atoms, scene.elements[-1], int(scene.formal_charges[-1])) == (23, "Zn", 2)
+
+
+def test_a_cut_file_is_refused(tmp_path: Path) -> None:
+    rows = _peptide()
+    rows[-1] = rows[-1][:40]
+    with pytest.raises(InputError, match="the file is cut"):
+        prepare(_write(tmp_path / "x.cif", rows))
