@@ -10,10 +10,9 @@ from typing import Any
 
 from md_reference.campaign_file import ClusterSpec
 from md_reference.replicas import available_cores
-from systems.errors import InputError, SimulationError, nearest
+from systems.errors import InputError, SimulationError
 
-# dask-jobqueue's classes by the name of the batch system; `local` starts the same jobs as processes, to try a file out.
-_KINDS = {
+_CLASSES = {
     "slurm": "SLURMCluster",
     "pbs": "PBSCluster",
     "sge": "SGECluster",
@@ -103,13 +102,9 @@ def _jobs(spec: ClusterSpec, folder: Path) -> Any:
 def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     """Return dask-jobqueue's cluster for the `[cluster]` table, without any job yet (`job_script()` shows one).
 
-    Each of its jobs holds `cores` worker processes of one thread. Raises InputError for another kind, and where
-    dask-jobqueue is not installed or refuses an entry.
+    Each of its jobs holds `cores` worker processes of one thread. Raises InputError where dask-jobqueue is
+    not installed or refuses an entry.
     """
-    if spec.kind not in _KINDS:
-        raise InputError(
-            f"[cluster] kind {spec.kind!r} is not one of {', '.join(_KINDS)}.{nearest(spec.kind, list(_KINDS))}"
-        )
     try:
         import dask_jobqueue
     except ImportError:
@@ -127,7 +122,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     named = ("walltime", "queue", "account", "interface", "python")
     arguments |= {key: value for key in named if (value := getattr(spec, key))}
     try:
-        return getattr(dask_jobqueue, _KINDS[spec.kind])(scheduler_options={"dashboard_address": None}, **arguments)
+        return getattr(dask_jobqueue, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": None}, **arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
     except OSError as error:

@@ -19,6 +19,8 @@ from systems.units import parse_temperature_k, parse_wall_s
 
 SUFFIXES = ("h5", "dcd")
 _SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
+# Batch systems that dask-jobqueue knows; `local` starts the same jobs as processes here, to try a file out.
+CLUSTER_KINDS = ("slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local")
 _LONGEST_NAME = 40
 _SEEDS = 2**31
 
@@ -292,4 +294,7 @@ def _cluster(table: dict[str, Any]) -> ClusterSpec | None:
             raise InputError(f"[cluster] {key} must be a list of texts.")
         else:
             values[key] = tuple(value)
+    if values["kind"] not in CLUSTER_KINDS:
+        meant = nearest(values["kind"], list(CLUSTER_KINDS))
+        raise InputError(f"[cluster] kind {values['kind']!r} is not one of {', '.join(CLUSTER_KINDS)}.{meant}")
     return ClusterSpec(**values)

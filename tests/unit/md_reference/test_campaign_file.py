@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -181,3 +182,15 @@ def test_a_library_scene_brings_its_protocol_which_the_file_outweighs(tmp_path: 
     assert (smiles.force.force_field, smiles.force.solvent, smiles.timestep_ps) == ("auto", "auto", 0.004)
     hot = _read(tmp_path, text + 'temperatures = ["400K"]\nsave_every = "100fs"\n').runs[0].config
     assert (hot.temperature_k, hot.save_every_ps, hot.timestep_ps) == (400.0, 0.1, 0.0005)
+
+
+def test_the_file_in_the_readme_is_one(tmp_path: Path, repository: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "pdb").mkdir()
+    pdb = (repository / "systems" / "data" / "alanine-dipeptide.pdb").read_bytes()
+    (tmp_path / "pdb" / "a.pdb").write_bytes(pdb)
+    campaign = _read(tmp_path, "".join(blocks))
+    assert [scene.name for scene in campaign.scenes] == ["alanine-dipeptide", "ACE-GLY-NME", "a", "ethanol"]
+    assert len(campaign.runs) == 4 * 2 * 4
+    assert campaign.cluster is not None
+    assert (campaign.cluster.kind, campaign.cluster.cores) == ("slurm", 8)
