@@ -59,13 +59,22 @@ def ambertools() -> AmberTools:
     return found
 
 
-def run(program: str, arguments: list[str], folder: Path) -> str:
-    """Run one program in `folder` and return what it printed. Raises PreparationError with its own complaint."""
+def gaff2_table() -> Path:
+    """Return the file of GAFF2's own parameters."""
+    return _gaff2_table(ambertools().bin.resolve().parent)
+
+
+def run(program: str, arguments: list[str], folder: Path, **variables: str) -> str:
+    """Run one program in `folder`, with these environment variables added, and return what it printed.
+
+    Raises PreparationError with its own complaint.
+    """
     tools = ambertools()
     environment = os.environ | {
         "PATH": f"{tools.bin}{os.pathsep}{os.environ.get('PATH', '')}",
         "AMBERHOME": str(tools.bin.parent),
         "OMP_NUM_THREADS": "1",
+        **variables,
     }
     done = subprocess.run(
         [str(tools.bin / program), *arguments],
@@ -108,8 +117,12 @@ def _package_version(home: Path) -> str:
 
 def _gaff2_version(home: Path) -> str:
     try:
-        with open(home / "dat" / "leap" / "parm" / "gaff2.dat", errors="replace") as handle:
+        with open(_gaff2_table(home), errors="replace") as handle:
             match = re.search(r"Version\s+([\w.]+)", handle.readline())
     except OSError:
         match = None
     return match[1] if match else "unknown"
+
+
+def _gaff2_table(home: Path) -> Path:
+    return home / "dat" / "leap" / "parm" / "gaff2.dat"

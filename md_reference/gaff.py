@@ -67,10 +67,13 @@ def entry(scene: Scene, *, cached: bool = True) -> Entry:
 def write_shipped(scene: Scene) -> Path:
     """Write the molecule's parameters into the package (systems/data/parameters) and return the file.
 
-    For the library's makers: `parameters` reads it before anything else, without AmberTools. Raises as `parameters`.
+    For the library's makers: `parameters` reads it before anything else, without AmberTools. What lies there is made
+    again. Raises as `parameters`.
     """
-    found = entry(scene)
+    refuse(scene)
+    found = _parametrise(scene)
     path = parameter_cache.shipped_folder() / f"{scene.molecule_key}-{METHOD}.json.gz"
+    path.unlink(missing_ok=True)
     parameter_cache.store(path, found)
     return path
 

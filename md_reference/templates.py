@@ -105,6 +105,8 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     """Return the System of a scene whose residues the force field knows; raises Unmatched for one it does not."""
     from openmm import app, unit
 
+    if spec.force_field == "charmm36":
+        scene = _with_caps_joined(scene)
     topology = scene.to_openmm_topology()
     files = [PROTEIN_FILES[spec.force_field]]
     needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene, m) for m in molecules_of(scene))
@@ -132,6 +134,7 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
                 raise Unmatched(_describe(scene, residue.index))
         system = force_field.createSystem(
             topology,
+            residueTemplates=_chosen_templates(topology) if spec.force_field == "charmm36" else {},
             **settings,
             constraints=app.HBonds if spec.constrain_hydrogens else None,
             rigidWater=True,
@@ -172,6 +175,29 @@ def _with_water_named(scene: Scene) -> Scene:
     water = {int(scene.residue_of_atom[m[0]]) for m in molecules_of(scene) if is_water(scene, m)}
     names = tuple("HOH" if r in water else name for r, name in enumerate(scene.residue_names))
     return scene if names == scene.residue_names else replace(scene, residue_names=names)
+
+
+def _with_caps_joined(scene: Scene) -> Scene:
+    """Return the scene with each cap in the residue it sits on: CHARMM's caps are patches of that residue."""
+    last = len(scene.residue_names) - 1
+    joined = {r: r + 1 for r, name in enumerate(scene.residue_names) if name == "ACE" and r < last}
+    joined |= {r: r - 1 for r, name in enumerate(scene.residue_names) if name in ("NME", "NH2") and r > 0}
+    if not joined:
+        return scene
+    kept = [r for r in range(last + 1) if r not in joined]
+    rank = {r: k for k, r in enumerate(kept)}
+    return replace(
+        scene,
+        residue_of_atom=np.array([rank[joined.get(r, r)] for r in scene.residue_of_atom.tolist()], dtype=np.int64),
+        residue_names=tuple(scene.residue_names[r] for r in kept),
+        residue_ids=tuple(scene.residue_ids[r] for r in kept),
+        chain_of_residue=tuple(scene.chain_of_residue[r] for r in kept),
+    )
+
+
+def _chosen_templates(topology: Any) -> dict[Any, str]:
+    """Capped alanine is in CHARMM's files twice; ALAD is the one with the protein's types."""
+    return {residue: "ALAD" for residue in topology.residues() if residue.name == "ALA" and len(residue) == 22}
 
 
 def _describe(scene: Scene, residue: int) -> str:
