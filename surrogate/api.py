@@ -206,6 +206,7 @@ def reference(
         pressure_bar=pressure_bar,
         platform=platform,
     )
+    _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
     if protocol and not quiet:
         sys.stderr.write(f"{molecule.name}: {protocol}\n")
     label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
@@ -249,7 +250,6 @@ def _settle(
     settings, protocol = settle(scene, asked)
     settings |= {"time_ps": time_ps, "ensemble": check_ensemble(settings["ensemble"], scene)}
     config = to_config(settings, seed=seed)
-    _ = config.steps_per_frame  # uneven intervals are refused before anything runs
     return config, protocol
 
 

@@ -1,0 +1,90 @@
+"""`surromd systems`, and the protocol of a library scene in `plan` and `reference`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from surrogate.cli import app
+from systems import library
+from systems.trajectory import open_trajectory
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def test_systems_lists_every_scene_in_its_group() -> None:
+    printed = run("systems").stdout
+    lines = printed.splitlines()
+    for group, names in library.groups().items():
+        start = lines.index(group) + 1
+        assert [line.split()[0] for line in lines[start : start + len(names)]] == names
+    assert "ACE-ALA-GLY-NME" in printed  # what can be had besides
+    listed = json.loads(run("systems", "--json").stdout)
+    assert [entry["name"] for entry in listed] == [name for names in library.groups().values() for name in names]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("uracil", ["gaff2", "500", "0.0005", "natural", "MD17"]),
+        ("n-body-gravity:3", ["nve", "gravitational_constant", "softening_nm", "GeoTDM"]),
+        ("SDFS", ["SER-ASP-PHE-SER", "gbn2", "350", "MDGen"]),
+    ],
+)
+def test_systems_shows_a_scene_with_its_protocol(name: str, words: list[str]) -> None:
+    printed = run("systems", name).stdout
+    for word in words:
+        assert word in printed
+    described = json.loads(run("systems", name, "--json").stdout)[0]
+    expected = {key: "natural" if value is None else value for key, value in library.protocol(name).items()}
+    assert described["protocol"] == expected
+
+
+def test_plan_takes_the_protocol_and_says_so() -> None:
+    told = json.loads(run("plan", "ethanol", "--json").stdout)
+    assert "500 K" in told["protocol"]
+    assert (told["force_field"], told["solvent"], told["constraints"]) == ("gaff2", "vacuum", "none")
+    assert "0.5 fs" in told["integrator"]
+    assert "500 K" in told["integrator"]
+    other = json.loads(run("plan", "ethanol", "--temperature", "300K", "--timestep", "2fs", "--json").stdout)
+    assert "2 fs, 300 K" in other["integrator"]
+    assert "temperature" not in other["protocol"]
+    assert other["constraints"] == "6 bonds to hydrogen"
+    assert "protocol" not in json.loads(run("plan", "alanine-dipeptide", "--json").stdout)
+
+
+def test_reference_takes_the_protocol_and_says_so(tmp_path: Path) -> None:
+    out = tmp_path / "a.h5"
+    result = run("reference", "n-body-spring:5", "--time", "1ps", "-o", str(out))
+    assert result.exit_code == 0, result.output
+    assert "ensemble nve" in result.stderr
+    with open_trajectory(out) as reader:
+        record = reader.record
+        assert reader.n_frames == 10
+    assert (record["ensemble"], record["timestep_ps"], record["save_every_ps"]) == ("nve", 0.001, 0.1)
+    quiet = run("reference", "harmonic-oscillator", "--time", "1ps", "--temperature", "400K", "-o",
+                str(tmp_path / "b.h5"), "--quiet")  # fmt: skip
+    assert quiet.exit_code == 0, quiet.output
+    assert quiet.stderr == ""
+    with open_trajectory(tmp_path / "b.h5") as reader:
+        assert (reader.record["temperature_k"], reader.record["timestep_ps"]) == (400.0, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["systems", "asprin"], "Did you mean 'aspirin'?"),
+        (["plan", "aspirin", "--temperature", "hot"], "--temperature"),
+        (["plan", "double-well", "--force-field", "ff14SB"], "its own law"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(arguments: list[str], said: str) -> None:
+    result = run(*arguments)
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
