@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def sander(prmtop: str, positions_nm: FloatArray, folder: Path, *, igb: int = 6)
     found: dict[str, float] = {}
     for line in block.splitlines()[2:8]:
         pieces = line.replace("1-4 ", "1-4").split("=")
-        for left, right in zip(pieces, pieces[1:], strict=False):
+        for left, right in pairwise(pieces):
             found[left.split()[-1]] = float(right.split()[0]) * KJ_PER_KCAL
     return found
 
@@ -101,7 +102,7 @@ def has_sander() -> bool:
     return tools is not None and shutil.which(str(tools.bin / "sander")) is not None
 
 
-# ---- energies --------------------------------------------------------------------------------------------------------
+# ---- energies ------------------------------------------------------------------------------------------------------
 
 
 @needs_ambertools
@@ -160,7 +161,7 @@ def test_native_and_custom_obc2_agree_for_gaff_molecules(cache_home: Path) -> No
     assert native["GBSAOBCForce"] == pytest.approx(custom["CustomGBForce"], abs=1e-3)
 
 
-# ---- atom order and cache ----------------------------------------------------------------------------------------------
+# ---- atom order and cache --------------------------------------------------------------------------------------------
 
 
 @needs_ambertools
@@ -242,7 +243,7 @@ def test_a_permuted_prmtop_keeps_every_term() -> None:
             assert there[force] == pytest.approx(energy, abs=1e-9)
 
 
-# ---- refusals ----------------------------------------------------------------------------------------------------------
+# ---- refusals --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -280,7 +281,7 @@ def test_parmchk2_says_the_same_each_time(cache_home: Path, tmp_path: Path) -> N
     text = gaff.parameters(load("aspirin"))
     types = Prmtop(text).fields["AMBER_ATOM_TYPE"]
     scene = load("aspirin")
-    atoms = [f"{k + 1} A{k} {k}.0 0.0 0.0 {t} 1 MOL 0.0" for k, t in enumerate(types)]
+    atoms = [f"{k + 1} {scene.elements[k]}{k} {k}.0 0.0 0.0 {t} 1 MOL 0.0" for k, t in enumerate(types)]
     bonds = [f"{k + 1} {i + 1} {j + 1} 1" for k, (i, j) in enumerate(scene.bonds.tolist())]
     head = ["@<TRIPOS>MOLECULE", "MOL", f"{len(atoms)} {len(bonds)} 1 0 0", "SMALL", "bcc"]
     (tmp_path / "typed.mol2").write_text("\n".join([*head, "@<TRIPOS>ATOM", *atoms, "@<TRIPOS>BOND", *bonds, ""]))
