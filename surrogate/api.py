@@ -266,6 +266,7 @@ def rollout(
     drop_ligand: bool = False,
     drop_water: bool = False,
     seed: int = 0,
+    solver: str | None = None,
     solver_steps: int | None = None,
     precision: str = "auto",
     resume: bool = False,
@@ -276,7 +277,8 @@ def rollout(
 
     `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
     the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
-    run in one batch and are named as by `reference`. `precision`: 'fp32', 'bf16' or 'auto'.
+    run in one batch and are named as by `reference`. `solver`: 'multistep' or 'euler', None for the one that suits the
+    weights. `precision`: 'fp32', 'bf16' or 'auto'.
     Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError,
     StorageError.
     """
@@ -293,7 +295,7 @@ def rollout(
     from surrogate.sampling.rollout import RolloutConfig
     from surrogate.sampling.rollout import rollout as roll
 
-    config = RolloutConfig(time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, precision=precision)
+    config = RolloutConfig(time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, solver=solver, precision=precision)
     if solver_steps is not None:
         config = replace(config, solver_steps=solver_steps)
     loaded = load_weights(file)

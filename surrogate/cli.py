@@ -33,6 +33,7 @@ from surrogate.cli_options import (
     SceneArg,
     SeedOpt,
     SolventOpt,
+    Solver,
     TemperatureOpt,
     TimestepOpt,
     parse_hydrogen_mass_da,
@@ -332,6 +333,7 @@ def rollout(
         str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
     ] = None,
     replicas: ReplicasOpt = 1,
+    solver: Annotated[Solver | None, typer.Option("--solver", help="Default: the one that suits the weights.")] = None,
     solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
     precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
     ph: PhOpt = 7.0,
@@ -359,6 +361,7 @@ def rollout(
         drop_ligand=drop_ligand,
         drop_water=drop_water,
         seed=seed,
+        solver=None if solver is None else solver.value,
         solver_steps=solver_steps,
         precision=precision.value,
         resume=resume,

@@ -10,6 +10,11 @@ import typer
 from systems.units import parse_mass_da
 
 
+class Solver(StrEnum):
+    multistep = "multistep"
+    euler = "euler"
+
+
 class Precision(StrEnum):
     auto = "auto"
     fp32 = "fp32"
