@@ -14,7 +14,8 @@ from typing import Any
 from md_reference.forcefield import resolve
 from md_reference.parent_watch import end_with_parent
 from md_reference.platforms import PlatformChoice, measured_platform
-from md_reference.simulate import MDConfig, checkpoint_path, simulate
+from md_reference.run_config import MDConfig, check_run
+from md_reference.simulate import checkpoint_path, simulate
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -54,6 +55,8 @@ def simulate_replicas(
     checkpoints: KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises
     SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
+    for out in outs:
+        check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     width = workers or min(len(outs), available_cores())
     # What goes on keeps its platform.

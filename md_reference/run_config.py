@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.forcefield import ForceFieldSpec
+from md_reference.forcefield import ForceFieldSpec, resolve
+from md_reference.integrators import check_ensemble
 from systems.errors import InputError
+from systems.scene import Scene
 from systems.units import whole_steps
 
 
@@ -68,3 +70,14 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
                 f"{out} was started with {key} = {before.get(key)!r}, not {value!r}; resume with the same settings "
                 "or write to another file."
             )
+
+
+def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
+    """Return the settings with force field and ensemble settled for this scene, before anything is computed.
+
+    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
+    """
+    _ = config.n_frames, config.steps_per_frame
+    if config.columns and out.suffix.lower() == ".dcd":
+        raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
+    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))

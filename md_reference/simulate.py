@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,10 @@ import numpy as np
 
 from md_reference.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
 from md_reference.engine import Engine, State
-from md_reference.forcefield import build_system, resolve
-from md_reference.integrators import check_ensemble, integrator_name
+from md_reference.forcefield import build_system
+from md_reference.integrators import integrator_name
 from md_reference.platforms import PlatformChoice, measured_platform
-from md_reference.run_config import MDConfig, check_same_run, settings_of
+from md_reference.run_config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.summary import summarise
 from systems.errors import InputError, SimulationError, TrajectoryError
 from systems.interrupts import deferred_interrupt
@@ -62,8 +61,7 @@ def simulate(
     (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
-    _ = config.n_frames, config.steps_per_frame
-    config = replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+    config = check_run(scene, config, out)
     chk = checkpoint_path(out)
     if resume and not chk.exists() and out.exists():
         return _already_complete(out, config)

@@ -1,0 +1,95 @@
+"""`surromd reference` with its ensembles, and `surromd bench`, as a user types them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from surrogate.cli import app
+from systems.trajectory import open_trajectory
+
+FAST = ("--time", "0.4ps", "--save-every", "0.02ps", "--timestep", "1fs", "--hydrogen-mass", "natural", "--solvent",
+        "vacuum")  # fmt: skip
+
+
+def run(*arguments: str) -> Any:
+    return CliRunner().invoke(app, list(arguments))
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    # The library's protocol equilibrates for longer than a test may take.
+    from md_reference import protocol
+
+    shortened = protocol.defaults() | {"equilibrate_ps": 0.2}
+    monkeypatch.setattr(protocol, "defaults", lambda: shortened)
+    return tmp_path
+
+
+def test_a_run_says_its_plan_first_and_its_summary_last(here: Path) -> None:
+    result = run("reference", "alanine-dipeptide", *FAST, "--ensemble", "nve", "--save-velocities", "-o", "a.h5")
+    assert result.exit_code == 0, result.output
+    assert "velocity Verlet, 1 fs, no bath" in result.stderr
+    assert "Reference on 1 thread" in result.stderr
+    assert "temperature" in result.stdout and "kJ/mol/ns per degree of freedom" in result.stdout
+    assert "bath 300 K" not in result.stdout
+    with open_trajectory(here / "a.h5") as reader:
+        velocities = reader.read_velocities()
+        assert velocities is not None and velocities.shape == (20, 22, 3)
+        assert reader.read_forces() is None
+    in_bath = run("reference", "alanine-dipeptide", *FAST, "-o", "b.h5")
+    assert "(bath 300 K)" in in_bath.stdout and "drifts" not in in_bath.stdout
+    silent = run("reference", "alanine-dipeptide", *FAST, "-o", "b.h5", "--overwrite", "--quiet")
+    assert not silent.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "a.dcd", "--save-forces"], "write an .h5 to keep forces"),
+        (["-o", "a.h5", "--ensemble", "npt"], "no periodic cell"),
+        (["-o", "a.h5", "--ensemble", "nvve"], "Did you mean 'nve'"),
+    ],
+)
+def test_what_cannot_be_is_one_line_before_anything_runs(here: Path, arguments: list[str], said: str) -> None:
+    result = run("reference", "alanine-dipeptide", *FAST, *arguments)
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not list(here.iterdir())
+
+
+def test_the_benchmark_compares_equal_models(here: Path) -> None:
+    arguments = ("--case", "ethanol", "--rounds", "1", "--seconds", "0.05s", "--cores", "1")
+    result = run("bench", "reference", *arguments, "-o", "bench.json")
+    assert result.exit_code == 0, result.output
+    rows = json.loads((here / "bench.json").read_text())["rows"]
+    assert [(row["case"], row["solvent"], row["n_atoms"]) for row in rows] == [
+        ("ethanol", "vacuum", 9),
+        ("ethanol", "obc2", 9),
+    ]
+    for row in rows:
+        assert row["equal_energies"] and row["energy_gap"] < 0.02 and row["force_gap"] < 1e-4
+        assert row["ns_per_day"]["ours"] > row["ns_per_day"]["plain, all cores"]
+    assert "ethanol" in result.stdout and "ratio" in result.stdout
+    wrong = run("bench", "reference", "--case", "methanol")
+    assert wrong.exit_code == 1 and "Did you mean 'ethanol'" in wrong.stderr
+
+
+def test_unequal_models_are_seen() -> None:
+    """Negative control of the comparison: another force field, and another solvent."""
+    from surrogate.bench import reference_setups as setups
+    from surrogate.bench.reference import _compare
+
+    ala = next(c for c in setups.CASES if c.scene == "alanine-dipeptide" and c.solvent == "obc2")
+    scene = ala.prepared()
+    mine = setups.ours(ala, scene, cores=1)
+    mine.context.setPositions(scene.positions_nm)
+    for other in (ala, setups.Case("x", ala.scene, "vacuum"), setups.Case("x", ala.scene, "obc2", "ff99SB-ILDN")):
+        found = _compare({"ours": mine, "plain, one a core": setups.plain(other, scene, threads=1)})
+        assert found["equal_energies"] == (other is ala), found
