@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+_LONGEST = 44
+
 
 class ProgressFn(Protocol):
     """Called by a running verb with what is done and what there is to do; `note` replaces the default account."""
@@ -29,7 +31,7 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # SMILES have brackets, too
         BarColumn(bar_width=30),
         TaskProgressColumn(),
         TextColumn("{task.fields[note]}"),
@@ -38,7 +40,7 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     )
     bar = Progress(*columns, console=Console(stderr=True))
     first: tuple[int, float] | None = None
-    task = bar.add_task(label, total=None, note="")
+    task = bar.add_task(label if len(label) <= _LONGEST else label[: _LONGEST - 3] + "...", total=None, note="")
 
     def advance(done: int, total: int, note: str | None = None) -> None:
         nonlocal first
