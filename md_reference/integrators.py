@@ -33,7 +33,11 @@ def integrator_name(ensemble: str, scene: Scene) -> str:
     """Return how records name it."""
     if ensemble != "nve":
         return "LangevinMiddle"
-    return "VelocityVerlet" if scene.interactions is None else "scene's own"
+    if scene.interactions is None:
+        return "VelocityVerlet"
+    from md_reference.model_systems import nve_scheme
+
+    return {"kick-drift": "SymplecticEuler", "kick-drift-kick": "VelocityVerlet"}[nve_scheme(scene)]
 
 
 def make_integrator(

@@ -98,19 +98,24 @@ _FORCES: dict[str, Callable[[dict[str, Any], Scene], Any]] = {
 }
 
 
+def nve_scheme(scene: Scene) -> str:
+    """Return how the scene moves without a bath: `kick-drift` or `kick-drift-kick`; see `build_nve_integrator`."""
+    protocol = N_BODY.get(str(scene.provenance.get("library_name")))
+    return "kick-drift-kick" if protocol is None else protocol.integrator
+
+
 def build_nve_integrator(scene: Scene, timestep_ps: float) -> Any:
-    """Return the `openmm.CustomIntegrator` without a bath that the scene's protocol asks for.
+    """Return the `openmm.CustomIntegrator` without a bath that the scene's protocol asks for (`nve_scheme`).
 
     `kick-drift` (symplectic Euler: v += dt F(x)/m, then x += dt v) for charged particles and springs, whose forces are
     cut at the law's `max_force_kj_mol_nm` in each component, as published; else `kick-drift-kick` (velocity Verlet).
     """
     from openmm import CustomIntegrator
 
-    protocol = N_BODY.get(str(scene.provenance.get("library_name")))
     largest = (scene.interactions or {}).get("max_force_kj_mol_nm")
     force = "f" if largest is None else f"max(-{largest!r}, min({largest!r}, f))"
     integrator = CustomIntegrator(timestep_ps)
-    if protocol is not None and protocol.integrator == "kick-drift":
+    if nve_scheme(scene) == "kick-drift":
         integrator.addComputePerDof("v", f"v+dt*{force}/m")
         integrator.addComputePerDof("x", "x+dt*v")
     else:
@@ -124,8 +129,8 @@ def build_nve_integrator(scene: Scene, timestep_ps: float) -> Any:
 class NBodyTrajectories:
     """Trajectories of one kind: `positions_nm` and `velocities_nm_ps` `(n, n_frames, n_particles, 3)`.
 
-    `time_ps (n_frames,)`. `charges_e (n, n_particles)`, 0 where the kind has none. `edges (n, n_particles, n_particles)`,
-    1 for a spring.
+    `time_ps (n_frames,)`. `charges_e (n, n_particles)`, 0 where the kind has none. `edges` are 1 for a spring,
+    `(n, n_particles, n_particles)`.
     """
 
     name: str

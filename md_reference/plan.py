@@ -9,7 +9,7 @@ from typing import Any
 
 from md_reference.engine import Engine
 from md_reference.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.integrators import check_ensemble
+from md_reference.integrators import check_ensemble, integrator_name
 from md_reference.platforms import PlatformChoice, choose_platform, measured_platform
 from md_reference.replicas import available_cores
 from md_reference.run_config import MDConfig
@@ -196,8 +196,11 @@ def _integrator(
 ) -> str:
     step = f"{timestep_ps * 1000:g} fs"
     if ensemble == "nve":
-        name = "velocity Verlet" if scene.interactions is None else "the scene's own"
-        return f"{name}, {step}, no bath (started at {temperature_k:g} K)"
+        name = {"VelocityVerlet": "velocity Verlet", "SymplecticEuler": "symplectic Euler"}[
+            integrator_name(ensemble, scene)
+        ]
+        own = scene.velocities_nm_ps is not None
+        return f"{name}, {step}, no bath (started {'as the scene says' if own else f'at {temperature_k:g} K'})"
     text = f"Langevin middle, {step}, {temperature_k:g} K, {friction_per_ps:g}/ps"
     return text + (f"; Monte Carlo barostat at {pressure_bar:g} bar" if ensemble == "npt" else "")
 
@@ -306,7 +309,9 @@ def _skips(
         skips.append(Skip("barostat", f"the ensemble is {ensemble}; npt has one"))
     if ensemble == "nve":
         skips.append(Skip("thermostat", "the ensemble is nve"))
-        skips.append(Skip("removal of centre-of-mass motion", "it is put at rest once and stays there"))
+        own = scene.interactions is not None
+        why = "it is part of the model system" if own else "it is put at rest once and stays there"
+        skips.append(Skip("removal of centre-of-mass motion", why))
     else:
         skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
     if not save_velocities:

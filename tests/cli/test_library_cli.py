@@ -56,6 +56,9 @@ def test_plan_takes_the_protocol_and_says_so() -> None:
     assert "temperature" not in other["protocol"]
     assert other["constraints"] == "6 bonds to hydrogen"
     assert "protocol" not in json.loads(run("plan", "alanine-dipeptide", "--json").stdout)
+    for name, scheme in (("n-body-spring", "symplectic Euler"), ("n-body-gravity", "velocity Verlet")):
+        moved = json.loads(run("plan", name, "--json").stdout)
+        assert moved["integrator"] == f"{scheme}, 1 fs, no bath (started as the scene says)"
 
 
 def test_reference_takes_the_protocol_and_says_so(tmp_path: Path) -> None:
@@ -67,6 +70,7 @@ def test_reference_takes_the_protocol_and_says_so(tmp_path: Path) -> None:
         record = reader.record
         assert reader.n_frames == 10
     assert (record["ensemble"], record["timestep_ps"], record["save_every_ps"]) == ("nve", 0.001, 0.1)
+    assert record["integrator"] == "SymplecticEuler"
     quiet = run("reference", "harmonic-oscillator", "--time", "1ps", "--temperature", "400K", "-o",
                 str(tmp_path / "b.h5"), "--quiet")  # fmt: skip
     assert quiet.exit_code == 0, quiet.output
