@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from systems.errors import PreparationError, UnknownNameError, nearest
+from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.scene import IntArray, Scene
 
 PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
@@ -85,6 +85,20 @@ class ForceFieldSpec:
         if self.solvent == "tip3p" and name == "ff19SB":
             found.append("ff19SB is tuned for OPC water; use --solvent opc.")
         return tuple(found)
+
+
+def at_level(level: str | None, force_field: str | None) -> str | None:
+    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands.
+
+    Raises UnknownNameError, and InputError where the two contradict each other.
+    """
+    if level is None:
+        return force_field
+    if level not in ("mm", QUANTUM):
+        raise UnknownNameError(f"unknown level {level!r}; known: mm, {QUANTUM}." + nearest(level, ["mm", QUANTUM]))
+    if (level == QUANTUM) != (force_field == QUANTUM) and force_field not in (None, "auto"):
+        raise InputError(f"--level {level} contradicts --force-field {force_field}; give one of them.")
+    return QUANTUM if level == QUANTUM else force_field
 
 
 def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:

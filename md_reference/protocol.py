@@ -6,14 +6,17 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any
 
-from md_reference.forcefield import ForceFieldSpec
+from md_reference.forcefield import QUANTUM, ForceFieldSpec
 from md_reference.run_config import MDConfig
 from systems import library
+from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import format_time_ps
 
 # Bonds to hydrogen of natural mass swing in 9 fs; a longer step than this needs them rigid.
 LONGEST_FLEXIBLE_STEP_PS = 0.001
+# A quantum-mechanical force takes a thousand times as long as a classical one.
+QUANTUM_DEFAULTS = {"timestep_ps": 0.0005, "equilibrate_ps": 1.0, "hydrogen_mass_da": None}
 _WORDS = {
     "force_field": "force field",
     "temperature_k": "temperature",
@@ -49,6 +52,14 @@ def settle_by_name(name: str, given: Mapping[str, Any]) -> tuple[dict[str, Any],
     if "force_field" in given:
         protocol.pop("solvent", None)
     own = defaults()
+    if given.get("force_field") == QUANTUM:
+        if given.get("timestep_ps", 0.0) > LONGEST_FLEXIBLE_STEP_PS:
+            raise InputError(
+                f"{QUANTUM} leaves bonds to hydrogen free, for which {format_time_ps(given['timestep_ps'])} is too "
+                "long; use --timestep 1fs or less."
+            )
+        own |= QUANTUM_DEFAULTS
+        protocol.pop("equilibrate_ps", None)
     settings = own | protocol | dict(given)
     if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:
         settings["constrain_hydrogens"] = True

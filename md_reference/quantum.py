@@ -17,6 +17,7 @@ from systems.scene import FloatArray, Scene
 KJ_MOL_PER_HARTREE = 2625.4996394799
 NM_PER_BOHR = 0.0529177210903
 _HEAVIEST = 86
+_UPHILL_KJ_MOL = 1e9
 # A force costs some hundred ms at 50 atoms and grows with the third power.
 LARGEST = 200
 
@@ -43,7 +44,14 @@ def build_quantum_system(scene: Scene) -> Any:
         system.addParticle(mass_da)
 
     def compute(state: Any) -> tuple[float, FloatArray]:
-        return potential(np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64))
+        positions_nm = np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64)
+        try:
+            return potential(positions_nm)
+        except PreparationError:
+            if state.getStepCount() > 0:
+                raise
+            # A minimiser's first trial moves all atoms by 1 nm in sum; it must learn that this is uphill.
+            return _UPHILL_KJ_MOL, np.zeros_like(positions_nm)
 
     force = openmm.PythonForce(compute)
     force.setName("GFN2-xTB")

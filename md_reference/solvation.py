@@ -12,7 +12,7 @@ import numpy.typing as npt
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.templates import cutoff_nm
 from systems.element_data import atomic_weight_da, covalent_radius_nm
-from systems.errors import PreparationError
+from systems.errors import InputError, PreparationError
 from systems.scene import FloatArray, Scene
 
 # Heights 1, 1 and 0.71 of the width; 71 % of the volume of the cube with the same distance between images.
@@ -77,6 +77,34 @@ def solvate(
     water = _shaped(np.delete(water, chosen, axis=0), *_WATER_SHAPES[spec.solvent])
     done = f"solvated: {len(water)} {spec.solvent.upper()} waters, {kinds.count('Na')} Na+, {kinds.count('Cl')} Cl-"
     return _assembled(scene, solute, water, kinds, ions, cell, done, seed)
+
+
+def solvate_if_asked(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    padding_nm: float | None = None,
+    ionic_strength_molar: float | None = None,
+    *,
+    seed: int = 0,
+) -> Scene:
+    """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is.
+
+    None is the default of `solvate`. Raises InputError for a padding or an ionic strength that nothing would use.
+    """
+    given = [
+        option
+        for option, value in (("--padding", padding_nm), ("--ionic-strength", ionic_strength_molar))
+        if value is not None
+    ]
+    if spec.is_explicit and scene.cell_nm is None:
+        return solvate(scene, spec, 1.0 if padding_nm is None else padding_nm, ionic_strength_molar or 0.0, seed=seed)
+    if given and not spec.is_explicit:
+        raise InputError(
+            f"nothing would use {' and '.join(given)} without water around the scene; give --solvent tip3p or opc."
+        )
+    if given:
+        raise InputError(f"scene {scene.name!r} has a periodic cell already; leave {' and '.join(given)} out.")
+    return scene
 
 
 @cache

@@ -90,6 +90,9 @@ def plan(
     *,
     force_field: str | None = None,
     solvent: str | None = None,
+    level: str | None = None,
+    padding_nm: float | None = None,
+    ionic_strength_molar: float | None = None,
     temperature_k: float | None = None,
     friction_per_ps: float | None = None,
     timestep_ps: float | None = None,
@@ -106,21 +109,25 @@ def plan(
 ) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
-    `ph`, `keep_ligand`, `drop_ligand`, `drop_water`: see `systems.prepare.prepare`. Steps are timed for about a second;
-    with `time_ps` the wall time of a run of that length is estimated. Raises what `reference` raises for settings that
-    cannot be.
+    `ph`, `keep_ligand`, `drop_ligand`, `drop_water`: see `systems.prepare.prepare`; `level` to `ionic_strength_molar`:
+    see `reference`. Steps are timed for about a second; with `time_ps` the wall time of a run of that length is
+    estimated. Raises what `reference` raises for settings that cannot be.
     """
     from md_reference.plan import make_plan
 
     molecule = _prepare(
         scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=False
     )
-    config, protocol = _settle(
+    molecule, config, protocol = _settle(
         molecule,
         time_ps=1.0 if time_ps is None else time_ps,
         seed=0,
+        quiet=True,
         force_field=force_field,
         solvent=solvent,
+        level=level,
+        padding_nm=padding_nm,
+        ionic_strength_molar=ionic_strength_molar,
         temperature_k=temperature_k,
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
@@ -153,6 +160,9 @@ def reference(
     save_every_ps: float | None = None,
     force_field: str | None = None,
     solvent: str | None = None,
+    level: str | None = None,
+    padding_nm: float | None = None,
+    ionic_strength_molar: float | None = None,
     temperature_k: float | None = None,
     friction_per_ps: float | None = None,
     timestep_ps: float | None = None,
@@ -177,6 +187,10 @@ def reference(
     `ensemble`: 'nvt' (Langevin middle integrator), 'nve' (velocity Verlet) or 'npt' (Monte Carlo barostat at
     `pressure_bar`; periodic scenes only). `save_velocities` (nm/ps) and `save_forces` (kJ/mol/nm) need an .h5.
 
+    `force_field`, `solvent`: see `md_reference.forcefield.ForceFieldSpec`; `level='gfn2-xtb'` is that force field.
+    Explicit solvents ('tip3p', 'opc') put a scene that has no periodic cell into one: water to `padding_nm` (1 nm) on
+    each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
+
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
     `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
     (`systems(name)`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs,
@@ -191,13 +205,17 @@ def reference(
     molecule = _prepare(
         scene, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water, quiet=quiet
     )
-    config, protocol = _settle(
+    molecule, config, protocol = _settle(
         molecule,
         time_ps=time_ps,
         save_every_ps=save_every_ps,
         seed=seed,
+        quiet=quiet,
         force_field=force_field,
         solvent=solvent,
+        level=level,
+        padding_nm=padding_nm,
+        ionic_strength_molar=ionic_strength_molar,
         temperature_k=temperature_k,
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
@@ -234,23 +252,43 @@ def _tell(name: str, line: str) -> None:
 
 
 def _settle(
-    scene: Scene, *, time_ps: float, seed: int, hydrogen_mass_da: float | Default | None, **given: Any
-) -> tuple[MDConfig, str]:
-    """Return the settings of a run, and a line about what the library's protocol decided.
+    scene: Scene,
+    *,
+    time_ps: float,
+    seed: int,
+    quiet: bool,
+    level: str | None,
+    padding_nm: float | None,
+    ionic_strength_molar: float | None,
+    hydrogen_mass_da: float | Default | None,
+    **given: Any,
+) -> tuple[Scene, MDConfig, str]:
+    """Return the scene, solvated if asked, the settings of a run, and a line about what the library's protocol decided.
 
     `given`: fields of MDConfig and ForceFieldSpec, None where the user leaves them open. Raises InputError.
     """
     from md_reference.campaign_settings import to_config
+    from md_reference.forcefield import at_level, resolve
     from md_reference.integrators import check_ensemble
     from md_reference.protocol import settle
+    from md_reference.solvation import solvate_if_asked
+
+    given["force_field"] = at_level(level, given.get("force_field"))
 
     asked = {key: value for key, value in given.items() if value is not None}
     if hydrogen_mass_da != "default":
         asked["hydrogen_mass_da"] = hydrogen_mass_da
     settings, protocol = settle(scene, asked)
-    settings |= {"time_ps": time_ps, "ensemble": check_ensemble(settings["ensemble"], scene)}
-    config = to_config(settings, seed=seed)
-    return config, protocol
+    config = to_config(settings | {"time_ps": time_ps}, seed=seed)
+    config = replace(config, force=resolve(scene, config.force))
+    dry, scene = scene, solvate_if_asked(scene, config.force, padding_nm, ionic_strength_molar, seed=seed)
+    config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
+    if not quiet:
+        if scene is not dry:
+            _tell(scene.name, scene.provenance["repairs"][-1])
+        for warning in config.force.warnings:
+            _tell(scene.name, f"warning: {warning}")
+    return scene, config, protocol
 
 
 def rollout(

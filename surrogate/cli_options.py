@@ -36,6 +36,15 @@ ForceFieldOpt = Annotated[
 SolventOpt = Annotated[
     str | None, typer.Option("--solvent", help="obc2, gbn2, tip3p, opc, vacuum, amber99-obc. [default: auto]")
 ]
+LevelOpt = Annotated[
+    str | None, typer.Option("--level", help="mm or gfn2-xtb, quantum mechanics for molecules. [default: mm]")
+]
+PaddingOpt = Annotated[
+    str | None, typer.Option("--padding", help="From the solute to the walls, in explicit water. [default: 1nm]")
+]
+IonicStrengthOpt = Annotated[
+    str | None, typer.Option("--ionic-strength", help="Of NaCl in explicit water, beside counter-ions. [default: 0M]")
+]
 TemperatureOpt = Annotated[str | None, typer.Option("--temperature", help="Of the bath. [default: 300K]")]
 FrictionOpt = Annotated[str | None, typer.Option("--friction", help="Of the Langevin bath. [default: 1/ps]")]
 TimestepOpt = Annotated[str | None, typer.Option("--timestep", help="Integration step. [default: 4fs]")]

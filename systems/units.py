@@ -13,6 +13,8 @@ _WALL_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 # These three mean the same in every MD program, so a bare number is accepted, too.
 _TEMPERATURE_K = {"K": 1.0, "": 1.0}
 _RATE_PER_PS = {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, "/ns": 1e-3, "1/ns": 1e-3, "": 1.0}
+_LENGTH_NM = {"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}
+_MOLAR = {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}
 _MASS_DA = {"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}
 _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
@@ -59,6 +61,16 @@ def parse_rate_per_ps(text: str, what: str = "friction") -> float:
 def parse_mass_da(text: str, what: str = "hydrogen mass") -> float:
     """Return a mass in dalton (`3Da` or `3`). Raises UnitError."""
     return _parse(text, _MASS_DA, what, "3Da")
+
+
+def parse_length_nm(text: str, what: str = "length") -> float:
+    """Return a length in nm (`1nm`, `10A`). Raises UnitError for a missing, unknown or non-positive quantity."""
+    return _parse(text, _LENGTH_NM, what, "1nm")
+
+
+def parse_molar(text: str, what: str = "concentration") -> float:
+    """Return a concentration in mol/l (`0.15M`, `150mM`, `0.15` or `0`). Raises UnitError."""
+    return 0.0 if text.strip() in ("0", "0M", "0mM") else _parse(text, _MOLAR, what, "0.15M")
 
 
 def format_time_ps(time_ps: float) -> str:
