@@ -454,3 +454,6 @@ def test_hard_files_prepare_or_are_refused_in_one_line(shared_data: Path) -> Non
         "unordered_res.pdb": 577,
         "varying_occ_tmp.pdb": 0,
     }
+    assert prepare(str(folder / "elements.pdb"), drop_ligand=True).n_atoms == 17
+    with pytest.raises(PreparationError, match="DMS A101 has no hydrogens, which a ligand must bring"):
+        prepare(str(folder / "elements.pdb"), keep_ligand=True)
