@@ -23,6 +23,8 @@ _CLASSES = {
     "local": "LocalCluster",
 }
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
+# So long a scheduler may take to answer.
+_ANSWER_S = 20.0
 _PRELOAD = "md_reference.campaign_worker"
 
 
@@ -47,7 +49,7 @@ def open_client(
     with _quiet(), dask.config.set({"distributed.scheduler.allowed-failures": retries}):
         if scheduler is not None:
             try:
-                client = Client(scheduler, timeout="20s", set_as_default=False)
+                client = Client(scheduler, timeout=_ANSWER_S, set_as_default=False)
             except (OSError, ValueError) as error:
                 raise InputError(f"no Dask scheduler answers at {scheduler} ({error}).") from error
             with client:
@@ -122,7 +124,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     named = ("walltime", "queue", "account", "interface", "python")
     arguments |= {key: value for key in named if (value := getattr(spec, key))}
     try:
-        return getattr(dask_jobqueue, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": None}, **arguments)
+        return getattr(dask_jobqueue, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": ":0"}, **arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
     except OSError as error:

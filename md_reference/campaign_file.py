@@ -114,7 +114,8 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
     for number, entry in enumerate(_scene_tables(table, path.parent)):
         where = f"scenes[{number}] ({entry.get('scene', '?')})"
         spec = _scene_spec(entry, shared, path.parent, where)
-        if spec.name in {other.name for other in scenes}:
+        # Some file systems take A and a for the same.
+        if spec.name.lower() in {other.name.lower() for other in scenes}:
             raise InputError(f"two scenes are called {spec.name!r}; give one of them a name of its own (name = ...).")
         scenes.append(spec)
         try:

@@ -38,11 +38,7 @@ def new_manifest(campaign: Campaign) -> Manifest:
         seed=campaign.seed,
         scenes={scene.name: scene for scene in scenes},
         runs={run.name: run for run in runs},
-        programs={
-            "python": platform.python_version(),
-            "openmm": version("openmm"),
-            "distributed": version("distributed"),
-        },
+        programs={"python": platform.python_version()} | {name: version(name) for name in ("openmm", "distributed")},
         started=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 

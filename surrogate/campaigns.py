@@ -37,17 +37,24 @@ def run_campaign(campaign: Campaign, *, workers: int | None, scheduler: str | No
         if not quiet:
             sys.stderr.write(f"{name}: {reason}\n")
 
-    with (
-        open_client(
-            workers=workers,
-            scheduler=scheduler,
-            cluster=campaign.cluster,
-            retries=campaign.retries,
-            folder=campaign.folder,
-        ) as client,
-        progress_bar(f"campaign {campaign.name}", quiet=quiet) as advance,
-    ):
-        run(campaign, client, progress=None if advance is None else _Meter(advance), failed=failed)
+    try:
+        with (
+            open_client(
+                workers=workers,
+                scheduler=scheduler,
+                cluster=campaign.cluster,
+                retries=campaign.retries,
+                folder=campaign.folder,
+            ) as client,
+            progress_bar(f"campaign {campaign.name}", quiet=quiet) as advance,
+        ):
+            run(campaign, client, progress=None if advance is None else _Meter(advance), failed=failed)
+    except KeyboardInterrupt as stop:
+        if stop.args:
+            raise
+        # While workers start or end.
+        summary = describe_campaign(campaign.folder)["summary"]
+        raise KeyboardInterrupt(f"{campaign.folder}: {summary}; the same command goes on") from None
     return describe_campaign(campaign.folder)
 
 

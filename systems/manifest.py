@@ -167,7 +167,7 @@ def file_sha256(path: Path) -> str:
 
 
 def frames_sha256(path: Path) -> str:
-    """Return the SHA-256 of a trajectory's frames: times, positions and scalars, whatever the file around them."""
+    """Return the SHA-256 of a trajectory's frames, all that is kept of each, whatever the file around them."""
     from systems.trajectory import open_trajectory
 
     digest = hashlib.sha256()
@@ -176,6 +176,11 @@ def frames_sha256(path: Path) -> str:
         for name in sorted(reader.scalars):
             digest.update(name.encode())
             digest.update(np.asarray(reader.scalars[name], dtype="<f8").tobytes())
-        for block in reader.iter_blocks(4096):
-            digest.update(np.asarray(block, dtype="<f4").tobytes())
+        for start in range(0, reader.n_frames, 4096):
+            stop = start + 4096
+            digest.update(np.asarray(reader.read(start, stop), dtype="<f4").tobytes())
+            for extra in (reader.read_velocities(start, stop), reader.read_forces(start, stop)):
+                digest.update(b"" if extra is None else np.asarray(extra, dtype="<f4").tobytes())
+            cells = reader.read_cells(start, stop)
+            digest.update(b"" if cells is None else np.asarray(cells, dtype="<f8").tobytes())
     return digest.hexdigest()

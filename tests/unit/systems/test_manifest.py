@@ -118,3 +118,11 @@ def test_the_hash_of_frames_sees_positions_times_and_scalars_and_nothing_else(
     assert file_sha256(tmp_path / "a.h5") != file_sha256(tmp_path / "b.h5")
     others = {write("c.h5", shift=1e-6), write("d.h5", later=1e-9), write("e.h5", warmer=1e-9)}
     assert len(others | {first}) == 4
+
+    def moving(name: str, faster: float) -> str:
+        positions = np.repeat(alanine_dipeptide.positions_nm[None], 2, axis=0)
+        with open_writer(tmp_path / name, alanine_dipeptide, {}, columns=["velocities"]) as writer:
+            writer.append(positions, np.array([1.0, 2.0]), velocities_nm_ps=positions + faster)
+        return frames_sha256(tmp_path / name)
+
+    assert moving("f.h5", 0.0) == moving("g.h5", 0.0) != moving("h.h5", 1e-6)

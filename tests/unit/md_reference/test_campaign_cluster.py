@@ -1,0 +1,94 @@
+"""Where a campaign's workers come from: batch jobs as the file asks for them, schedulers that are there or not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from md_reference import campaign_cluster
+from md_reference.campaign import run_campaign
+from md_reference.campaign_cluster import job_cluster, open_client
+from md_reference.campaign_file import ClusterSpec, read_campaign
+from systems.errors import InputError
+from systems.manifest import COMPLETE
+
+pytest.importorskip("dask_jobqueue")
+
+
+def test_a_slurm_job_asks_for_what_the_file_says(tmp_path: Path) -> None:
+    spec = ClusterSpec(
+        kind="slurm",
+        jobs=20,
+        cores=8,
+        memory="16GB",
+        walltime="12:00:00",
+        queue="cpu",
+        account="chem",
+        directives=("--exclude=node7",),
+        prologue=("module load python/3.12",),
+    )
+    with job_cluster(spec, tmp_path) as cluster:
+        lines = cluster.job_script().splitlines()
+        assert not cluster.workers, "no job before there is work"
+    assert {"#SBATCH -p cpu", "#SBATCH -A chem", "#SBATCH -t 12:00:00", "#SBATCH --exclude=node7"} <= set(lines)
+    assert "#SBATCH --cpus-per-task=8" in lines
+    worker = next(line for line in lines if "--preload md_reference.campaign_worker" in line)
+    assert "--nworkers 8" in worker
+    assert "--nthreads 1" in worker
+    before = lines[: lines.index(worker)]
+    assert "export OPENMM_CPU_THREADS=1" in before
+    assert "module load python/3.12" in before
+
+
+def test_one_worker_in_a_job_without_a_queue(tmp_path: Path) -> None:
+    with job_cluster(ClusterSpec(kind="pbs", walltime="01:00:00"), tmp_path) as cluster:
+        script = cluster.job_script()
+    assert "#PBS -l walltime=01:00:00" in script
+    assert "#PBS -q" not in script
+    assert "--nthreads 1" in script
+
+
+def test_no_scheduler_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaign_cluster, "_ANSWER_S", 0.5)
+    with (
+        pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9") as caught,
+        open_client(scheduler="tcp://127.0.0.1:9"),
+    ):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_workers_here_and_a_scheduler_there_exclude_each_other() -> None:
+    with pytest.raises(InputError, match="give one of them"), open_client(workers=2, scheduler="tcp://127.0.0.1:9"):
+        pass
+
+
+@pytest.mark.slow
+def test_a_campaign_through_dask_jobqueue(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(
+        'scenes = ["alanine-dipeptide"]\nreplicas = 2\ntime = "2ps"\nsave_every = "100fs"\nequilibrate = "1ps"\n'
+        'platform = "Reference"\n[cluster]\nkind = "local"\njobs = 1\nmemory = "1GB"\n'
+    )
+    campaign = read_campaign(file)
+    with open_client(cluster=campaign.cluster, folder=campaign.folder) as client:
+        manifest = run_campaign(campaign, client)
+    assert manifest.counts() == {COMPLETE: 2}
+
+
+@pytest.mark.slow
+def test_a_campaign_on_a_scheduler_that_runs_already(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    file = tmp_path / "c.toml"
+    file.write_text(
+        'scenes = ["alanine-dipeptide"]\nreplicas = 2\ntime = "2ps"\nsave_every = "100fs"\nequilibrate = "1ps"\n'
+        'platform = "Reference"\n'
+    )
+    campaign = read_campaign(file)
+    with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+        with open_client(scheduler=cluster.scheduler_address) as client:
+            manifest = run_campaign(campaign, client)
+        assert manifest.counts() == {COMPLETE: 2}
+        assert len(cluster.workers) == 1, "workers of others are left alone"
