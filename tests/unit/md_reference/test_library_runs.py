@@ -156,5 +156,7 @@ def test_an_n_body_file_holds_the_trajectory_of_its_generator(tmp_path: Path) ->
 def test_every_scene_runs_ten_picoseconds(name: str, tmp_path: Path) -> None:
     outcome = run_scene(name, tmp_path)
     assert outcome.passed, outcome.reason or f"{outcome.invalid_frames} invalid frames"
-    if outcome.bath_k and outcome.n_frames >= 1000:
-        assert outcome.temperature_k == pytest.approx(outcome.bath_k, rel=0.25)
+    if outcome.bath_k:
+        # At a friction of 0.1/ps the energy hardly changes within 10 ps: one draw, of relative spread 1 / sqrt(3 n).
+        spread = 1.0 / np.sqrt(3 * outcome.n_atoms)
+        assert outcome.temperature_k == pytest.approx(outcome.bath_k, rel=4.0 * spread)
