@@ -1,0 +1,116 @@
+"""GFN2-xTB through OpenMM: units, signs, charges and spins, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from md_reference.engine import Engine
+from md_reference.forcefield import ForceFieldSpec, at_level, resolve
+from md_reference.protocol import settle
+from md_reference.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
+from systems.errors import InputError, PreparationError, UnknownNameError
+from systems.library import load
+from systems.molecule import scene_from_smiles
+
+pytest.importorskip("tblite")
+SPEC = ForceFieldSpec("gfn2-xtb", "vacuum")
+
+
+def test_energy_is_tblites_own_in_kj_mol_and_its_forces_are_minus_the_gradient() -> None:
+    from tblite.interface import Calculator
+
+    scene = scene_from_smiles("CO")
+    x = scene.positions_nm + 0.004 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
+    numbers = np.array([{"H": 1, "C": 6, "O": 8}[e] for e in scene.elements])
+    own = Calculator("GFN2-xTB", numbers, x / NM_PER_BOHR)
+    own.set("verbosity", 0)
+    result = own.singlepoint()
+    with Engine(scene, SPEC, platform="Reference", timestep_ps=0.0005) as engine:
+        energy, forces = engine.energy(x), engine.forces(x)
+        assert energy == pytest.approx(float(result.get("energy")) * 2625.4996394799, rel=1e-10)
+        # Methanol in GFN2-xTB: -8.22 hartree; a wrong unit is off by orders of magnitude.
+        assert energy / KJ_MOL_PER_HARTREE == pytest.approx(-8.2, abs=0.1)
+        step = 1e-5
+        for atom, axis in ((0, 0), (1, 2), (3, 1)):
+            ends = []
+            for sign in (1, -1):
+                moved = x.copy()
+                moved[atom, axis] += sign * step
+                ends.append(engine.energy(moved))
+            numeric = -(ends[0] - ends[1]) / (2 * step)
+            assert forces[atom, axis] == pytest.approx(numeric, rel=2e-3, abs=1.0)
+        scale = np.abs(forces).max()
+        assert scale > 100.0
+        # No net force on a free molecule.
+        np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-3 * scale)
+
+
+def test_forces_depend_on_positions_alone() -> None:
+    """Not on what was computed before, so that a resumed run repeats an undisturbed one."""
+    scene = scene_from_smiles("CO")
+    fresh, used = Potential(scene), Potential(scene)
+    x = scene.positions_nm
+    for shift in (0.01, -0.02):
+        used(x * (1.0 + shift))
+    (energy, forces), (again, forces_again) = fresh(x), used(x)
+    assert energy == again
+    np.testing.assert_array_equal(forces, forces_again)
+
+
+def test_charge_and_unpaired_electrons_are_used() -> None:
+    radical, anion = scene_from_smiles("[CH3]"), scene_from_smiles("[CH3-]")
+    assert radical.provenance["multiplicity"] == 2
+    energies = [Potential(s)(radical.positions_nm)[0] for s in (radical, anion)]
+    assert abs(energies[0] - energies[1]) > 10.0
+
+
+def test_there_are_no_constraints_and_masses_are_natural() -> None:
+    scene = load("ethanol")
+    system = build_quantum_system(scene)
+    assert system.getNumConstraints() == 0
+    assert [system.getParticleMass(i)._value for i in range(scene.n_atoms)] == scene.masses_da.tolist()
+    assert resolve(scene, ForceFieldSpec("gfn2-xtb", "auto", 3.0, True)) == ForceFieldSpec(
+        "gfn2-xtb", "vacuum", None, False
+    )
+
+
+def test_a_short_run_keeps_its_energy() -> None:
+    scene = load("ethanol")
+    with Engine(scene, SPEC, platform="Reference", timestep_ps=0.0005, ensemble="nve") as engine:
+        engine.thermalise()
+        totals, potentials = [], []
+        for _ in range(5):
+            engine.step(2)
+            state = engine.state()
+            potentials.append(state.potential_kj_mol)
+            totals.append(state.potential_kj_mol + state.kinetic_kj_mol)
+    assert np.ptp(totals) < 1.0
+    # Negative control: what is conserved is the sum.
+    assert np.ptp(potentials) > 2.0
+
+
+def test_level_and_settings_go_together() -> None:
+    assert at_level(None, None) is None
+    assert at_level("gfn2-xtb", None) == "gfn2-xtb"
+    assert at_level("mm", "ff19SB") == "ff19SB"
+    with pytest.raises(InputError, match="contradicts"):
+        at_level("gfn2-xtb", "ff14SB")
+    with pytest.raises(InputError, match="contradicts"):
+        at_level("mm", "gfn2-xtb")
+    with pytest.raises(UnknownNameError, match="gfn2-xtb"):
+        at_level("gfn2", None)
+    scene = scene_from_smiles("CO")
+    settings, _ = settle(scene, {"force_field": "gfn2-xtb"})
+    assert settings["timestep_ps"] == 0.0005
+    with pytest.raises(InputError, match="1fs"):
+        settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.004})
+
+
+def test_impossible_electrons_are_refused() -> None:
+    from dataclasses import replace
+
+    scene = scene_from_smiles("CO")
+    wrong = replace(scene, provenance=scene.provenance | {"multiplicity": 2})
+    with pytest.raises(PreparationError, match="unpaired"):
+        build_quantum_system(wrong)
