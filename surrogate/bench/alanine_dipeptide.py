@@ -14,13 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from md_reference.replicas import replica_paths
 from surrogate import api
 from systems.units import parse_wall_s
 
 SCENE = "alanine-dipeptide"
 # Kind of run: first seed and number of replicas. `more` was added when the first 400 ns turned out to hold a single
 # crossing to phi > 0; the held-out runs are those of the first version.
-TRAIN = {"train": (100, 4), "more": (106, 4)}
+TRAIN = {"train": (100, 4), "more": (106, 3)}
 HELD = {"held": (104, 2)}
 REPLICA_PS = 100_000.0
 ROLLOUT_SEED = 1
@@ -110,10 +113,43 @@ def judge(
     return rows
 
 
+def noise_floor(references: list[Path], rollout: list[Path]) -> dict[str, Any]:
+    """Return the joint phi/psi distance of every pair of reference runs and of the rollout to each, and phi > 0.
+
+    One replicate is one draw of the floor: a state that is visited once in 200 ns makes pairs of 100 ns differ widely.
+    """
+    from surrogate.judge.distributions import RAMACHANDRAN_BINS, distance, is_positive
+    from surrogate.judge.ensemble import load_ensemble
+    from surrogate.judge.structure import backbone
+    from systems.geometry import torsion
+    from systems.library import load
+
+    scene = load(SCENE)
+    residue = backbone(scene)
+    quads = np.stack([residue.phi[0], residue.psi[0]])
+    counts, positive = [], []
+    for paths in [*([p] for p in references), rollout]:
+        angles = np.concatenate([torsion(x, quads) for x in load_ensemble(paths, template=scene).segments])
+        phi, psi = (RAMACHANDRAN_BINS.index(angles[:, k]) for k in range(2))
+        n = RAMACHANDRAN_BINS.n_total
+        counts.append(np.bincount(phi * n + psi, minlength=n * n).astype(np.float64))
+        positive.append(float(is_positive(angles[:, 0]).mean()))
+    to_each = [float(distance(counts[-1], c)) for c in counts[:-1]]
+    pairs = [float(distance(a, b)) for k, a in enumerate(counts[:-1]) for b in counts[k + 1 : -1]]
+    share = [100.0 * x for x in positive]
+    sys.stdout.write(
+        f"{len(pairs)} pairs of reference runs: joint distance {min(pairs):.3f} to {max(pairs):.3f}, median "
+        f"{np.median(pairs):.3f}; rollout to each: {min(to_each):.3f} to {max(to_each):.3f}, median "
+        f"{np.median(to_each):.3f}\nphi > 0, %: references {' '.join(f'{x:.2f}' for x in share[:-1])}; "
+        f"rollout {share[-1]:.2f}\n"
+    )
+    return {"pairs": pairs, "rollout": to_each, "positive_phi_percent": share}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/alanine-dipeptide"))
-    parser.add_argument("--budget", default="55min", help="training time, both stages (default 55min)")
+    parser.add_argument("--budget", default="65min", help="training time, both stages (default 65min)")
     parser.add_argument("--compile", action="store_true", help="compile the network (needs a C++ compiler)")
     parser.add_argument("--solver-steps", type=int, default=None)
     parser.add_argument("--curve", action="store_true", help="also judge every snapshot of the training")
@@ -125,7 +161,10 @@ def main() -> None:
     train(paths, references, parse_wall_s(args.budget), compile_=args.compile)
     ship(paths.weights, paths.shipped)
     steps = args.solver_steps
-    figures = {"rollout": judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)}
+    figures: dict[str, Any] = {}
+    figures["rollout"] = judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)
+    rolled = replica_paths(paths.folder / "rollout.h5", ROLLOUT_REPLICAS)
+    figures["floor"] = noise_floor([*references, *held], rolled)
     if args.curve:
         for weights in [*sorted(paths.folder.glob("model.at*min.safetensors")), paths.weights]:
             name = weights.stem.replace("model", "curve").replace(".at", "_")
