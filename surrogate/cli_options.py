@@ -58,7 +58,7 @@ SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them wi
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
 ]
-PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform, or auto.")]
+PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform; auto: the fastest, timed on the scene.")]
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
 ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
 OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
