@@ -106,7 +106,7 @@ def test_rotations_are_uniform_over_so3() -> None:
 
 @pytest.mark.parametrize("width", [1.0, 0.4, 0.1, 0.05])
 def test_multistep_keeps_narrow_directions_wide(width: float) -> None:
-    """Linear in the noise, so that the ratio of the widths is the exact answer: how much too narrow a direction comes."""
+    """Linear in the noise, so the ratio of the widths is exact: how much too narrow a direction comes out."""
     noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def error(sample: Tensor) -> float:
