@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +55,15 @@ def test_replicas_resume_and_keep_what_is_complete(alanine_dipeptide: Scene, tmp
 
 # ---- the end of the parent -----------------------------------------------------------------------------------------
 
+@contextmanager
+def ended(process: subprocess.Popen[str]) -> Iterator[None]:
+    """A failed assertion must not wait for a run of days."""
+    try:
+        yield
+    finally:
+        process.kill()
+
+
 PARENT = """
 import sys
 sys.path.insert(0, {repository!r})
@@ -64,7 +75,7 @@ from systems.library import load
 if __name__ == "__main__":
     config = MDConfig(time_ps=4e6, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
     try:
-        simulate_replicas(load("alanine-dipeptide"), config, [Path(p) for p in {outs!r}])
+        simulate_replicas(load("alanine-dipeptide"), config, [Path(p) for p in {outs!r}], workers=2)
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -94,7 +105,10 @@ def test_replicas_end_with_their_parent_and_can_be_resumed(
     outs = [tmp_path / "a.h5", tmp_path / "b.h5"]
     script = tmp_path / "parent.py"
     script.write_text(PARENT.format(repository=str(repository), outs=[str(out) for out in outs]))
-    with subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as parent:
+    with (
+        subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as parent,
+        ended(parent),
+    ):
         deadline = time.monotonic() + 60
         while not all(being_written(out, alanine_dipeptide) for out in outs):  # also shows that the question can be yes
             assert parent.poll() is None and time.monotonic() < deadline
