@@ -55,6 +55,7 @@ def test_replicas_resume_and_keep_what_is_complete(alanine_dipeptide: Scene, tmp
 
 # ---- the end of the parent -----------------------------------------------------------------------------------------
 
+
 @contextmanager
 def ended(process: subprocess.Popen[str]) -> Iterator[None]:
     """A failed assertion must not wait for a run of days."""
