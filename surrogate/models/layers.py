@@ -40,7 +40,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
     """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `mask` True where allowed.
 
-    On a CPU the plain products are preferred for short sequences, such as a chunk of 32 frames: torch's fused kernel was
+    On a CPU the plain products are preferred for short sequences, as in a chunk of 32 frames: torch's fused kernel was
     the largest item in a profile of training.
     """
     if q.device.type != "cpu" or k.shape[-2] > _SHORT:

@@ -69,8 +69,8 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
     Second order at one evaluation a step: between two grid points the prediction is the line through the last two, for
     which dx/dtau = (o1 - x) / (1 - tau) is integrated exactly (the idea of DPM-Solver++ 2M, Lu 2022, in tau). The grid
     1 - tau = (1 - k / n)^2 spends its steps near the data, where narrow directions (bond lengths) are decided: with
-    exact predictions of Gaussian data, 20 of these steps keep widths down to a twentieth of the data's within 1.1 %, where
-    20 even Euler steps are at least six times as far off (tests/unit/surrogate/test_flow.py).
+    exact predictions of Gaussian data, 20 of these steps keep widths down to a twentieth of the data's within 1.1 %;
+    20 even Euler steps are over six times as far off (tests/unit/surrogate/test_flow.py).
     """
     if interpolant != "linear":
         raise ValueError(f"the multistep solver integrates the linear interpolant, not {interpolant!r}")
