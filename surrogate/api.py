@@ -497,6 +497,9 @@ def train(
     config: PathLike | None = None,
     budget_s: float | None = None,
     steps: int | None = None,
+    start_from: PathLike | None = None,
+    time_reversal: bool = False,
+    rare_draws: float = 0.0,
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
@@ -506,8 +509,11 @@ def train(
     """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
     Ends after `budget_s` seconds of training or `steps` optimiser steps over both stages, whichever is given. `config`:
-    a TOML file of model settings. Beside `out`, a CSV holds the training curves and, until done, files the state that
-    `resume` goes on from. Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
+    a TOML file of model settings. `start_from`: weights (name or file) whose second stage is trained further, with
+    their configuration. `time_reversal` shows every other window backwards, right for a reference in equilibrium;
+    `rare_draws` is the share of windows drawn for a rare state they show (surrogate.data.rarity). Beside `out`, a CSV
+    holds the training curves and, until done, files the state that `resume` goes on from. Raises InputError,
+    TrajectoryError, SimulationError (training diverged), StorageError.
     """
     architectures = ["lam-slide"]
     if arch not in architectures:
@@ -530,32 +536,42 @@ def train(
     from surrogate.models.lam_slide.config import LamSlideConfig
     from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 
-    model_config = LamSlideConfig() if config is None else LamSlideConfig.from_toml(config)
+    start = None
+    if start_from is not None:
+        from surrogate.data.weights import load_weights
+
+        if config is not None:
+            raise InputError("--from takes the configuration of its weights; leave --config out.")
+        start = load_weights(weights_path(start_from))
+        model_config = start.model.config
+    else:
+        model_config = LamSlideConfig() if config is None else LamSlideConfig.from_toml(config)
     in_windows = [is_windows(path) for path in paths]
     if any(in_windows) and len(paths) > 1:
         raise InputError("give either trajectories or one windows file to train on.")
     frames = load_frames(paths[0]) if any(in_windows) else collect_frames(paths, canonical=model_config.canonical)
     for validation in (False, True):  # too short a reference is refused before the first stage has been trained
         frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
-    first = None if steps is None else max(1, round(steps * STAGE_ONE_SHARE))
+    first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
     settings = TrainingConfig(
         budget_s=budget_s,
         stage_one_steps=first,
         stage_two_steps=None if steps is None or first is None else steps - first,
         seed=seed,
         device=_device(device),
+        time_reversal=time_reversal,
+        rare_draws=rare_draws,
     )
+    share_one = 0.0 if start is not None else STAGE_ONE_SHARE
     with progress_bar(f"training {frames.scene.name}", quiet=quiet) as advance:
 
         def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            done = (
-                share * STAGE_ONE_SHARE if stage == "autoencoder" else STAGE_ONE_SHARE + share * (1 - STAGE_ONE_SHARE)
-            )
+            done = share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one)
             if advance is not None:
                 advance(round(1000 * done), 1000, stage)
 
         try:
-            return train_lam_slide(frames, out, model_config, settings, resume=resume, progress=report)
+            return train_lam_slide(frames, out, model_config, settings, start=start, resume=resume, progress=report)
         except KeyboardInterrupt:
             kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
             if not kept:

@@ -316,6 +316,15 @@ def train(
     config: Annotated[Path | None, typer.Option("--config", help="TOML of model and training settings.")] = None,
     budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
+    start_from: Annotated[
+        str | None, typer.Option("--from", help="Weights whose second stage is trained further: a name or a file.")
+    ] = None,
+    time_reversal: Annotated[
+        bool, typer.Option("--time-reversal", help="Show windows backwards too: right for MD in equilibrium.")
+    ] = False,
+    rare_draws: Annotated[
+        float, typer.Option("--rare-draws", help="Share of windows drawn for a rare state, weighted down by as much.")
+    ] = 0.0,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -332,6 +341,9 @@ def train(
         config=config,
         budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
         steps=steps,
+        start_from=start_from,
+        time_reversal=time_reversal,
+        rare_draws=rare_draws,
         seed=seed,
         resume=resume,
         overwrite=overwrite,

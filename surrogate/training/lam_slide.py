@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.weights import TrainingDomain, save_weights
+from surrogate.data.rarity import window_sampler
+from surrogate.data.weights import TrainingDomain, Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
@@ -48,6 +49,8 @@ class TrainingConfig:
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
     # reversibility), and each rare event then shows how it begins and how it ends.
     time_reversal: bool = False
+    # Share of stage two's windows drawn for a rare state they show, weighted down by as much (data.rarity); 0 is plain.
+    rare_draws: float = 0.0
 
     def stages(self) -> tuple[StageConfig, StageConfig]:
         share = STAGE_ONE_SHARE
@@ -67,11 +70,13 @@ def train_lam_slide(
     model_config: LamSlideConfig,
     config: TrainingConfig,
     *,
+    start: Weights | None = None,
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
     """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
 
+    With `start`, stage two goes on from those weights for the whole budget, and stage one is taken over as it is.
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
@@ -92,14 +97,20 @@ def train_lam_slide(
     if not resume:
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
-    one, two = config.stages()
-    spent_one = _stage_one(model, frames, elements, one, states[0], log_path, resume, progress)
-    normalise_latents(model, frames, elements, config.seed)
+    if start is None:
+        one, two = config.stages()
+        spent_one = _stage_one(model, frames, elements, one, states[0], log_path, resume, progress)
+        normalise_latents(model, frames, elements, config.seed)
+    else:
+        _check_start(start, frames, model_config)
+        two = replace(config.stages()[1], budget_s=config.budget_s)
+        spent_one = 0.0
+        model.load_state_dict(start.model.state_dict())
 
     domain = training_domain(frames)
 
     def write(spent_s: float) -> None:
-        save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s))
+        save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s, start))
 
     spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config)
     write(spent_two)
@@ -172,7 +183,7 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
                resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig) -> float:  # fmt: skip
     length = model.config.approximator.chunk_frames
     n_atoms, device = frames.scene.n_atoms, elements.device
-    starts = torch.from_numpy(frames.window_starts(length, validation=False))
+    sampler = window_sampler(frames, length, config.rare_draws)
     held = torch.from_numpy(frames.window_starts(length, validation=True))
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
     model.autoencoder.requires_grad_(False)
@@ -191,10 +202,10 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
             return model.encode(x.to(device), elements)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
+        first, importance = sampler.draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         batch = windows(first, generator, time_reversal=config.time_reversal)
-        return flow_loss(model, batch, n_atoms, tau, generator)
+        return flow_loss(model, batch, n_atoms, tau, generator, importance=importance.to(device))
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
@@ -226,8 +237,22 @@ def training_domain(frames: TrainingFrames, n_geometry_frames: int = 20_000) -> 
     return TrainingDomain(frames.scene, frames.lag_ps, frames.conditions, geometry.to_dict())
 
 
-def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float) -> dict[str, Any]:
+def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
+    """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
+    name, of = start.path.name, start.domain
+    if start.model.config != model_config:
+        raise InputError(f"{name} has another configuration; a training goes on with the one it began with.")
+    if of.scene.topology_hash != frames.scene.topology_hash:
+        raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
+    if not np.isclose(of.lag_ps, frames.lag_ps, rtol=1e-4):
+        raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
+
+
+def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float,
+                start: Weights | None) -> dict[str, Any]:  # fmt: skip
+    earlier = {} if start is None else {"from": {"hash": start.hash, **start.provenance}}
     return {
+        **earlier,
         "trained": datetime.now(UTC).isoformat(timespec="seconds"),
         "torch": torch.__version__,
         "machine": platform.machine(),
@@ -235,6 +260,7 @@ def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float
         "sources": list(frames.sources),
         "seed": config.seed,
         "time_reversal": config.time_reversal,
+        "rare_draws": config.rare_draws,
         "stage_one_s": round(spent_one, 1),
         "stage_two_s": round(spent_two, 1),
     }

@@ -58,9 +58,17 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
 
 
 def flow_loss(
-    model: LamSlide, latents: Tensor, n_atoms: int, tau: Tensor, generator: torch.Generator
+    model: LamSlide,
+    latents: Tensor,
+    n_atoms: int,
+    tau: Tensor,
+    generator: torch.Generator,
+    *,
+    importance: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames, plus decoded position and distance.
+
+    `importance` (b,): what each window counts (data.rarity); None is one each.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
@@ -75,6 +83,8 @@ def flow_loss(
     weight = torch.ones_like(tau)
     if c.precondition:
         weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
+    if importance is not None:
+        weight = weight * importance
     loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
     terms = {"flow": loss.detach()}
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):

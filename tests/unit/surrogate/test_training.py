@@ -66,6 +66,35 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, harmonic_fram
     assert not torch.equal(load_weights(other).model.state_dict()["autoencoder.queries"], first["autoencoder.queries"])
 
 
+def test_training_goes_on_from_weights(tmp_path: Path, harmonic_frames: TrainingFrames, small_weights: Weights,
+                                       small_model_config: LamSlideConfig) -> None:  # fmt: skip
+    out = train_lam_slide(harmonic_frames, tmp_path / "m.safetensors", small_model_config, QUICK, start=small_weights)
+    further = load_weights(out)
+    before, after = small_weights.model.state_dict(), further.model.state_dict()
+    for name, tensor in before.items():
+        if name.startswith(("autoencoder", "latent_")):
+            assert torch.equal(after[name], tensor), name
+    # Eight steps move the second stage a little: it neither stood still nor began anew.
+    name = next(k for k in before if k.startswith("approximator.layers") and k.endswith("weight"))
+    change = float((after[name] - before[name]).norm() / before[name].norm())
+    assert 0.0 < change < 0.3
+    assert further.provenance["from"]["hash"] == small_weights.hash
+    assert {r["stage"] for r in csv.DictReader(out.with_suffix(".csv").open())} == {"flow"}
+
+
+def test_training_goes_on_only_from_weights_that_fit(tmp_path: Path, harmonic_frames: TrainingFrames,
+                                                     small_weights: Weights,
+                                                     small_model_config: LamSlideConfig) -> None:  # fmt: skip
+    def refused(frames: TrainingFrames, config: LamSlideConfig, why: str) -> None:
+        with pytest.raises(InputError, match=why):
+            train_lam_slide(frames, tmp_path / "m.safetensors", config, QUICK, start=small_weights)
+
+    refused(harmonic_frames, replace(small_model_config, position_scale_nm=0.3), "another configuration")
+    refused(replace(harmonic_frames, lag_ps=2.0), small_model_config, "1 ps from frame to frame")
+    scene = replace(harmonic_frames.scene, atom_names=tuple(reversed(harmonic_frames.scene.atom_names)))
+    refused(replace(harmonic_frames, scene=scene), small_model_config, "in this atom order")
+
+
 def test_training_stops_on_nan_and_says_where(tmp_path: Path) -> None:
     module = torch.nn.Linear(2, 1)
 

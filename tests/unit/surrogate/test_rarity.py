@@ -1,0 +1,62 @@
+"""Rare windows are drawn more often and count less by exactly as much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.rarity import rare_frames, window_sampler
+from systems.errors import InputError
+from systems.library import load
+
+LENGTH = 8
+
+
+@pytest.fixture(scope="module")
+def frames() -> TrainingFrames:
+    """2,000 frames of alanine dipeptide, twelve of them its mirror image, with phi and psi of the other sign."""
+    scene = load("alanine-dipeptide")
+    x = np.repeat(scene.positions_nm[None], 2000, axis=0)
+    x += np.random.default_rng(0).normal(0.0, 0.002, x.shape)
+    x[700:712] *= np.array([-1.0, 1.0, 1.0])
+    return TrainingFrames(scene, quantise(canonicalise(x, scene)), np.array([0, 2000]), 1.0, True, {}, ())
+
+
+def test_rare_frames_are_found(frames: TrainingFrames) -> None:
+    rare = rare_frames(frames)
+    assert rare.shape == (2, 2000)
+    assert (np.flatnonzero(rare[0]) == np.arange(700, 712)).all()
+
+
+def test_draws_are_more_and_weigh_less(frames: TrainingFrames) -> None:
+    sampler = window_sampler(frames, LENGTH, 0.3)
+    first, weight = sampler.draw(40_000, torch.Generator().manual_seed(0))
+    in_rare = ((first + LENGTH > 700) & (first < 712)).double()
+    starts = frames.window_starts(LENGTH, validation=False)
+    truth = float(((starts + LENGTH > 700) & (starts < 712)).mean())
+    error = float((in_rare * weight).std()) / 200.0
+    assert abs(float((in_rare * weight).mean()) - truth) < 4 * error
+    assert error < 0.05 * truth  # tight enough to see a weight that is wrong by a fifth
+    assert abs(float(weight.mean()) - 1.0) < 0.01
+    # Negative control: without weights the rare windows would count twenty times too much.
+    assert float(in_rare.mean()) > 20 * truth
+
+
+def test_no_rare_draws_is_the_plain_draw(frames: TrainingFrames) -> None:
+    sampler = window_sampler(frames, LENGTH, 0.0)
+    first, weight = sampler.draw(50, torch.Generator().manual_seed(3))
+    starts = torch.from_numpy(frames.window_starts(LENGTH, validation=False))
+    plain = starts[torch.randint(len(starts), (50,), generator=torch.Generator().manual_seed(3))]
+    assert torch.equal(first, plain) and bool((weight == 1).all())
+
+
+def test_what_cannot_be_told_is_refused(frames: TrainingFrames, harmonic_frames: TrainingFrames) -> None:
+    with pytest.raises(InputError, match="less than 1"):
+        window_sampler(frames, LENGTH, 1.0)
+    rigid = replace(harmonic_frames, scene=load("benzene"), coordinates=np.zeros((800, 12, 3), dtype=np.int16))
+    with pytest.raises(InputError, match="no rotatable torsion"):
+        window_sampler(rigid, LENGTH, 0.3)
