@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import distributions
+from surrogate.judge.charts import Chart, Curve
+from surrogate.judge.charts import Histogram as Histogram
 from surrogate.judge.rows import Trio
 from surrogate.judge.structure import Features
 from systems import validity
@@ -21,25 +22,6 @@ MAX_TIMELINE_BINS = 240
 MAX_DRAWN_BOUNDARIES = 60
 
 
-def _plain(value: Any) -> Any:
-    """Arrays to lists, rounded to six digits; what is not finite to None."""
-    if isinstance(value, np.ndarray):
-        return [_plain(x) for x in value.tolist()]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    if isinstance(value, (list, tuple)):
-        return [_plain(x) for x in value]
-    return value
-
-
-class Curve:
-    """Base of the records below."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {name: _plain(value) for name, value in vars(self).items()}
-
-
 @dataclass(frozen=True, eq=False)
 class RamachandranMap(Curve):
     """Joint counts of one residue, each `(50, 50)`, first index phi, on [-pi, pi]."""
@@ -48,19 +30,6 @@ class RamachandranMap(Curve):
     reference: FloatArray
     candidate: FloatArray
     replicate: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Histogram(Curve):
-    """Densities of one quantity over `edges` `(n + 1,)`; `outside` is the share beyond the range or not finite."""
-
-    label: str
-    unit: str
-    edges: FloatArray
-    reference: FloatArray
-    candidate: FloatArray
-    replicate: FloatArray
-    outside: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +81,21 @@ class BondLength(Curve):
 
 @dataclass(frozen=True, eq=False)
 class Curves(Curve):
-    """All curves of one candidate."""
+    """All curves of one candidate; `charts` are those that any room of metrics adds, drawn by their type."""
 
     ramachandran: tuple[RamachandranMap, ...]
     histograms: tuple[Histogram, ...]
     correlations: tuple[CorrelationCurve, ...]
     timelines: tuple[Timeline, ...]
     bonds: tuple[BondLength, ...]
+    charts: tuple[Chart, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
-        return {name: [curve.to_dict() for curve in value] for name, value in vars(self).items()}
+        out: dict[str, Any] = {name: [c.to_dict() for c in value] for name, value in vars(self).items()}
+        for record, chart in zip(out["charts"], self.charts, strict=True):
+            record["type"] = type(chart).__name__
+        return out
 
 
 def ramachandran_maps(trio: Trio) -> tuple[RamachandranMap, ...]:

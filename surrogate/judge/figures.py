@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.curves import CorrelationCurve, Histogram, RamachandranMap, Timeline
+from surrogate.judge.charts import Histogram
+from surrogate.judge.curves import CorrelationCurve, RamachandranMap, Timeline
 from surrogate.judge.distributions import free_energy_kj
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,0 +1,121 @@
+"""Charts as plain numbers: what any room of metrics hands to the report, which draws each by its type.
+
+A room computes, the report draws: nothing here knows colours or pixels, and all of it goes into the JSON as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "experiment", "worth"]
+Role = Literal["reference", "candidate", "replicate", "other"]
+
+
+def _plain(value: Any) -> Any:
+    """Arrays to lists, rounded to six digits; what is not finite to None."""
+    if isinstance(value, np.ndarray):
+        return [_plain(x) for x in value.tolist()]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    if isinstance(value, (list, tuple)):
+        return [_plain(x) for x in value]
+    if isinstance(value, Curve):
+        return value.to_dict()
+    return value
+
+
+class Curve:
+    """Base of the records below."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {name: _plain(value) for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram(Curve):
+    """Densities of one quantity over `edges` `(n + 1,)`; `outside` is the share beyond the range or not finite."""
+
+    label: str
+    unit: str
+    edges: FloatArray
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray
+    outside: tuple[float, float, float]
+    section: Section = "distributions"
+
+
+@dataclass(frozen=True, eq=False)
+class Line(Curve):
+    """One line of a chart: `x` and `y` `(n,)`, NaN in gaps, with a 95 % band where `low` and `high` are given.
+
+    `role` gives the colour; lines that are neither of the three (a baseline, a guide) are "other".
+    """
+
+    name: str
+    role: Role
+    x: FloatArray
+    y: FloatArray
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LineChart(Curve):
+    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen."""
+
+    section: Section
+    title: str
+    caption: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    log_x: bool = False
+    log_y: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape(Curve):
+    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies like the Ramachandran maps.
+
+    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`.
+    """
+
+    section: Section
+    title: str
+    x_label: str
+    y_label: str
+    x_edges: FloatArray
+    y_edges: FloatArray
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BarChart(Curve):
+    """One number per name and role, `(n,)`, with 95 % intervals `*_low`, `*_high` where they are given."""
+
+    section: Section
+    title: str
+    caption: str
+    y_label: str
+    names: tuple[str, ...]
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray | None = None
+    reference_low: FloatArray | None = None
+    reference_high: FloatArray | None = None
+    candidate_low: FloatArray | None = None
+    candidate_high: FloatArray | None = None
+
+
+Chart = LineChart | Landscape | BarChart | Histogram
