@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.model import LamSlide
-from systems.errors import InputError, WeightsError
+from surrogate.models.architectures import architecture
+from surrogate.models.interface import Surrogate
+from systems.errors import InputError, UnknownNameError, WeightsError
 from systems.scene import Scene
 from systems.whole_file import create_whole
 
@@ -43,7 +43,7 @@ class TrainingDomain:
 class Weights:
     """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
 
-    model: LamSlide
+    model: Surrogate
     domain: TrainingDomain
     provenance: dict[str, Any]
     hash: str
@@ -51,13 +51,13 @@ class Weights:
 
 
 def save_weights(
-    path: str | Path, model: LamSlide, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
+    path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
 ) -> None:
     """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
     from safetensors.torch import save_file
 
     header = {
-        "arch": "lam-slide",
+        "arch": model.arch,
         "config": model.config.to_dict(),
         "domain": {**vars(domain), "scene": domain.scene.to_dict()},
         "provenance": provenance,
@@ -92,7 +92,11 @@ def load_weights(path: str | Path) -> Weights:
     path = Path(path)
     header = read_header(path)
     data = path.read_bytes()
-    model = LamSlide(LamSlideConfig.from_dict(header["config"]))
+    try:
+        arch = architecture(header["arch"])
+    except UnknownNameError as error:
+        raise WeightsError(f"{path} is of another version of surromd: {error}") from error
+    model = arch.model(arch.config(header["config"]))
     try:
         state = load(data)
         model.load_state_dict(state)

@@ -1,46 +1,123 @@
-"""The contract every surrogate fulfils: the last frames in, the next chunk of frames out."""
+"""The contract every surrogate fulfils: a molecule and its last frames in, the next chunk of frames out."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from systems.elements import ATOMIC_NUMBERS, PARTICLE
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
 
 
-class Surrogate(Protocol):
-    """A learned simulator of one scene, batched over replicas.
+@dataclass(frozen=True, eq=False)
+class Molecule:
+    """What a model is told of a scene, beside its frames.
 
-    Frames are in the model's canonical frame when `canonical` is True (the caller superposes), in nm, float32.
-    Randomness enters through `noise` alone: the same noise, frames and settings give the same chunk, row by row,
-    whatever the batch they stand in.
+    `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
+    `bonds` (n_bonds, 2) int64.
     """
 
+    elements: Tensor
+    masses_da: Tensor
+    bonds: Tensor
+
+    @staticmethod
+    def of(scene: Scene) -> Molecule:
+        """Return the features of a scene, in its atom order."""
+        numbers = [0 if e == PARTICLE else ATOMIC_NUMBERS[e] for e in scene.elements]
+        return Molecule(
+            elements=torch.tensor(numbers, dtype=torch.int64),
+            masses_da=torch.tensor(scene.masses_da.tolist(), dtype=torch.float32),
+            bonds=torch.tensor(scene.bonds.tolist(), dtype=torch.int64).reshape(-1, 2),
+        )
+
     @property
+    def n_atoms(self) -> int:
+        return len(self.elements)
+
+    def to(self, device: torch.device) -> Molecule:
+        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device))
+
+    def permuted(self, order: Tensor) -> Molecule:
+        """Return the molecule whose atom k is this one's atom order[k]."""
+        return Molecule(self.elements[order], self.masses_da[order], torch.argsort(order)[self.bonds])
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Frames `(b, n_new, n_atoms, 3)` nm and, of a model that carries them, the velocities `(b, n_atoms, 3)` nm/ps at
+    the last of them; None of the others."""
+
+    frames_nm: Tensor
+    velocities_nm_ps: Tensor | None = None
+
+
+class Config(Protocol):
+    """A model's settings: a frozen dataclass that a weights file keeps as JSON."""
+
+    def to_dict(self) -> dict[str, Any]: ...
+
+
+class Surrogate(nn.Module, ABC):
+    """A learned simulator, batched over replicas of one molecule.
+
+    Frames are in the model's canonical frame when `canonical` is True (the caller superposes), else centred by the
+    caller or not, as it likes; nm, float32. Randomness enters through `noise` alone: the same noise, frames and
+    settings give the same chunk, row by row, whatever the batch they stand in. `surrogate.models.conformance` holds
+    any model against this contract.
+    """
+
+    # Name in weights files and on the command line.
+    arch: ClassVar[str]
+    # Solvers that `next_chunk` knows, the default first; empty for a model that answers in one evaluation.
+    solvers: tuple[str, ...] = ()
+    # Names (prefixes) of layers that compute in float32 under autocast too.
+    float32_layers: ClassVar[tuple[str, ...]] = ()
+    # Whether a chunk ends in velocities that the next one starts from.
+    carries_velocities: ClassVar[bool] = False
+    config: Any
+
+    @property
+    @abstractmethod
     def canonical(self) -> bool:
         """Whether frames must be superposed on the template first."""
-        ...
 
     @property
+    @abstractmethod
     def n_conditioning(self) -> int:
         """Frames the model looks back on."""
-        ...
 
     @property
+    @abstractmethod
     def n_new(self) -> int:
         """Frames one call returns."""
-        ...
 
+    @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
-        """Shape of one replica's noise."""
-        ...
+        """Shape of one replica's noise; (0,) of a model without any."""
 
+    @abstractmethod
     def next_chunk(
-        self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int, solver: str | None = None
-    ) -> Tensor:
-        """Frames `(b, n_conditioning, n_atoms, 3)` nm, atomic numbers `(n_atoms,)`, noise `(b, *noise_shape)` ->
-        `(b, n_new, n_atoms, 3)` nm. Inputs are left untouched; `solver` None is the model's own choice."""
-        ...
+        self,
+        last_frames_nm: Tensor,
+        molecule: Molecule,
+        noise: Tensor,
+        *,
+        solver_steps: int = 1,
+        solver: str | None = None,
+        last_velocities_nm_ps: Tensor | None = None,
+    ) -> Chunk:
+        """Frames `(b, n_conditioning, n_atoms, 3)` nm, noise `(b, *noise_shape)` -> the next chunk.
+
+        `last_velocities_nm_ps` `(b, n_atoms, 3)`: what the chunk before ended in, where the model carries velocities;
+        None starts from velocities that the noise draws. Inputs are left untouched; `solver` None is the default.
+        """
 
 
 def draw_noise(model: Surrogate, n_atoms: int, generators: list[torch.Generator]) -> Tensor:

@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.models.interface import draw_noise
-from surrogate.models.lam_slide.flow import SOLVERS, default_solver
-from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from surrogate.models.lam_slide.flow import SOLVERS
 from surrogate.sampling.domain import match_scene
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
@@ -71,6 +70,7 @@ class _Progress:
     chunks: int = 0  # chunks done
     steps: int = 0  # model frames done, kept or not
     wall_s: float = 0.0
+    last_velocities: Float32Array | None = None  # (replicas, n_atoms, 3) nm/ps, of a model that carries them
 
 
 def rollout(
@@ -104,14 +104,11 @@ def rollout(
     template = weights.domain.scene
     fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
     target = template.positions_nm - template.positions_nm[fit].mean(axis=0)
-    elements = torch.tensor(_atomic_numbers(template))
+    molecule = Molecule.of(template)
     use_bf16 = config.precision == "bf16" or (config.precision == "auto" and bf16_in_hardware())
     if use_bf16:
         model = with_bf16_weights(model)
-    solver = config.solver or default_solver(model.config.approximator.interpolant)
-    if solver == "multistep" and model.config.approximator.interpolant != "linear":
-        raise InputError("the multistep solver integrates the linear interpolant only; use --solver euler.")
-    config = replace(config, solver=solver)
+    config = replace(config, solver=choose_solver(model, config.solver))
     settings = {**asdict(config), "bf16": use_bf16, "weights_hash": weights.hash, "replicas": len(outs)}
     del settings["time_ps"]  # a rollout may be resumed to become longer
     state_path = outs[0].with_name(outs[0].name + ".checkpoint")
@@ -136,7 +133,7 @@ def rollout(
                 writer.truncate(min(state.steps, n_frames * stride) // stride)
         last_flush = time.monotonic()
         while state.steps < n_frames * stride:
-            chunk = _next_chunk(model, state, target, fit, elements, config, use_bf16)
+            chunk = _next_chunk(model, state, target, fit, molecule, config, use_bf16)
             times = (state.steps + 1 + np.arange(model.n_new)) * lag_ps
             keep = np.flatnonzero((state.steps + 1 + np.arange(model.n_new)) % stride == 0)
             keep = keep[state.steps + 1 + keep <= n_frames * stride]
@@ -174,9 +171,10 @@ def rollout(
 
 
 @torch.inference_mode()
-def _next_chunk(model: LamSlide, state: _Progress, target: npt.NDArray[np.float64], fit: npt.NDArray[np.int64],
-                elements: torch.Tensor, config: RolloutConfig, use_bf16: bool) -> Float32Array:  # fmt: skip
-    """Return the next chunk `(replicas, n_new, n_atoms, 3)` nm in model order and the pose of the frames before."""
+def _next_chunk(model: Surrogate, state: _Progress, target: npt.NDArray[np.float64], fit: npt.NDArray[np.int64],
+                molecule: Molecule, config: RolloutConfig, use_bf16: bool) -> Float32Array:  # fmt: skip
+    """Return the next chunk `(replicas, n_new, n_atoms, 3)` nm in model order and the pose of the frames before;
+    velocities, where the model carries them, move on in `state`."""
     last = state.last_frames.astype(np.float64)
     n_replicas, _, n_atoms, _ = last.shape
     if model.canonical:
@@ -191,15 +189,35 @@ def _next_chunk(model: LamSlide, state: _Progress, target: npt.NDArray[np.float6
     ]
     noise = draw_noise(model, n_atoms, generators)
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=use_bf16):
-        frames = model.next_chunk(
+        found = model.next_chunk(
             torch.from_numpy(canonical.astype(np.float32)),
-            elements,
+            molecule,
             noise,
             solver_steps=config.solver_steps,
             solver=config.solver,
+            last_velocities_nm_ps=_turned(state.last_velocities, rotation),
         )
-    moved = frames.double().numpy() - translation[:, None, None, :]
+    if found.velocities_nm_ps is not None:
+        back = np.einsum("rji,rnj->rni", rotation, found.velocities_nm_ps.double().numpy())
+        state.last_velocities = back.astype(np.float32)
+    moved = found.frames_nm.double().numpy() - translation[:, None, None, :]
     return np.einsum("rji,rtnj->rtni", rotation, moved).astype(np.float32)
+
+
+def _turned(velocities: Float32Array | None, rotation: npt.NDArray[np.float64]) -> torch.Tensor | None:
+    if velocities is None:
+        return None
+    return torch.from_numpy(np.einsum("rij,rnj->rni", rotation, velocities).astype(np.float32))
+
+
+def choose_solver(model: Surrogate, asked: str | None) -> str | None:
+    """Return the solver asked for, or the model's default; None for a model that answers in one evaluation."""
+    if asked is None:
+        return model.solvers[0] if model.solvers else None
+    if asked not in model.solvers:
+        known = f"use --solver {' or '.join(model.solvers)}" if model.solvers else "it needs no solver, leave it out"
+        raise InputError(f"these weights ({model.arch}) are not integrated by the {asked} solver; {known}.")
+    return asked
 
 
 def _seed(seed: int, replica: int, chunk: int) -> int:
@@ -207,7 +225,7 @@ def _seed(seed: int, replica: int, chunk: int) -> int:
     return int.from_bytes(digest[:8], "little") >> 1
 
 
-def with_bf16_weights(model: LamSlide) -> LamSlide:
+def with_bf16_weights(model: Surrogate) -> Surrogate:
     """Return a copy whose matrix weights are bf16 already: autocast would round them anew in every evaluation."""
     copied = copy.deepcopy(model)
     for name, module in copied.named_modules():
@@ -222,12 +240,6 @@ def bf16_in_hardware() -> bool:
     return bool(supported and supported())
 
 
-def _atomic_numbers(scene: Scene) -> list[int]:
-    from systems.elements import ATOMIC_NUMBERS
-
-    return [ATOMIC_NUMBERS[e] for e in scene.elements]
-
-
 def _flush(writer: TrajectoryWriter, buffer: list[tuple[Float32Array, Any, Any, Any]]) -> None:
     if buffer:
         frames, times, flags, chunks = (np.concatenate(parts) for parts in zip(*buffer, strict=True))
@@ -239,7 +251,7 @@ def _record(weights: Weights, config: RolloutConfig, settings: dict[str, Any], s
             replica: int) -> dict[str, Any]:  # fmt: skip
     return {
         "kind": "rollout",
-        "model": "lam-slide",
+        "model": weights.model.arch,
         "weights": weights.path.name,
         "weights_hash": weights.hash,
         "program": {"torch": torch.__version__},
@@ -264,15 +276,16 @@ def _cost(state: _Progress, config: RolloutConfig, n_replicas: int, n_frames: in
     return {
         "wall_s": wall_s,
         "batch_wall_s": state.wall_s,
-        "network_evaluations": state.chunks * config.solver_steps,
+        "network_evaluations": state.chunks * (1 if config.solver is None else config.solver_steps),
         "ns_per_day": n_frames * save_every_ps * 1e-3 / wall_s * 86400.0,
     }
 
 
 def _write_state(path: Path, state: _Progress, settings: dict[str, Any]) -> None:
-    header = {"settings": settings, **{k: v for k, v in vars(state).items() if k != "last_frames"}}
+    arrays: dict[str, Any] = {k: v for k, v in vars(state).items() if isinstance(v, np.ndarray)}
+    header = {"settings": settings, **{k: v for k, v in vars(state).items() if k not in arrays}}
     buffer = io.BytesIO()
-    np.savez(buffer, last_frames=state.last_frames, header=np.array(json.dumps(header)))
+    np.savez(buffer, header=np.array(json.dumps(header)), **arrays)
     create_whole(path, lambda temporary: _write_bytes(temporary, buffer.getvalue()))
 
 
@@ -284,13 +297,13 @@ def _read_state(path: Path, settings: dict[str, Any]) -> _Progress:
     try:
         with np.load(path, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"]))
-            last_frames = stored["last_frames"]
+            arrays = {key: stored[key] for key in stored.files if key != "header"}
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
     for key, value in header.pop("settings").items():
         if settings[key] != value:
             raise InputError(f"{path}: this rollout was started with {key} = {value!r}, not {settings[key]!r}.")
-    return _Progress(last_frames, **header)
+    return _Progress(**{**header, **arrays})
 
 
 def _already_complete(outs: Sequence[Path], n_frames: int) -> list[Path]:

@@ -92,6 +92,6 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
 SOLVERS: dict[str, Callable[[DataPrediction, Tensor, int, str], Tensor]] = {"multistep": multistep, "euler": euler}
 
 
-def default_solver(interpolant: str) -> str:
-    """Return the better solver that integrates this interpolant."""
-    return "multistep" if interpolant == "linear" else "euler"
+def solvers_for(interpolant: str) -> tuple[str, ...]:
+    """Return the solvers that integrate this interpolant, the better one first."""
+    return ("multistep", "euler") if interpolant == "linear" else ("euler",)

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor, nn
+from typing import ClassVar
 
+import torch
+from torch import Tensor
+
+from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.approximator import Approximator
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 
 
-class LamSlide(nn.Module):
+class LamSlide(Surrogate):
     """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.interface`.
 
     Latents are used as (z - mean) / scale with a mean per latent component and one common scale, both measured on the
     training frames: LayerNorm bounds their power but leaves constant offsets that carry no information.
     """
 
+    arch: ClassVar[str] = "lam-slide"
+    float32_layers: ClassVar[tuple[str, ...]] = ("autoencoder.to_position",)
+    config: LamSlideConfig
     latent_mean: Tensor
     latent_scale: Tensor
-    # Layers that compute in float32 under autocast too.
-    float32_layers = ("autoencoder.to_position",)
 
     def __init__(self, config: LamSlideConfig) -> None:
         super().__init__()
         self.config = config
+        self.solvers = flow.solvers_for(config.approximator.interpolant)
         ae = config.autoencoder
         self.autoencoder = Autoencoder(ae)
         self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim)
@@ -68,15 +73,15 @@ class LamSlide(nn.Module):
         ae = self.config.autoencoder
         return (self.config.approximator.chunk_frames, ae.n_latents, ae.latent_dim)
 
-    def next_chunk(self, last_frames_nm: Tensor, elements: Tensor, noise: Tensor, *, solver_steps: int,
-                   solver: str | None = None) -> Tensor:  # fmt: skip
-        """See `Surrogate.next_chunk`."""
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 20,
+                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
+        """See `Surrogate.next_chunk`. Velocities play no part."""
         interpolant = self.config.approximator.interpolant
-        known = self.encode(last_frames_nm, elements)
+        known = self.encode(last_frames_nm, molecule.elements)
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
             return self.approximator(o, tau, known)
 
-        integrate = flow.SOLVERS[solver or flow.default_solver(interpolant)]
+        integrate = flow.SOLVERS[solver or self.solvers[0]]
         latents = integrate(predict, noise, solver_steps, interpolant)
-        return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
+        return Chunk(self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2]))

@@ -1,0 +1,34 @@
+"""The known architectures: which configuration and which model a weights file's `arch` names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from surrogate.models.interface import Surrogate
+from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlide
+from systems.errors import UnknownNameError, nearest
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """`config` builds a configuration from a record (InputError for unknown keys), `model` a model from that."""
+
+    config: Callable[[dict[str, Any]], Any]
+    model: Callable[[Any], Surrogate]
+
+
+ARCHITECTURES: dict[str, Architecture] = {
+    LamSlide.arch: Architecture(LamSlideConfig.from_dict, LamSlide),
+}
+
+
+def architecture(name: str) -> Architecture:
+    """Return the architecture of this name. Raises UnknownNameError, naming the nearest."""
+    if name not in ARCHITECTURES:
+        raise UnknownNameError(
+            f"unknown architecture {name!r}; known: {', '.join(ARCHITECTURES)}.{nearest(name, list(ARCHITECTURES))}"
+        )
+    return ARCHITECTURES[name]
