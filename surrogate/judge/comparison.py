@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from surrogate.judge import curves, metrics, relaxation, verdict
 from surrogate.judge.account import Account, Faults, account_of, faults_of, speed_ratio
-from surrogate.judge.curves import Curves
+from surrogate.judge.curves import Chart, Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags
-from surrogate.judge.rows import Options, Row, Trio, make_sample
+from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry
 from systems import validity
@@ -22,7 +22,13 @@ from systems.scene import Scene
 from systems.units import format_time_ps
 from systems.validity import Geometry
 
+# Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
+Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
+ROOMS: tuple[Room, ...] = ()
+
 _MIN_FRAMES = 20
+# Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
+_ROWS_FORESEEN = 60
 _SHORT_IN_CORRELATION_TIMES = 30
 
 
@@ -178,7 +184,9 @@ def _judge(
     kinetic, correlations, skipped = relaxation.correlation_rows(trio)
     slowest, projected, without_tica = relaxation.tica_rows(trio)
     seams, without_seams = relaxation.boundary_row(trio)
-    judged = verdict.judge_rows([*rows, *kinetic, *slowest, *seams], options)
+    rooms = [room(trio) for room in ROOMS]
+    more = [row for found, _, _ in rooms for row in found]
+    judged = verdict.judge_rows(by_group([*rows, *kinetic, *slowest, *seams, *more]), options)
     found = verdict.findings(judged)
     compared = trio.reference.features.total_ps
     truth = trio.reference
@@ -196,7 +204,7 @@ def _judge(
         effective_samples=effective_samples(truth.features.n_frames, correlation),
         speed_ratio=speed_ratio(account, reference_account),
         faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
-        skipped=(*_skipped(trio), *skipped, *without_tica, *without_seams),
+        skipped=(*_skipped(trio), *skipped, *without_tica, *without_seams, *(x for _, _, why in rooms for x in why)),
         notes=tuple(_trimming(trio, reference, candidate, replicate, correlation) + _unlike(judged, options)),
         curves=Curves(
             ramachandran=curves.ramachandran_maps(trio),
@@ -204,6 +212,7 @@ def _judge(
             correlations=tuple(correlations),
             timelines=tuple(curves.timeline(s.features) for s in trio.samples),
             bonds=tuple(bonds),
+            charts=tuple(chart for _, charts, _ in rooms for chart in charts),
         ),
     )
 
@@ -227,7 +236,7 @@ def _equal_terms(
     cut = [f.frames(0, n) for f in (reference, candidate, replicate)]
     times = [relaxation.longest_correlation(f) for f in cut]
     each = block_length(n, max(times))
-    n_rows = 12 + 8 * (len(torsions.phi) + len(torsions.psi))
+    n_rows = _ROWS_FORESEEN + 8 * (len(torsions.phi) + len(torsions.psi))
     options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
     truth, rolled, other = (
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream) for stream, f in enumerate(cut)

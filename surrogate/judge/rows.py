@@ -120,6 +120,11 @@ def make_sample(features: Features, blocks: Blocks, options: Options, stream: in
     return Sample(features, blocks, bootstrap_weights(blocks.n_blocks, options.n_bootstrap, rng))
 
 
+def by_group(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with those of one group together, in the order of `GROUPS`; within a group as they came."""
+    return sorted(rows, key=lambda row: GROUPS.index(row.group))
+
+
 def distance_row(
     trio: Trio,
     counts: Sequence[FloatArray],

@@ -20,6 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 MIN_BLOCKS = 10
 MAX_BLOCKS = 100
 BLOCK_IN_CORRELATION_TIMES = 10
+ENOUGH_AS_FAR = 100
 
 
 class Piece(NamedTuple):
@@ -195,23 +196,27 @@ def permutation_p(
     """Return the p-value of "both sets of blocks come from one distribution" under the statistic `distance`.
 
     `counts_a` and `counts_b` are histograms per block, `(n_blocks_a | n_blocks_b, n_bins)`. Blocks are dealt at random
-    to two sides; the p-value is the share of deals at least as far apart as the data. Blocks must be longer than the
-    correlation time for the blocks to be exchangeable.
+    to two sides; the p-value is the share of deals at least as far apart as the data. Dealing stops early once
+    `ENOUGH_AS_FAR` deals were as far (Besag and Clifford, Biometrika 78, 301, 1991), as p is then known well enough.
+    Blocks must be longer than the correlation time for the blocks to be exchangeable.
     """
     pooled = np.concatenate([counts_a, counts_b])
     n_a, n = len(counts_a), len(pooled)
     observed = float(distance(counts_a.sum(0)[None], counts_b.sum(0)[None])[0])
     total = pooled.sum(0)
     n_as_far, done = 0, 0
-    batch = max(1, min(n_permutations, int(2e6 // max(pooled.shape[1], 1))))
+    largest = max(1, min(n_permutations, int(2e6 // max(pooled.shape[1], 1))))
+    batch = min(largest, 2 * ENOUGH_AS_FAR)
     while done < n_permutations:
         size = min(batch, n_permutations - done)
         order = rng.random((size, n)).argsort(axis=1)
         side = np.zeros((size, n))
         np.put_along_axis(side, order[:, :n_a], 1.0, axis=1)
         left = side @ pooled
-        n_as_far += int((distance(left, total - left) >= observed * (1 - 1e-12)).sum())
-        done += size
+        as_far = n_as_far + (distance(left, total - left) >= observed * (1 - 1e-12)).cumsum()
+        if as_far[-1] >= ENOUGH_AS_FAR:
+            return float(ENOUGH_AS_FAR / (done + int(np.argmax(as_far >= ENOUGH_AS_FAR)) + 1))
+        n_as_far, done, batch = int(as_far[-1]), done + size, min(largest, 4 * batch)
     return (n_as_far + 1) / (n_permutations + 1)
 
 
