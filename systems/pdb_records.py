@@ -15,6 +15,10 @@ from systems.hybrid36 import decode
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
 _FARTHEST_ANGSTROM = 9_999.0
+# Narrower than float(), which also takes 1_0.5, tabs and the digits of other alphabets.
+_COORDINATE = re.compile(r" *[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)? *|\s*[-+]?(nan|inf)\w*\s*", re.ASCII | re.IGNORECASE)
+# Records whose columns 31-54 may hold three numbers without being an atom.
+_NOT_ATOMS = ("ANISOU", "SIGATM", "SIGUIJ", "REMARK", "HETSYN", "HELIX ", "SHEET ", "CRYST1", "MASTER")
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,11 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
             found.chain_ends.add(len(found.atoms) - 1)
         elif record == "CONECT":
             conect_lines.append(line)
+        elif record not in _NOT_ATOMS and not ended and _coordinates(line) is not None and len(line) > 66:
+            raise InputError(
+                f"{path}, line {number}: {record!r} is no record of the PDB format, but the line looks like an atom; "
+                "write ATOM or HETATM there, or take the line out."
+            )
     if n_models > 1:
         found.notes.append(f"{n_models} models in the file: the first is taken")
     _resolve_conect(found, conect_lines, index_of, repeated)
@@ -139,13 +148,12 @@ def _read_pdb(text: str, path: Path) -> StructureFile:
 def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
     if len(line) < 54:
         raise InputError(f"{path}, line {number}: the atom record is cut short; fetch or write the file again.")
-    try:
-        x, y, z = (float(line[k : k + 8]) for k in (30, 38, 46))
-    except ValueError:
+    position = _coordinates(line)
+    if position is None:
         raise InputError(
             f"{path}, line {number}: columns 31-54 hold {line[30:54]!r}, not three coordinates; "
             "write the file again as standard PDB."
-        ) from None
+        )
     name_field = line[12:16]
     residue_name = line[17:21].strip()  # four letters where a program needs them (TIP3), the standard leaves one blank
     symbol = element_symbol(name_field, residue_name, line[76:78].strip(), hetero=line.startswith("HETATM"))
@@ -165,11 +173,19 @@ def _pdb_atom(line: str, number: int, path: Path) -> AtomRecord:
         residue_name=residue_name or "UNL",
         chain=line[21].strip(),
         residue_id=_residue_id(line[22:26], line[26:27]),
-        position_angstrom=(x, y, z),
+        position_angstrom=position,
         occupancy=occupancy,
         element=symbol,
         hetero=line.startswith("HETATM"),
     )
+
+
+def _coordinates(line: str) -> tuple[float, float, float] | None:
+    fields = [line[k : k + 8] for k in (30, 38, 46)]
+    if not all(_COORDINATE.fullmatch(field) for field in fields):
+        return None
+    x, y, z = (float(field) for field in fields)
+    return x, y, z
 
 
 def _residue_id(number: str, insertion: str) -> str:

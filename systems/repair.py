@@ -71,6 +71,9 @@ def complete(
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
     account = _account(residues, records)
+    replaced = _with_replaced_hydrogens(residues, records, atoms)
+    if replaced:
+        account.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
     account += protonation_account([r.label for r in residues], [r.key for r in residues], variants, records, ph)
     if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
         account.append("atoms stand in the standard order under their standard names")
@@ -295,6 +298,19 @@ def _keep_hydrogens(
         for a, b in zip(new, chosen, strict=True):
             out[a] = replace(records[a], position_angstrom=atoms[b].position_angstrom)
     return out
+
+
+def _with_replaced_hydrogens(
+    residues: Sequence[Residue], records: Sequence[AtomRecord], atoms: Sequence[AtomRecord]
+) -> list[str]:
+    """Labels of residues that had all their hydrogens and did not keep them: an end that became one, say."""
+    kept = {(a.residue_key, a.position_angstrom) for a in records if a.element == "H"}
+    return [
+        r.label
+        for r in residues
+        if not r.lacks_hydrogens
+        and any(atoms[i].element == "H" and (r.key, atoms[i].position_angstrom) not in kept for i in r.atoms)
+    ]
 
 
 def _distance(old: Sequence[int], new: Sequence[int], atoms: Sequence[AtomRecord], records: list[AtomRecord]) -> float:

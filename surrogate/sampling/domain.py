@@ -100,10 +100,10 @@ def _compare(
     if order is not None:
         found += _compare_start(scene, order, Geometry.from_dict(domain.geometry))
     trained_k = domain.conditions.get("temperature_k")
-    if temperature_k is not None and trained_k is not None:
-        if abs(temperature_k - trained_k) > TEMPERATURE_TOLERANCE_K:
-            reason = f"{temperature_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
-            found.append(Deviation("temperature", reason, forcible=True))
+    asked_k = trained_k if temperature_k is None else temperature_k
+    if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
+        reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
+        found.append(Deviation("temperature", reason, forcible=True))
     return order, tuple(found)
 
 
