@@ -149,7 +149,7 @@ def time_limit(seconds: int) -> Iterator[None]:
 _NUMBER = re.compile(r" *[-+]?[0-9]*\.?[0-9]*([eE][-+]?[0-9]+)? *\Z")
 
 
-_TELLING = re.compile("left out|models|taken|kept|hydrogens placed|dropped|standardi|renamed|replaced")
+_TELLING = re.compile("left out|models|added|taken|kept|hydrogens placed|dropped|standardi|renamed|replaced")
 _NO_ATOM = ("CRYST1", "REMARK")
 
 
@@ -182,11 +182,14 @@ def altered(scene: Scene, data: bytes) -> str:
     if len(there) == scene.n_atoms and np.abs(scene.positions_nm * 10 - there).max() < 1e-6:
         return ""
     kept = Counter(tuple(np.round(x, 3)) for x in (scene.positions_nm * 10).tolist())
-    lost = sum((Counter(tuple(np.round(x, 3)) for x in there) - kept).values())
+    given = Counter(tuple(np.round(x, 3)) for x in there)
+    lost, new = sum((given - kept).values()), sum((kept - given).values())
     if not said:
         return f"{scene.n_atoms} atoms from {len(there)} records, {lost} of them lost, and nothing said"
     if lost and not _TELLING.search(" ".join(said)):
         return f"{lost} atoms lost, and only this said: {said}"
+    if new and not _TELLING.search(" ".join(said)):
+        return f"{new} atoms made up, and only this said: {said}"
     return ""
 
 
@@ -232,8 +235,9 @@ def test_an_alteration_is_noticed(sources: list[bytes], tmp_path: Path) -> None:
     assert altered(scene, sources[1]) == ""
     moved = scene.positions_nm.copy()
     moved[3, 2] += 1e-4
-    assert "lost, and nothing said" in altered(scene.with_positions(moved), sources[1])
-    assert "lost, and nothing said" in altered(scene, drop_line(sources[1], random.Random(3)))
+    assert "1 atoms lost" in altered(scene.with_positions(moved), sources[1])
+    fewer = b"".join(line for line in _lines(sources[1]) if not line.startswith(b"ATOM      4"))
+    assert "1 atoms made up" in altered(scene, fewer)
     assert outcome(path, sources[1]) == "read" and outcome(path, b"ATOM") == "refused"
 
 
