@@ -9,6 +9,8 @@ from typing import Any
 from surrogate.models.interface import Surrogate
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.painet.config import PainetConfig
+from surrogate.models.painet.model import Painet
 from systems.errors import UnknownNameError, nearest
 
 
@@ -22,6 +24,7 @@ class Architecture:
 
 ARCHITECTURES: dict[str, Architecture] = {
     LamSlide.arch: Architecture(LamSlideConfig.from_dict, LamSlide),
+    Painet.arch: Architecture(PainetConfig.from_dict, Painet),
 }
 
 

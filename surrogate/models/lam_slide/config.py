@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from systems.errors import InputError, nearest
-
-T = TypeVar("T")
+from surrogate.models.settings import build, read_toml
 
 
 @dataclass(frozen=True)
@@ -84,19 +81,4 @@ class LamSlideConfig:
     @staticmethod
     def from_toml(path: str | Path) -> LamSlideConfig:
         """Read a TOML file. Raises InputError when it is missing, malformed or has unknown keys."""
-        try:
-            with open(path, "rb") as handle:
-                return LamSlideConfig.from_dict(tomllib.load(handle))
-        except FileNotFoundError:
-            raise InputError(f"configuration {path} does not exist.") from None
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"configuration {path} is not valid TOML: {error}") from error
-
-
-def build(cls: type[T], record: dict[str, Any], prefix: str) -> T:
-    """Return cls(**record), refusing (InputError) unknown keys with the nearest known one."""
-    known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
-    for key in record:
-        if key not in known:
-            raise InputError(f"unknown setting {prefix}{key}; known: {', '.join(known)}.{nearest(key, known)}")
-    return cls(**record)
+        return LamSlideConfig.from_dict(read_toml(path))

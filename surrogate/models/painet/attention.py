@@ -1,0 +1,100 @@
+"""Energy-descent all-pair attention with type matrices, dense and factored; the energy that it descends.
+
+With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
+phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
+with these weights is a descent step of `pair_energy`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+# Index lists of each type's atoms: what the factored form sums over.
+TypeGroups = list[Tensor]
+
+
+def dense_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor) -> Tensor:
+    """Return sum_j w_ij v_j / sum_j w_ij with w_ij = phi_ij + psi_ij q_i.k_j.
+
+    `q`, `k` (..., n, d), `v` (..., n, d_v); `phi`, `psi` (..., n, n) by pair of particles.
+    """
+    weights = phi + psi * (q @ k.transpose(-1, -2))
+    return (weights @ v) / weights.sum(-1, keepdim=True)
+
+
+def linear_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor, groups: TypeGroups) -> Tensor:
+    """The same mean in time linear in n: weights depend on a pair through its types and one product of vectors, so
+    out_i = (sum_b phi_ab s_b + q_i sum_b psi_ab S_b) / (the same with ones), s_b = sum of v, S_b = sum of k v^T over b.
+
+    `phi`, `psi` (..., n_types, n_types) by type; `groups[b]` the atoms of type b, every atom in one of them.
+    """
+    v = torch.cat([v, torch.ones_like(v[..., :1])], dim=-1)
+    sums = torch.stack([v[..., group, :].sum(-2) for group in groups], dim=-2)
+    products = torch.stack([k[..., group, :].transpose(-1, -2) @ v[..., group, :] for group in groups], dim=-3)
+    plain = phi @ sums
+    turned = torch.einsum("...ab,...bde->...ade", psi, products)
+    out = v.new_empty(v.shape)
+    for a, group in enumerate(groups):
+        out[..., group, :] = plain[..., a, None, :] + q[..., group, :] @ turned[..., a, :, :]
+    return out[..., :-1] / out[..., -1:]
+
+
+def pair_energy(h: Tensor, before: Tensor, a: Tensor, b: Tensor, smoothness: float) -> Tensor:
+    """Return E(H) = sum_i |h_i - h_i(t)|^2 + lambda sum_ij (a_ij s - b_ij s^2), s = |h_i - h_j|^2.
+
+    `h` and `before` (H(t)) are `(..., n, d)`, `a` and `b` `(n, n)`; the result `(...)`.
+    """
+    squared = (h.unsqueeze(-2) - h.unsqueeze(-3)).square().sum(-1)
+    rho = a * squared - b * squared.square()
+    return (h - before).square().sum((-1, -2)) + smoothness * rho.sum((-1, -2))
+
+
+def largest_step(weights: Tensor, smoothness: float) -> float:
+    """Return the largest eta for which h + eta (mean - h) is proved not to raise `pair_energy`.
+
+    For concave rho the tangent at H(t) majorises the energy. With symmetric weights W, row sums D and L = D - W, the
+    step -eta D^-1 L H changes the majorant by at most eta u^T u (eta / d_min - 4 lambda (1 - eta)), u = D^-1/2 L H,
+    because D^-1/2 L D^-1/2 has no eigenvalue above 2. It vanishes at eta = c / (1 + c), c = 4 lambda d_min.
+    """
+    bound = 4.0 * smoothness * float(weights.sum(-1).min())
+    return bound / (1.0 + bound)
+
+
+class EnergyAttention(nn.Module):
+    """One latent step: h <- (1 - eta) h + eta W concat_heads(mean of values), with learned Q, K, V.
+
+    Queries and keys have unit length. Phi = sigmoid(E_phi) and Psi = psi_limit * Phi * sigmoid(E_psi), symmetric, by
+    type and head: Phi >= Psi keeps every weight positive. (A common factor of Phi and Psi, s_1 in the paper, cancels.)
+    """
+
+    def __init__(
+        self, width: int, n_heads: int, head_dim: int, n_types: int, *, step: float, psi_limit: float, dense: bool
+    ) -> None:
+        super().__init__()
+        self.n_heads, self.step, self.psi_limit, self.dense = n_heads, step, psi_limit, dense
+        self.qkv = nn.Linear(width, 3 * n_heads * head_dim)
+        self.out = nn.Linear(n_heads * head_dim, width)
+        self.e_phi = nn.Parameter(torch.zeros(n_heads, n_types, n_types))
+        self.e_psi = nn.Parameter(torch.zeros(n_heads, n_types, n_types))
+
+    def type_matrices(self) -> tuple[Tensor, Tensor]:
+        """Return Phi and Psi `(n_heads, n_types, n_types)`."""
+        phi, psi = (torch.sigmoid(0.5 * (e + e.transpose(-1, -2)).float()) for e in (self.e_phi, self.e_psi))
+        return phi, self.psi_limit * phi * psi
+
+    def forward(self, h: Tensor, types: Tensor, groups: TypeGroups) -> Tensor:
+        """Embeddings `(b, n, width)`, types `(n,)` among those present, their atoms `groups` -> embeddings."""
+        q, k, v = self.qkv(h).float().unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k = F.normalize(q, dim=-1), F.normalize(k, dim=-1)
+        phi, psi = self.type_matrices()
+        # Sums over all atoms stay in float32: in bf16 the two forms would differ by more than rounding.
+        with torch.autocast(h.device.type, enabled=False):
+            if self.dense:
+                mean = dense_mean(q, k, v, phi[:, types][:, :, types], psi[:, types][:, :, types])
+            else:
+                present = torch.stack([types[group[0]] for group in groups])
+                phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
+                mean = linear_mean(q, k, v, phi, psi, groups)
+        return (1.0 - self.step) * h + self.step * self.out(mean.transpose(1, 2).flatten(-2))

@@ -1,0 +1,131 @@
+"""PAINET: latent steps of energy-descent attention, one per future frame, decoded in parallel by one EGNN."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from surrogate.models.egnn import Egnn
+from surrogate.models.graphs import Graph, molecular_graph
+from surrogate.models.interface import Chunk, Molecule, Surrogate
+from surrogate.models.painet.attention import EnergyAttention, TypeGroups
+from surrogate.models.painet.config import PainetConfig
+from systems.errors import InputError
+
+# Atomic numbers up to xenon; 0 is a particle of a model system.
+N_TYPES = 55
+BOLTZMANN_KJ_MOL_K = 0.00831446261815324
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What of a molecule does not change from chunk to chunk: edges, the type of each atom, each type's atoms."""
+
+    molecule: Molecule
+    graph: Graph
+    groups: TypeGroups
+
+
+class Painet(Surrogate):
+    """X0, V0 -> X(1..T) and V(T), equivariant to rotations, reflections, translations and atom order.
+
+    Embeddings start from invariants of the state: element, speed, distance to the centroid and the angle between the
+    two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
+    `velocity_scale_nm_ps`, measured on the training frames.
+    """
+
+    arch: ClassVar[str] = "painet"
+    carries_velocities: ClassVar[bool] = True
+    config: PainetConfig
+    velocity_scale_nm_ps: Tensor
+
+    def __init__(self, config: PainetConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        self.embed_type = nn.Embedding(N_TYPES, c.width)
+        self.embed_state = nn.Sequential(nn.Linear(3, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
+        self.embed_frame = nn.Parameter(torch.randn(c.n_new, c.width) * 0.1)
+        n_attention = 0 if c.attention == "none" else c.n_new
+        self.steps = nn.ModuleList(
+            EnergyAttention(
+                c.width,
+                c.n_heads,
+                c.head_dim,
+                N_TYPES,
+                step=c.step,
+                psi_limit=c.psi_limit,
+                dense=c.attention == "dense",
+            )
+            for _ in range(n_attention)
+        )
+        self.decoder = Egnn(c.width, c.n_decoder_layers)
+        self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
+
+    @property
+    def canonical(self) -> bool:
+        return False
+
+    @property
+    def n_conditioning(self) -> int:
+        return 1
+
+    @property
+    def n_new(self) -> int:
+        return self.config.n_new
+
+    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
+        return (n_atoms, 3)
+
+    def structure(self, molecule: Molecule) -> Structure:
+        """Return what `forward` needs of a molecule. Raises InputError for elements beyond xenon."""
+        heaviest = int(molecule.elements.max())
+        if heaviest >= N_TYPES:
+            raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
+        present = torch.unique(molecule.elements)
+        groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
+        return Structure(molecule, molecular_graph(molecule, all_pairs=self.config.edges == "all"), groups)
+
+    def embed(self, x: Tensor, v: Tensor, elements: Tensor) -> Tensor:
+        """H(0) `(b, n, width)` from scaled, centred positions and velocities `(b, n, 3)`."""
+        speed, radius = ((t.square().sum(-1) + 1e-6).sqrt() for t in (v, x))
+        state = torch.stack([speed, radius, (x * v).sum(-1) / (1.0 + radius)], dim=-1)
+        return self.embed_type(elements) + self.embed_state(state)
+
+    def forward(self, positions_nm: Tensor, velocities_nm_ps: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
+        """States `(b, n, 3)` -> positions and velocities `(b, n_new, n, 3)` of all future frames, nm and nm/ps."""
+        scale = self.config.length_scale_nm
+        centre = positions_nm.mean(1, keepdim=True)
+        x = (positions_nm - centre) / scale
+        v = velocities_nm_ps / self.velocity_scale_nm_ps
+        h = self.embed(x, v, structure.molecule.elements)
+        latents = []
+        for t in range(self.n_new):
+            if self.steps:
+                h = self.steps[t](h, structure.molecule.elements, structure.groups)
+            latents.append(h + self.embed_frame[t])
+        frames = torch.stack(latents, dim=1).flatten(0, 1)
+        over_frames = lambda s: s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1)  # noqa: E731
+        x_new, v_new = self.decoder(frames, over_frames(x), over_frames(v), structure.graph)
+        x_new, v_new = (s.unflatten(0, (-1, self.n_new)) for s in (x_new, v_new))
+        return x_new * scale + centre[:, None], v_new * self.velocity_scale_nm_ps
+
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
+                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
+        """See `Surrogate.next_chunk`: one evaluation from velocities that the bath has refreshed."""
+        start = self.refreshed(last_velocities_nm_ps, molecule, noise)
+        x, v = self(last_frames_nm[:, -1], start, self.structure(molecule))
+        return Chunk(x, v[:, -1])
+
+    def refreshed(self, velocities: Tensor | None, molecule: Molecule, noise: Tensor) -> Tensor:
+        """The bath acts on velocities `(b, n, 3)` for the time of one chunk (exact Ornstein-Uhlenbeck step); None are
+        drawn from the Maxwell-Boltzmann distribution, all from `noise` (b, n, 3)."""
+        c = self.config
+        thermal = (BOLTZMANN_KJ_MOL_K * c.temperature_k / molecule.masses_da).sqrt()[:, None] * noise
+        if velocities is None:
+            return thermal
+        kept = math.exp(-c.friction_per_ps * c.chunk_ps)
+        return kept * velocities + math.sqrt(1.0 - kept * kept) * thermal
