@@ -1,4 +1,4 @@
-"""Distances, volumes and torsions of many frames at once, frames last in memory.
+"""Distances, angles, volumes and torsions of many frames at once, frames last in memory.
 
 Coordinates are `(3, n_atoms, n_frames)`: picking an atom then copies one contiguous row of all frames, which is several
 times faster than picking it from each frame in turn.
@@ -44,18 +44,36 @@ def signed_volume(columns: FloatArray, quads: IntArray) -> FloatArray:
     """Return the signed volumes `(k, n)` nm³ of (centre, a, b, c) in coordinates `(3, n_atoms, n)` nm."""
     centre = columns[:, quads[:, 0]]
     a, b, c = (columns[:, quads[:, k]] - centre for k in (1, 2, 3))
-    volume: FloatArray = (_cross(a, b) * c).sum(axis=0)
+    volume: FloatArray = (cross(a, b) * c).sum(axis=0)
     return volume
 
 
 def torsion_cosine(columns: FloatArray, quads: IntArray) -> FloatArray:
     """Return the cosines `(k, n)` of torsions `(k, 4)` in coordinates `(3, n_atoms, n)` nm; 0 where undefined."""
     first, second, third = (columns[:, quads[:, k + 1]] - columns[:, quads[:, k]] for k in range(3))
-    left, right = _cross(first, second), _cross(second, third)
+    left, right = cross(first, second), cross(second, third)
     scale = np.sqrt((left * left).sum(axis=0) * (right * right).sum(axis=0))
     cosine: FloatArray = (left * right).sum(axis=0) / np.maximum(scale, np.finfo(columns.dtype).tiny)
     return cosine
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def torsion_angle(columns: FloatArray, quads: IntArray) -> FloatArray:
+    """Return the torsions `(k, n)` in [-pi, pi], IUPAC sign, of quads `(k, 4)` in coordinates `(3, n_atoms, n)` nm."""
+    first, second, third = (columns[:, quads[:, k + 1]] - columns[:, quads[:, k]] for k in range(3))
+    left, right = cross(first, second), cross(second, third)
+    sine = (first * right).sum(axis=0) * np.sqrt((second * second).sum(axis=0))
+    angle: FloatArray = np.arctan2(sine, (left * right).sum(axis=0))
+    return angle
+
+
+def bond_angle(columns: FloatArray, triples: IntArray) -> FloatArray:
+    """Return the angles `(k, n)` in [0, pi] at the middle atom of triples `(k, 3)` of coordinates `(3, n_atoms, n)`."""
+    a, b = (columns[:, triples[:, k]] - columns[:, triples[:, 1]] for k in (0, 2))
+    normal = cross(a, b)
+    angle: FloatArray = np.arctan2(np.sqrt((normal * normal).sum(axis=0)), (a * b).sum(axis=0))
+    return angle
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the cross products of vectors `(3, ...)`; np.cross takes several times as long."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -164,15 +164,18 @@ def _flat_ring_torsions(scene: Scene, mean_cosine: Any) -> IntArray:
     `mean_cosine(quads)` gives the mean cosine of each torsion; a ring is planar when none lies beyond 20°.
     """
     rows: list[tuple[int, ...]] = []
-    for cycle in _small_rings(scene):
+    for cycle in small_rings(scene, most_neighbours=3):
         torsions = [tuple(cycle[(k + m) % len(cycle)] for m in range(4)) for k in range(len(cycle))]
         if (mean_cosine(np.array(torsions, dtype=np.int64)) > _RING_PLANAR_COSINE).all():
             rows.extend(torsions)
     return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
 
-def _small_rings(scene: Scene) -> list[list[int]]:
-    """Rings of 4 to 7 atoms with at most three neighbours each, atoms in order: the smallest ring of each bond."""
+def small_rings(scene: Scene, *, most_neighbours: int | None = None) -> list[list[int]]:
+    """Return the rings of 4 to 7 atoms, atoms in order: the smallest ring of each bond.
+
+    `most_neighbours` leaves out rings with an atom of more neighbours.
+    """
     from systems.chemistry import bonded_graph, ring_bonds
 
     graph = bonded_graph(scene)
@@ -191,6 +194,7 @@ def _small_rings(scene: Scene) -> list[list[int]]:
             ring = [j]
             while ring[-1] != i:
                 ring.append(before[ring[-1]])
-            if 4 <= len(ring) <= 7 and all(graph.degree(atom) <= 3 for atom in ring):
+            crowded = most_neighbours is not None and any(graph.degree(atom) > most_neighbours for atom in ring)
+            if 4 <= len(ring) <= 7 and not crowded:
                 rings.setdefault(frozenset(ring), ring)
     return list(rings.values())

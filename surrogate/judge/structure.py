@@ -1,15 +1,16 @@
-"""What is measured on each frame: backbone torsions, bond lengths, validity flags. One pass over the positions."""
+"""What is measured on each frame: torsions, bond lengths, validity flags, shape. One pass over the positions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.ensemble import Ensemble, Flags, Frames
+from surrogate.judge.ensemble import Ensemble, Flags
+from surrogate.judge.probes import FAMILIES, Family, Probes, find_probes, measure_block
 from systems.scene import Scene
 from systems.validity import Geometry
 
@@ -17,7 +18,9 @@ IntArray = npt.NDArray[np.int64]
 Series = npt.NDArray[np.float32]
 
 _BLOCK_FRAMES = 2048
+_BLOCK_VALUES = 20_000_000
 _GEOMETRY_FRAMES = 20_000
+_PROBE_FRAMES = 2_000
 # A thermal bond is 2 pm or more wide; what is narrower than this was held by a constraint.
 CONSTRAINED_BELOW_NM = 5e-4
 
@@ -46,7 +49,8 @@ class Features:
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
-    frame is not finite. `chunk_idx` `(n,)` or None.
+    frame is not finite. `chunk_idx` `(n,)` or None. `series` holds the further families `(n, k)` that `probes` names
+    (see `surrogate.judge.probes.Probes`), empty where nothing was asked for.
     """
 
     label: str
@@ -56,6 +60,8 @@ class Features:
     bonds_nm: Sequence[Series]
     flags: Sequence[Flags]
     chunk_idx: Sequence[npt.NDArray[np.int32]] | None
+    series: Mapping[Family, Sequence[npt.NDArray[Any]]] = field(default_factory=dict)
+    probes: Probes | None = None
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -87,6 +93,7 @@ class Features:
             bonds_nm=cut(self.bonds_nm),
             flags=cut(self.flags),
             chunk_idx=None if self.chunk_idx is None else cut(self.chunk_idx),
+            series={family: cut(values) for family, values in self.series.items()},
         )
 
 
@@ -112,42 +119,62 @@ def backbone(scene: Scene) -> Backbone:
     return Backbone(phi, psi, tuple(label(int(q[2])) for q in phi), tuple(label(int(q[1])) for q in psi), residues)
 
 
+def sample_frames(ensemble: Ensemble, n_frames: int) -> npt.NDArray[np.float32]:
+    """Return about `n_frames` finite frames spread evenly over an ensemble (fewer of very large scenes)."""
+    wanted = max(min(n_frames, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 10)
+    stride = max(1, -(-ensemble.n_frames // wanted))
+    frames = np.concatenate([s[::stride] for s in ensemble.segments])
+    return frames[np.isfinite(frames).all(axis=(1, 2))]
+
+
 def reference_geometry(reference: Ensemble) -> Geometry:
     """Return what valid frames look like, learned from at most 20,000 frames spread over the reference."""
     from systems.validity import geometry_from_frames
 
-    stride = max(1, reference.n_frames // _GEOMETRY_FRAMES)
-    frames: Frames = np.concatenate([s[::stride] for s in reference.segments])
-    finite = np.isfinite(frames).all(axis=(1, 2))
-    return geometry_from_frames(reference.scene, frames[finite])
+    return geometry_from_frames(reference.scene, sample_frames(reference, _GEOMETRY_FRAMES))
 
 
-def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry) -> Features:
-    """Measure every frame of `ensemble`, in blocks that stay in the processor's cache."""
-    from systems.geometry import torsion
+def reference_probes(reference: Ensemble, *, parent: Scene | None = None, kept: IntArray | None = None) -> Probes:
+    """Return what else to measure, chosen on at most 2,000 frames of the reference; see `find_probes`."""
+    return find_probes(reference.scene, sample_frames(reference, _PROBE_FRAMES), parent=parent, kept=kept)
+
+
+def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: Probes | None = None) -> Features:
+    """Measure every frame of `ensemble`, block by block: no more than a block of positions is held at a time."""
+    from systems.frame_columns import column_blocks, squared_distance, torsion_angle
     from systems.validity import check_frames
 
     bonds = np.asarray(geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
     phi, psi, lengths, flags = [], [], [], []
+    series: dict[Family, list[npt.NDArray[Any]]] = {family: [] for family in FAMILIES} if probes else {}
+    size = max(min(_BLOCK_FRAMES, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 1)
     for segment in ensemble.segments:
         n = len(segment)
         phi.append(np.empty((n, len(torsions.phi)), dtype=np.float32))
         psi.append(np.empty((n, len(torsions.psi)), dtype=np.float32))
         lengths.append(np.empty((n, len(bonds)), dtype=np.float32))
         flags.append(np.empty(n, dtype=np.uint16))
-        for start in range(0, n, _BLOCK_FRAMES):
-            part = slice(start, min(start + _BLOCK_FRAMES, n))
+        for start in range(0, n, size):
+            part = slice(start, min(start + size, n))
             block = segment[part]
             broken = ~np.isfinite(block).all(axis=(1, 2))
             with np.errstate(invalid="ignore", over="ignore"):
-                phi[-1][part] = torsion(block, torsions.phi)
-                psi[-1][part] = torsion(block, torsions.psi)
-                vectors = block[:, bonds[:, 1]] - block[:, bonds[:, 0]]
-                lengths[-1][part] = np.sqrt(np.einsum("fbx,fbx->fb", vectors, vectors))
+                for first, x in column_blocks(block, max(len(bonds), 1)):
+                    rows = slice(start + first, start + first + x.shape[2])
+                    phi[-1][rows] = torsion_angle(x, torsions.phi).T
+                    psi[-1][rows] = torsion_angle(x, torsions.psi).T
+                    lengths[-1][rows] = np.sqrt(squared_distance(x, bonds)).T
                 flags[-1][part] = check_frames(block, geometry)
-            for series in (phi[-1], psi[-1], lengths[-1]):
-                series[part][broken] = np.nan
-    return Features(ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx)
+            for column in (phi[-1], psi[-1], lengths[-1]):
+                column[part][broken] = np.nan
+            if probes is not None:
+                for family, values in measure_block(block, probes).items():
+                    if start == 0:
+                        series[family].append(np.empty((n, values.shape[1]), dtype=values.dtype))
+                    series[family][-1][part] = values
+    return Features(
+        ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series=series, probes=probes
+    )
 
 
 def bond_label(scene: Scene, i: int, j: int) -> str:
