@@ -15,7 +15,7 @@ from surrogate.judge.curves import Chart, Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
-from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry
+from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
 from systems import validity
 from systems.errors import InputError
 from systems.scene import Scene
@@ -128,7 +128,8 @@ def compare(
     thinned = equal_lags(everyone)
     torsions = backbone(stage)
     geometry = reference_geometry(thinned[0])
-    measured = [measure(e, torsions, geometry) for e in thinned]
+    probes = reference_probes(thinned[0])
+    measured = [measure(e, torsions, geometry, probes) for e in thinned]
     notes = [note for e in thinned for note in e.notes]
     truth = measured[0]
     if replicate is None:
