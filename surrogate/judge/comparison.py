@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from surrogate.judge import curves, metrics, relaxation, verdict
-from surrogate.judge.account import Account, Faults, account_of, faults_of, speed_ratio
+from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.curves import Chart, Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.worth import Worth, headline, worth_charts
+from surrogate.judge.worth_measures import worths
 from systems import validity
 from systems.errors import InputError
 from systems.scene import Scene
@@ -39,6 +41,8 @@ class Judgement:
     `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` stand behind the error
     bars; `correlation_ps` is the slowest torsion's integrated autocorrelation time in the reference, which makes it
     `effective_samples` independent samples; `speed_ratio` is simulated time per wall second over the reference's.
+    `worth` says by each measure how much MD the whole candidate is worth, and `worth_words` says it in a sentence
+    (empty where it cannot be told, or frames are broken).
     """
 
     account: Account
@@ -57,6 +61,8 @@ class Judgement:
     skipped: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
     curves: Curves
+    worth: tuple[Worth, ...] = ()
+    worth_words: str = ""
 
     def row(self, key: str) -> Row:
         """Return the row whose key is, or starts with, `key`. Raises InputError when there is none."""
@@ -92,10 +98,11 @@ class Comparison:
         plain["options"] = _jsonable(asdict(self.options))
         plain["judgements"] = []
         for judgement in self.judgements:
-            nested = ("rows", "curves", "account", "faults")
+            nested = ("rows", "curves", "account", "faults", "worth")
             out = _jsonable({k: v for k, v in vars(judgement).items() if k not in nested})
             out["account"] = _jsonable(asdict(judgement.account))
             out["faults"] = [_jsonable(asdict(f)) for f in judgement.faults]
+            out["worth"] = [_jsonable(asdict(w)) for w in judgement.worth]
             out["rows"] = [r.to_dict() for r in judgement.rows]
             out["curves"] = judgement.curves.to_dict()
             plain["judgements"].append(out)
@@ -191,10 +198,13 @@ def _judge(
     found = verdict.findings(judged)
     compared = trio.reference.features.total_ps
     truth = trio.reference
+    kind = verdict.status(judged)
+    worth = worths(reference, candidate, replicate, torsions, options)
+    words = "" if kind == "broken" else headline(worth, lambda ps: cost_ratio(ps, account, reference_account))
     return Judgement(
         account=account,
-        status=verdict.status(judged),
-        verdict=verdict.sentence(judged, found, format_time_ps(compared)),
+        status=kind,
+        verdict=" ".join([verdict.sentence(judged, found, format_time_ps(compared)), *([words] if words else [])]),
         findings=found,
         rows=judged,
         compared_ps=compared,
@@ -213,8 +223,10 @@ def _judge(
             correlations=tuple(correlations),
             timelines=tuple(curves.timeline(s.features) for s in trio.samples),
             bonds=tuple(bonds),
-            charts=tuple(chart for _, charts, _ in rooms for chart in charts),
+            charts=(*(chart for _, charts, _ in rooms for chart in charts), *worth_charts(worth)),
         ),
+        worth=worth,
+        worth_words=words,
     )
 
 

@@ -1,0 +1,234 @@
+"""How many nanoseconds of MD a candidate is worth: the length at which MD is as far from the truth as the candidate is.
+
+Reference and replicate are one simulation, run twice. Pieces of the one, of every length, are held against the whole
+of the other, and so is the candidate; both stand against the same truth, so its own noise is in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.charts import Line, LineChart
+from surrogate.judge.statistics import bootstrap_weights
+from systems.units import format_time_ps
+
+FloatArray = npt.NDArray[np.float64]
+Kind = Literal["distribution", "kinetics"]
+
+_MANY_PIECES = 8
+_NORMAL_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class Worth:
+    """The worth of a candidate by one measure, in ps of MD, with its 95 % interval.
+
+    `candidate_error` is its distance to the truth; MD of `lengths_ps` `(n,)`, ascending, has `errors` `(n,)`, the
+    geometric mean over pieces, which scatter between `errors_low` and `errors_high` (10 % and 90 % quantiles).
+    `bound` says where the worth lies when the candidate is better than the longest MD at hand ("at least") or worse
+    than the shortest ("less than"); an end of the interval beyond that range is None.
+    """
+
+    key: str
+    kind: Kind
+    measure: str
+    worth_ps: float
+    low_ps: float | None
+    high_ps: float | None
+    bound: Literal["", "at least", "less than"]
+    candidate_error: float
+    lengths_ps: tuple[float, ...]
+    errors: tuple[float, ...]
+    errors_low: tuple[float, ...]
+    errors_high: tuple[float, ...]
+
+    def in_words(self) -> str:
+        """Return such as '38 ns [25 ns, 60 ns]', 'at least 100 ns' or 'less than 0.8 ns'."""
+        length = format_time_ps(_round(self.worth_ps))
+        if self.bound == "less than" or (self.bound == "at least" and self.low_ps is None):
+            return f"{self.bound} {length}"
+        low = f"< {format_time_ps(_round(self.lengths_ps[0]))}" if self.low_ps is None else _words(self.low_ps)
+        high = f"> {format_time_ps(_round(self.lengths_ps[-1]))}" if self.high_ps is None else _words(self.high_ps)
+        if self.bound:
+            return f"{self.bound} {length} [{low}, ...]"
+        return f"{length} [{low}, {high}]"
+
+    def error_at(self, share: float) -> float:
+        """Return the error of MD of `share` of the longest length, between neighbouring lengths on logarithmic axes."""
+        at = math.log(share * self.lengths_ps[-1])
+        return float(np.exp(np.interp(at, np.log(self.lengths_ps), np.log(np.maximum(self.errors, 1e-12)))))
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """A squared distance between two trajectories, made of sums over blocks of frames.
+
+    `sums` are of (reference, candidate, replicate), `(n_blocks, n_sums)`, the blocks of the first and the last being
+    equal parts of equal lengths in order of time; `squared(p, q)` maps sums `(n, n_sums)` of a trajectory and
+    `(n_sums,)` of the truth to squared distances `(n,)`.
+    """
+
+    key: str
+    kind: Kind
+    name: str
+    sums: tuple[FloatArray, FloatArray, FloatArray]
+    squared: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def worth_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 400) -> Worth | None:
+    """Return the worth by one measure; `length_ps` is that of reference and of replicate. None when it has no value.
+
+    Length and error of MD are read from geometric means over all pieces of one length (a typical piece: a rare event
+    makes few pieces very wrong), made monotone by isotonic regression and interpolated on logarithmic axes. The
+    interval combines the error of that mean with the candidate's own: its block bootstrap, or the scatter of MD pieces
+    of such worth where that is larger, because no trajectory knows by itself which states it has missed.
+    """
+    first, own, second = measure.sums
+    n_blocks = len(first)
+    truths = (first.sum(0), second.sum(0))
+    lengths, means, scatter, spans, counts = [], [], [], [], []
+    n_each = 1
+    while n_each <= n_blocks:
+        n_pieces = n_blocks // n_each
+        found = []
+        for blocks, truth in ((second, truths[0]), (first, truths[1])):
+            pieces = blocks[: n_pieces * n_each].reshape(n_pieces, n_each, -1).sum(1)
+            found.append(measure.squared(pieces, truth))
+        errors = np.concatenate(found)
+        logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
+        if len(logs):
+            lengths.append(length_ps * n_each / n_blocks)
+            means.append(float(logs.mean()))
+            scatter.append(float(logs.std(ddof=1)) if len(logs) >= _MANY_PIECES else math.nan)
+            spans.append(np.exp(0.5 * np.quantile(logs, [0.1, 0.9])))
+            # The two trajectories held whole against each other are one number, twice.
+            counts.append(1 if n_each == n_blocks else len(logs))
+        n_each *= 2
+    value = float(np.mean([measure.squared(own.sum(0)[None], truth)[0] for truth in truths]))
+    if len(lengths) < 3 or not math.isfinite(value):
+        return None
+    curve = _falling(np.asarray(means), np.asarray(counts, dtype=np.float64))
+    log_lengths, log_error = np.log(lengths), math.log(max(value, 1e-300))
+    at = _length_at(log_error, log_lengths, curve)
+    # Where pieces are few their scatter is not known; it grows with length as rare events come in one by one.
+    spread = np.maximum.accumulate(np.nan_to_num(scatter, nan=0.0))
+    of_mean = float(np.interp(at, log_lengths, spread / np.sqrt(counts)))
+    own_error = max(_own_error(measure, truths, seed, n_draws), float(np.interp(at, log_lengths, spread)))
+    combined = math.hypot(own_error, of_mean)
+    low, high = (_crossing(log_error + s * _NORMAL_95 * combined, log_lengths, curve) for s in (1, -1))
+    bound: Literal["", "at least", "less than"] = ""
+    if log_error <= curve[-1]:
+        bound = "at least"
+    elif log_error >= curve[0]:
+        bound = "less than"
+    return Worth(
+        key=measure.key,
+        kind=measure.kind,
+        measure=measure.name,
+        worth_ps=float(math.exp(at)),
+        low_ps=low,
+        high_ps=high,
+        bound=bound,
+        candidate_error=math.sqrt(value),
+        lengths_ps=tuple(lengths),
+        errors=tuple(math.exp(0.5 * x) for x in means),
+        errors_low=tuple(float(s[0]) for s in spans),
+        errors_high=tuple(float(s[1]) for s in spans),
+    )
+
+
+def _own_error(measure: Measure, truths: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> float:
+    """Return the standard error of the logarithm of the candidate's squared distance (block bootstrap)."""
+    own = measure.sums[1]
+    drawn = bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own
+    draws = np.mean([measure.squared(drawn, truth) for truth in truths], axis=0)
+    draws = draws[np.isfinite(draws) & (draws > 0)]
+    if len(draws) < 2 or len(own) < 2:
+        return math.inf
+    return float(np.log(draws).std()) * math.sqrt(len(own) / (len(own) - 1))
+
+
+def _falling(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the non-increasing sequence nearest to `values` (isotonic regression)."""
+    from scipy.optimize import isotonic_regression
+
+    return np.asarray(isotonic_regression(values, weights=weights, increasing=False).x)
+
+
+def _length_at(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> float:
+    """Return the (log) length with this (log) error; beyond the curve its end. Flat stretches give their middle."""
+    left = float(np.interp(-log_error, -curve - 1e-12 * np.arange(len(curve))[::-1], log_lengths))
+    right = float(np.interp(-log_error, -curve + 1e-12 * np.arange(len(curve)), log_lengths))
+    return 0.5 * (left + right)
+
+
+def _crossing(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> float | None:
+    """Return the length in ps with this error, or None where no MD at hand is as good or as bad."""
+    if not curve[-1] < log_error < curve[0]:
+        return None
+    return float(math.exp(_length_at(log_error, log_lengths, curve)))
+
+
+def _round(time_ps: float) -> float:
+    return float(f"{time_ps:.2g}")
+
+
+def _words(time_ps: float) -> str:
+    return format_time_ps(_round(time_ps))
+
+
+def headline(found: Sequence[Worth], cost_ratio: Callable[[float], float | None]) -> str:
+    """Return 'Worth 38 ns [25 ns, 60 ns] of MD by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns [...].'
+
+    `cost_ratio(worth_ps)`: the cost of that much MD over the candidate's, None when a cost is unknown. Empty without
+    a measure.
+    """
+    first = next((w for w in found if w.kind == "distribution"), None)
+    if first is None:
+        return ""
+    text = f"Worth {first.in_words()} of MD by its {first.measure}"
+    ratio = cost_ratio(first.worth_ps)
+    if ratio is not None and first.bound != "less than":
+        text += f", at {_cost_words(ratio)} its cost"
+    moving = next((w for w in found if w.kind == "kinetics"), None)
+    return text + (f"; by its kinetics ({moving.measure}) {moving.in_words()}." if moving else ".")
+
+
+def _cost_words(ratio: float) -> str:
+    """Return '1/900 of' for MD that costs 900 times as much, '3.2 times' for MD that is cheaper."""
+    if ratio < 1.0:
+        return f"{float(f'{1 / ratio:.2g}'):g} times"
+    return f"1/{float(f'{ratio:.2g}'):,g} of"
+
+
+def worth_charts(found: Sequence[Worth]) -> list[LineChart]:
+    """Return one chart a measure: the error of MD against its length, and the candidate's error as a level line."""
+    charts = []
+    for w in found:
+        x = np.asarray(w.lengths_ps) * 1e-3
+        level = np.full(len(x), w.candidate_error)
+        charts.append(
+            LineChart(
+                section="worth",
+                title=f"Worth by {w.measure}: {w.in_words()} of MD",
+                caption="Distance to the truth of reference MD of each length (typical piece; band: 10 to 90 % of "
+                "the pieces) and of the candidate. Where the lines cross, MD is as good as the candidate.",
+                x_label="length of MD / ns",
+                y_label="distance to the truth",
+                lines=(
+                    Line(
+                        "MD", "reference", x, np.asarray(w.errors), np.asarray(w.errors_low), np.asarray(w.errors_high)
+                    ),
+                    Line("candidate", "candidate", x, level),
+                ),
+                log_x=True,
+                log_y=True,
+            )
+        )
+    return charts

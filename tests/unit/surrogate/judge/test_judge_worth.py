@@ -1,0 +1,137 @@
+"""How much MD a candidate is worth: on true MD of known length the answer is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surrogate.judge import distributions, worth_measures
+from surrogate.judge.comparison import Judgement, compare
+from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.worth import Measure, Worth, headline, worth_by
+
+N_BLOCKS, PER_BLOCK = 128, 20
+
+
+def draw_counts(p: np.ndarray, n_blocks: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.multinomial(PER_BLOCK, p, size=n_blocks).astype(float)
+
+
+def squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray(distributions.divergence(a, b[None]))
+
+
+def measured(candidate: np.ndarray, rng: np.random.Generator, p: np.ndarray) -> Worth:
+    sums = (draw_counts(p, N_BLOCKS, rng), candidate, draw_counts(p, N_BLOCKS, rng))
+    found = worth_by(Measure("x", "distribution", "x", sums, squared), 1000.0 * N_BLOCKS)
+    assert found is not None
+    return found
+
+
+STATES = np.full(30, 1 / 30)
+
+
+@pytest.mark.parametrize("n_blocks", [8, 32])
+def test_a_true_sample_is_worth_its_own_length(n_blocks: int) -> None:
+    """Blocks stand for 1 ns each. The mean over trials is within 15 %; the intervals hold it as often as stated."""
+    rng = np.random.default_rng(n_blocks)
+    found = [measured(draw_counts(STATES, n_blocks, rng), rng, STATES) for _ in range(60)]
+    truth = 1000.0 * n_blocks
+    assert float(np.exp(np.mean([math.log(w.worth_ps / truth) for w in found]))) == pytest.approx(1.0, abs=0.15)
+    covered = sum((w.low_ps or 0) <= truth <= (w.high_ps or math.inf) for w in found)
+    assert covered >= 54, "95 % of 60 intervals should hold the truth; fewer than 54 is chance once in 200 times"
+    widths = [w.high_ps / w.low_ps for w in found if w.low_ps and w.high_ps]
+    assert np.median(widths) < 6
+
+
+def test_a_biased_sample_is_worth_the_length_of_its_bias_however_long_it_is() -> None:
+    """Divergence eps^2 / 8 of the bias; MD of l frames has (30 - 1) / (8 l). Equal at l = 29 / eps^2."""
+    rng = np.random.default_rng(0)
+    eps = 0.3
+    tilted = STATES * (1 + eps * np.where(np.arange(30) % 2, 1, -1))
+    found = measured(rng.multinomial(200_000, tilted, size=20).astype(float), rng, STATES)
+    frames = 29 / eps**2
+    assert found.worth_ps / 1000 == pytest.approx(frames / PER_BLOCK, rel=0.2)
+    assert not found.bound and found.low_ps and found.high_ps
+    assert found.low_ps < found.worth_ps < found.high_ps
+
+
+def test_what_is_better_or_worse_than_all_md_at_hand_says_so() -> None:
+    rng = np.random.default_rng(1)
+    good = measured(rng.multinomial(100_000, STATES, size=20).astype(float), rng, STATES)
+    assert good.bound == "at least" and good.high_ps is None
+    assert good.in_words().startswith("at least 130 ns")
+    stuck = np.zeros((20, 30))
+    stuck[:, 0] = 100.0
+    bad = measured(stuck, rng, STATES)
+    assert bad.bound == "less than" and bad.in_words() == "less than 1 ns"
+
+
+def test_rising_errors_are_made_monotone() -> None:
+    rng = np.random.default_rng(2)
+    found = measured(draw_counts(STATES, 64, rng), rng, STATES)
+    assert list(found.lengths_ps) == [1000.0 * 2**k for k in range(8)]
+    assert found.error_at(0.1) == pytest.approx(math.sqrt(29 / 8 / PER_BLOCK * (1 / 12.8 + 1 / 128)), rel=0.15)
+    assert found.error_at(0.01) > found.error_at(0.1) > found.error_at(1.0)
+
+
+def test_even_blocks_cover_every_frame_once() -> None:
+    for lengths in ([1000], [300, 7, 693], [128] * 5):
+        blocks = worth_measures.even_blocks(lengths, 16)
+        seen = [np.zeros(n, dtype=int) for n in lengths]
+        sizes = np.zeros(16, dtype=int)
+        for piece in blocks.pieces:
+            seen[piece.segment][piece.start : piece.stop] += 1
+            sizes[piece.block] += piece.stop - piece.start
+        assert all((s == 1).all() for s in seen)
+        assert sizes.max() - sizes.min() <= 1
+
+
+@pytest.fixture(scope="module")
+def judged(trio: tuple[Ensemble, Ensemble, Ensemble]) -> Judgement:
+    reference, candidate, replicate = trio
+    reference = replace(reference, record=reference.record | {"cost": {"wall_s": 1000.0}})
+    shorter = replace(candidate, segments=[candidate.segments[0][:1500]], record={"cost": {"wall_s": 1.0}})
+    return compare(reference, [shorter], replicate).judgements[0]
+
+
+def test_the_verdict_says_what_the_trajectory_is_worth_and_costs(judged: Judgement) -> None:
+    by = {w.key: w for w in judged.worth}
+    assert list(by) == ["joint_jsd", "torsion_jsd", "tic0_jsd", "psi_correlation"]
+    for worth in by.values():
+        assert worth.low_ps is None or worth.low_ps < 1500
+        assert worth.high_ps is None or worth.high_ps > 1500
+    assert by["joint_jsd"].worth_ps == pytest.approx(1500, rel=0.4)
+    assert judged.worth_words.startswith("Worth 1.") and judged.worth_words in judged.verdict
+    # 12 ns of reference cost 1000 s, so 1.5 ns cost 125 times the candidate's 1 s.
+    share = float(judged.worth_words.split("at 1/")[1].split(" of")[0])
+    assert share == pytest.approx(by["joint_jsd"].worth_ps / 12_000 * 1000, rel=0.05)
+
+
+def test_wrong_kinetics_are_worth_little_where_the_map_is_right(trio: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+    """Negative control: shuffled frames keep the map's worth and lose that of the kinetics."""
+    reference, candidate, replicate = trio
+    frames = candidate.segments[0].copy()
+    np.random.default_rng(0).shuffle(frames)
+    found = compare(reference, [replace(candidate, segments=[frames])], replicate).judgements[0]
+    by = {w.key: w for w in found.worth}
+    assert by["joint_jsd"].worth_ps > 4_000
+    assert by["psi_correlation"].worth_ps < 400
+
+
+def test_the_headline_without_costs_or_measures() -> None:
+    rng = np.random.default_rng(3)
+    found = measured(draw_counts(STATES, 32, rng), rng, STATES)
+    assert "cost" not in headline([found], lambda _: None)
+    assert "at 1/900 of its cost" in headline([found], lambda _: 901.0)
+    assert "at 2 times its cost" in headline([found], lambda _: 0.5)
+    assert headline([], lambda _: None) == ""
+
+
+def test_short_trajectories_have_no_worth(simulate: Callable[..., Ensemble]) -> None:
+    judgement = compare(simulate(31, 60), [simulate(32, 60)], simulate(33, 60)).judgements[0]
+    assert judgement.worth == () and judgement.worth_words == ""
