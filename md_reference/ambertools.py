@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -67,6 +68,7 @@ def gaff2_table() -> Path:
 def run(program: str, arguments: list[str], folder: Path, **variables: str) -> str:
     """Run one program in `folder`, with these environment variables added, and return what it printed.
 
+    An interruption ends it and whatever it has started: antechamber leaves its sqm running for minutes otherwise.
     Raises PreparationError with its own complaint.
     """
     tools = ambertools()
@@ -76,7 +78,7 @@ def run(program: str, arguments: list[str], folder: Path, **variables: str) -> s
         "OMP_NUM_THREADS": "1",
         **variables,
     }
-    done = subprocess.run(
+    with subprocess.Popen(
         [str(tools.bin / program), *arguments],
         cwd=folder,
         env=environment,
@@ -85,10 +87,14 @@ def run(program: str, arguments: list[str], folder: Path, **variables: str) -> s
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        check=False,
-    )
-    printed = _COLOUR.sub("", done.stdout)
-    if done.returncode != 0:
+        start_new_session=True,
+    ) as process:
+        try:
+            printed = _COLOUR.sub("", process.communicate()[0])
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+    if process.returncode != 0:
         raise PreparationError(f"{program} failed: {complaint(printed)}")
     return printed
 
