@@ -46,7 +46,7 @@ def platform_properties(name: str, threads: int) -> dict[str, str]:
     return {"Threads": str(threads)} | ({"DeterministicForces": "true"} if threads > 1 else {})
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
     """OpenMM's own words, without its advice and its address."""
     return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
 
@@ -103,7 +103,7 @@ class Engine:
                 self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties
             )
         except openmm.OpenMMException as error:
-            raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {_one_line(error)}") from error
+            raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {one_line(error)}") from error
         masses = [self._system.getParticleMass(k)._value for k in range(self._system.getNumParticles())]
         self._masses_da = np.array(masses, dtype=np.float64)
         self.set_positions(scene.positions_nm)
@@ -190,7 +190,7 @@ class Engine:
         try:
             openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"minimisation failed: {_one_line(error)}") from error
+            raise SimulationError(f"minimisation failed: {one_line(error)}") from error
         energy = self.energy()
         if not math.isfinite(energy):
             raise SimulationError("minimisation failed: the energy is no longer finite")
@@ -213,7 +213,7 @@ class Engine:
         try:
             self._integrator.step(n_steps)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"integration failed: {_one_line(error)}") from error
+            raise SimulationError(f"integration failed: {one_line(error)}") from error
 
     def positions(self) -> FloatArray:
         """Return positions `(n_atoms, 3)` nm without computing any energy."""
@@ -269,7 +269,7 @@ class Engine:
         try:
             return self._context.getState(**what)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"evaluation failed: {_one_line(error)}") from error
+            raise SimulationError(f"evaluation failed: {one_line(error)}") from error
 
     def checkpoint(self) -> bytes:
         """Return OpenMM's binary checkpoint: positions, velocities, time, random states. Same platform only."""
@@ -282,7 +282,7 @@ class Engine:
         try:
             self._context.loadCheckpoint(blob)
         except openmm.OpenMMException as error:
-            raise SimulationError(f"checkpoint does not fit this run: {_one_line(error)}") from error
+            raise SimulationError(f"checkpoint does not fit this run: {one_line(error)}") from error
 
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""

@@ -132,8 +132,9 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
 
 def _choose(scene: Scene) -> str:
-    from md_reference.mixture import is_water, molecules_of, part_of
+    from md_reference.mixture import is_water, molecules_of
     from md_reference.templates import uncovered_residue
+    from systems.selection import part_of
 
     rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene, m)]
     known = [uncovered_residue(part_of(scene, m), "ff14SB") is None for m in rest]
@@ -198,8 +199,9 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
 def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     """GAFF2 molecules, alone or beside peptides, water and ions."""
     from md_reference import born
-    from md_reference.mixture import is_water, merge, molecules_of, part_of
+    from md_reference.mixture import is_water, merge, molecules_of
     from md_reference.templates import build_templated, uncovered_residue
+    from systems.selection import part_of
 
     templated: list[IntArray] = []
     others: list[IntArray] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import networkx as nx
@@ -27,28 +26,6 @@ def molecules_of(scene: Scene) -> list[IntArray]:
 def is_water(scene: Scene, atoms: IntArray) -> bool:
     """Return whether a molecule's atoms are those of water."""
     return len(atoms) == 3 and sorted(scene.elements[i] for i in atoms.tolist()) == ["H", "H", "O"]
-
-
-def part_of(scene: Scene, atoms: IntArray) -> Scene:
-    """Return the scene of some atoms (ascending), with their bonds and residues, without a cell's other contents."""
-    where = {int(i): k for k, i in enumerate(atoms)}
-    rows = [k for k, (i, j) in enumerate(scene.bonds.tolist()) if i in where and j in where]
-    residues = list(dict.fromkeys(int(scene.residue_of_atom[i]) for i in atoms))
-    rank = {r: k for k, r in enumerate(residues)}
-    return replace(
-        scene,
-        atom_names=tuple(scene.atom_names[i] for i in atoms),
-        elements=tuple(scene.elements[i] for i in atoms),
-        residue_of_atom=np.array([rank[int(scene.residue_of_atom[i])] for i in atoms], dtype=np.int64),
-        residue_names=tuple(scene.residue_names[r] for r in residues),
-        residue_ids=tuple(scene.residue_ids[r] for r in residues),
-        chain_of_residue=tuple(scene.chain_of_residue[r] for r in residues),
-        bonds=np.array([[where[int(i)] for i in scene.bonds[k]] for k in rows], dtype=np.int64).reshape(-1, 2),
-        bond_orders=scene.bond_orders[rows],
-        formal_charges=scene.formal_charges[atoms],
-        masses_da=scene.masses_da[atoms],
-        positions_nm=scene.positions_nm[atoms],
-    )
 
 
 def merge(n_atoms: int, parts: Iterable[tuple[IntArray, Any]]) -> Any:

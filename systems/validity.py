@@ -24,6 +24,12 @@ CLASH = 8
 CHIRALITY = 16
 OMEGA = 32
 RING = 64
+# What guards watch beyond that while rolling (systems.limits); they are no part of INVALID.
+ANGLE = 128
+PLANARITY = 256
+JUMP = 512
+DRIFT = 1024
+ENERGY = 2048
 INVALID = NOT_FINITE | BOND_HALF_ANGSTROM | CLASH | CHIRALITY | OMEGA | RING
 
 _NAMES = {
@@ -34,6 +40,11 @@ _NAMES = {
     CHIRALITY: "stereocentre inverted",
     OMEGA: "peptide or double bond turned over",
     RING: "planar ring bent",
+    ANGLE: "angle beyond the reference",
+    PLANARITY: "flat centre bent",
+    JUMP: "jump between frames",
+    DRIFT: "drift of the whole",
+    ENERGY: "energy above the reference",
 }
 _FLOAT_FIELDS = ("bond_mean_nm", "bond_std_nm", "clash_min_nm")
 

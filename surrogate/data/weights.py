@@ -23,12 +23,14 @@ FORMAT = "surromd-weights-1"
 class TrainingDomain:
     """What the weights were trained for. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
-    `geometry` is what its frames say of valid ones (systems.validity.Geometry as a dictionary)."""
+    `geometry` is what its frames say of valid ones (systems.validity.Geometry as a dictionary), `limits` how far they
+    go beyond that (systems.limits.Limits; None in files of older versions)."""
 
     scene: Scene
     lag_ps: float
     conditions: dict[str, Any]
     geometry: dict[str, Any]
+    limits: dict[str, Any] | None = None
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""

@@ -22,6 +22,7 @@ from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
+from systems.limits import limits_from_frames
 from systems.validity import geometry_from_frames
 
 # Share of the whole budget that stage one gets.
@@ -230,11 +231,13 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
 
 
 def training_domain(frames: TrainingFrames, n_geometry_frames: int = 20_000) -> TrainingDomain:
-    """Return the domain of weights trained on `frames`; the geometry is measured on evenly spaced training frames."""
-    starts = frames.window_starts(1, validation=False)
+    """Return the domain of weights trained on `frames`; its checks are measured on evenly spaced training frames."""
+    starts = frames.window_starts(2, validation=False)
     picked = starts[np.linspace(0, len(starts) - 1, min(n_geometry_frames, len(starts))).astype(int)]
-    geometry = geometry_from_frames(frames.scene, frames.positions_nm(picked))
-    return TrainingDomain(frames.scene, frames.lag_ps, frames.conditions, geometry.to_dict())
+    positions = frames.positions_nm(picked)
+    geometry = geometry_from_frames(frames.scene, positions)
+    limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + 1))
+    return TrainingDomain(frames.scene, frames.lag_ps, frames.conditions, geometry.to_dict(), limits.to_dict())
 
 
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:

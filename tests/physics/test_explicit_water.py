@@ -11,12 +11,13 @@ import pytest
 
 from md_reference.engine import Engine
 from md_reference.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.mixture import is_water, molecules_of, part_of
+from md_reference.mixture import is_water, molecules_of
 from md_reference.solvation import solvate, solvate_if_asked
 from systems.errors import InputError, PreparationError
 from systems.library import load
 from systems.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
+from systems.selection import part_of
 
 TIP3P = ForceFieldSpec("ff14SB", "tip3p")
 AVOGADRO_NM3 = 602.214  # dalton per nm³ in one g/cm³

@@ -72,7 +72,7 @@ def test_an_interrupted_rollout_resumes_bit_for_bit(tmp_path: Path, small_weight
     class Killed(BaseException):
         pass
 
-    def kill(done: int, total: int) -> None:
+    def kill(done: int, total: int, note: str) -> None:
         if done > total // 2:
             raise Killed
 

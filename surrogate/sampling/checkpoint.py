@@ -1,0 +1,82 @@
+"""Where a rollout stands: written beside its first file after each flush, read by `--resume`."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.sampling.account import Tally
+from systems.errors import InputError
+from systems.whole_file import create_whole
+
+Float32Array = npt.NDArray[np.float32]
+
+_FORMAT = 2
+
+
+@dataclass
+class Progress:
+    """Where a rollout stands between two chunks.
+
+    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
+    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
+    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before.
+    """
+
+    last_frames: Float32Array
+    velocities: Float32Array | None = None
+    chunks: int = 0
+    steps: int = 0
+    wall_s: float = 0.0
+    batch: int | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    tallies: list[Tally] = field(default_factory=list)
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Return where the checkpoint of a rollout stands whose first file is `out`."""
+    return out.with_name(out.name + ".checkpoint")
+
+
+def write_checkpoint(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
+    """Write a checkpoint whole or not at all. Raises StorageError."""
+    arrays: dict[str, Any] = {k: v for k, v in vars(progress).items() if isinstance(v, np.ndarray)}
+    plain = {k: v for k, v in asdict(progress).items() if k not in arrays}
+    buffer = io.BytesIO()
+    header = {"format": _FORMAT, "settings": settings, "progress": plain}
+    np.savez(buffer, header=np.array(json.dumps(header)), **arrays)
+    create_whole(path, lambda temporary: _write_bytes(temporary, buffer.getvalue()))
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def read_checkpoint(path: Path, settings: dict[str, Any]) -> Progress:
+    """Return where a rollout of these settings stood.
+
+    Raises InputError when the file cannot be read, or the rollout was started with other settings.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            header = json.loads(str(stored["header"]))
+            arrays = {key: stored[key] for key in stored.files if key != "header"}
+        known, plain = header["settings"], header.get("progress", {})
+        of_this_version = header.get("format") == _FORMAT
+        tallies = [Tally(**tally) for tally in plain.pop("tallies", [])]
+        progress = Progress(**arrays, **plain, tallies=tallies) if of_this_version else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
+    if progress is None:
+        raise InputError(f"checkpoint {path} is of another version of surromd; start again with --overwrite.")
+    for key, value in settings.items():
+        if key not in known or known[key] != value:
+            raise InputError(f"{path}: this rollout was started with {key} = {known.get(key)!r}, not {value!r}.")
+    return progress

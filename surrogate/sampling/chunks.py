@@ -1,0 +1,178 @@
+"""Draws chunks of a model: canonical pose, noise from seeds, and batches that halve when memory runs out."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from systems.errors import InputError, SimulationError
+from systems.geometry import superposition
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+FloatArray = npt.NDArray[np.floating[Any]]
+_Model = TypeVar("_Model", bound=Surrogate)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """New frames `(b, n_new, n_atoms, 3)` nm and, of a model that carries them, the velocities `(b, n_atoms, 3)` nm/ps
+    at the last of them; both in the pose of the frames that they follow."""
+
+    frames_nm: FloatArray
+    velocities_nm_ps: FloatArray | None
+
+
+class ChunkSampler:
+    """One model, ready to draw chunks: what a rollout does with the weights, and all that it does with them.
+
+    Atoms are in the model's order throughout. `batch` is the most replicas computed at once: None for all, until
+    memory runs out, and then half as many, for good. Raises InputError for a solver or precision that does not suit
+    the weights.
+    """
+
+    def __init__(
+        self, weights: Weights, *, solver_steps: int = 20, solver: str | None = None, precision: str = "auto"
+    ) -> None:
+        if precision not in ("auto", "fp32", "bf16"):
+            raise InputError(f"precision {precision!r} is unknown; choose auto, fp32 or bf16.")
+        model, template = weights.model, weights.domain.scene
+        known = model.solvers
+        if solver is not None and solver not in known:
+            raise InputError(
+                f"the solver {solver!r} does not suit {weights.path.name}; "
+                + (f"choose {' or '.join(known)}." if known else "its model has no solver; leave --solver out.")
+            )
+        self.solver = solver or (known[0] if known else None)
+        self.solver_steps = solver_steps
+        self.bf16 = precision == "bf16" or (precision == "auto" and bf16_in_hardware())
+        self.batch: int | None = None
+        self._model = with_bf16_weights(model) if self.bf16 else model
+        self._molecule = Molecule.of(template)
+        self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+        self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
+
+    @property
+    def n_conditioning(self) -> int:
+        """Frames that a chunk is conditioned on."""
+        return self._model.n_conditioning
+
+    @property
+    def n_new(self) -> int:
+        """Frames in a chunk."""
+        return self._model.n_new
+
+    @property
+    def evaluations_per_chunk(self) -> int:
+        """Network evaluations for a chunk of one replica."""
+        return self.solver_steps if self._model.solvers else 1
+
+    def draw(
+        self, last_frames_nm: FloatArray, seeds: Sequence[int], velocities_nm_ps: FloatArray | None = None
+    ) -> Drawn:
+        """Return the chunks that follow `last_frames_nm (b, n_conditioning, n_atoms, 3)`, row k drawn with `seeds[k]`.
+
+        `velocities_nm_ps (b, n_atoms, 3)`: what the chunk before ended in; rows of NaN start from velocities that the
+        noise draws. A row does not depend on the rows beside it, but for rounding. Frames come in the precision of
+        `last_frames_nm`: in float64 they keep their accuracy however far from the origin the molecule lies.
+        Raises SimulationError when memory does not suffice for a single replica.
+        """
+        parts: list[tuple[npt.NDArray[np.int64], Drawn]] = []
+        for rows in _alike(velocities_nm_ps, len(seeds)):
+            start = 0
+            while start < len(rows):
+                size = min(self.batch or len(rows), len(rows) - start)
+                some = rows[start : start + size]
+                given = velocities_nm_ps if velocities_nm_ps is None else velocities_nm_ps[some]
+                if given is not None and np.isnan(given).any():
+                    given = None
+                try:
+                    parts.append((some, self._draw(last_frames_nm[some], [seeds[k] for k in some], given)))
+                except (MemoryError, RuntimeError) as error:
+                    if not _out_of_memory(error):
+                        raise
+                    if size == 1:
+                        raise SimulationError(
+                            "memory does not suffice for one replica; use smaller weights."
+                        ) from error
+                    self.batch = -(-size // 2)
+                    continue
+                start += size
+        order = np.argsort(np.concatenate([rows for rows, _ in parts]))
+        frames = np.concatenate([part.frames_nm for _, part in parts])[order]
+        ends = [part.velocities_nm_ps for _, part in parts if part.velocities_nm_ps is not None]
+        return Drawn(frames, np.concatenate(ends)[order] if ends else None)
+
+    @torch.inference_mode()
+    def _draw(self, last_frames_nm: FloatArray, seeds: Sequence[int], velocities: FloatArray | None) -> Drawn:
+        kind = last_frames_nm.dtype
+        last = last_frames_nm.astype(np.float64)
+        n_replicas, _, n_atoms, _ = last.shape
+        if self._model.canonical:
+            # One rigid motion per replica, that of its last frame, carried back onto the new frames.
+            rotation, translation = superposition(last[:, -1], self._target, idx=self._fit)
+        else:
+            rotation = np.broadcast_to(np.eye(3), (n_replicas, 3, 3))
+            translation = -last[:, -1].mean(axis=1)
+        canonical = np.einsum("rij,rtnj->rtni", rotation, last) + translation[:, None, None, :]
+        noise = draw_noise(self._model, n_atoms, [torch.Generator().manual_seed(seed) for seed in seeds])
+        turned = None if velocities is None else np.einsum("rij,rnj->rni", rotation, velocities)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
+            chunk = self._model.next_chunk(
+                torch.from_numpy(canonical.astype(np.float32)),
+                self._molecule,
+                noise,
+                solver_steps=self.solver_steps,
+                solver=self.solver,
+                last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),
+            )
+        moved = chunk.frames_nm.double().numpy() - translation[:, None, None, :]
+        ends = None
+        if chunk.velocities_nm_ps is not None:
+            ends = np.einsum("rji,rnj->rni", rotation, chunk.velocities_nm_ps.double().numpy()).astype(kind)
+        return Drawn(np.einsum("rji,rtnj->rtni", rotation, moved).astype(kind), ends)
+
+
+def noise_seed(seed: int, replica: int, chunk: int, attempt: int = 0) -> int:
+    """Return the seed of one replica's chunk; further attempts at the same chunk draw other noise."""
+    text = f"{seed}/{replica}/{chunk}" + (f"/{attempt}" if attempt else "")
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
+
+
+def with_bf16_weights(model: _Model) -> _Model:
+    """Return a copy whose matrix weights are bf16 already: autocast would round them anew in every evaluation."""
+    copied = copy.deepcopy(model)
+    for name, module in copied.named_modules():
+        if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers):
+            module.to(torch.bfloat16)
+    return copied
+
+
+def bf16_in_hardware() -> bool:
+    """True where the processor has matrix units for bf16 (AMX); a fixed property, so a seed keeps its meaning."""
+    supported = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return bool(supported and supported())
+
+
+def _alike(velocities: FloatArray | None, n: int) -> list[npt.NDArray[np.int64]]:
+    """Rows with velocities and rows without, which go into different calls of the model."""
+    if velocities is None:
+        return [np.arange(n)]
+    without = np.isnan(velocities).any(axis=(1, 2))
+    return [rows for rows in (np.flatnonzero(~without), np.flatnonzero(without)) if len(rows)]
+
+
+def _out_of_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    text = str(error).lower()
+    return any(words in text for words in ("out of memory", "not enough memory", "can't allocate memory"))

@@ -1,0 +1,61 @@
+"""Every frame is checked as it is made, before it is written or anything follows from it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.limits import Limits, check_limits
+from systems.validity import ANGLE, DRIFT, ENERGY, INVALID, JUMP, NOT_FINITE, PLANARITY, Geometry, check_frames
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import TrainingDomain
+
+FloatArray = npt.NDArray[np.floating[Any]]
+Flags = npt.NDArray[np.uint16]
+
+# Any of these bits, and a frame does not pass.
+CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY
+
+
+class Guard:
+    """The checks of one training domain, with thresholds that its reference set (`systems.validity`, `.limits`)."""
+
+    def __init__(self, domain: TrainingDomain) -> None:
+        self._geometry = Geometry.from_dict(domain.geometry)
+        self._limits = None if domain.limits is None else Limits.from_dict(domain.limits)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What is not checked, because the reference changes it or the weights are older than the check."""
+        missing = ("angles, flat centres, jumps and drift: the weights carry no limits",) if not self._limits else ()
+        return (*self._geometry.excluded, *missing)
+
+    def check(self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False) -> Flags:
+        """Return the flags `(b, n)` of frames `(b, n, n_atoms, 3)` nm that follow `before_nm (b, n_atoms, 3)`.
+
+        `from_start`: the frames before are the user's structure, which need not be one of the ensemble, so that the
+        first step away from it does not count as a jump.
+        """
+        n_rows, n_frames = frames_nm.shape[:2]
+        flat = frames_nm.reshape(-1, *frames_nm.shape[2:])
+        flags = check_frames(flat, self._geometry)
+        if self._limits is not None:
+            first = frames_nm[:, :1] if from_start else before_nm[:, None]
+            previous = np.concatenate([first, frames_nm[:, :-1]], axis=1).reshape(flat.shape)
+            flags |= check_limits(flat, self._limits, previous)
+        return flags.reshape(n_rows, n_frames)
+
+
+def caught(flags: Flags) -> npt.NDArray[np.bool_]:
+    """Return which frames do not pass."""
+    found: npt.NDArray[np.bool_] = (flags & np.uint16(CAUGHT)) != 0
+    return found
+
+
+def finite(flags: Flags) -> npt.NDArray[np.bool_]:
+    """Return which frames are finite."""
+    found: npt.NDArray[np.bool_] = (flags & np.uint16(NOT_FINITE)) == 0
+    return found

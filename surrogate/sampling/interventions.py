@@ -1,0 +1,296 @@
+"""Chunks that can be trusted: drawn, checked, and helped where a guard catches a frame.
+
+flag: caught frames are marked. resample: from the first caught frame on, the chunk is drawn again with another seed,
+from the last valid frame; after four draws, from where the chunk began. repair: OpenMM restores bond lengths and
+relaxes caught frames under restraints; what is not valid then is drawn again. fallback: real MD runs from the last
+valid frame to the end of the chunk, and the surrogate takes over again.
+
+A model that gives a chunk without one frame that passes, and another in a second draw, is not unlucky but wrong: the
+rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken (validity.INVALID).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.sampling.account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Clock, Tally
+from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.sampling.coupling import Coupling
+from surrogate.sampling.guards import Flags, Guard, caught, finite
+from systems.errors import SimulationError
+from systems.validity import ENERGY, INVALID, flag_names
+
+FloatArray = npt.NDArray[np.floating[Any]]
+
+MOST_DRAWS = 8
+_DRAWS_FROM_LAST_VALID = 4
+MOST_MD_IN_A_ROW = 10
+_MD_ATTEMPT, _BETWEEN_ATTEMPT = 1000, 2000
+
+
+@dataclass(eq=False)
+class Chunk:
+    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`account.MARKS`) and, where they were
+    computed, energies of relaxed frames in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
+    that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
+
+    frames_nm: FloatArray
+    flags: Flags
+    marks: npt.NDArray[np.uint8]
+    energies_kj_mol: npt.NDArray[np.float64]
+    velocities_nm_ps: FloatArray | None
+    failure: tuple[int, str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Interventions:
+    """Draws chunks and does about caught frames what `guard` says (settings.GUARDS).
+
+    `coupling` is needed by 'repair', 'fallback', `energy_every` (every k-th frame's energy is checked) and `n_between`
+    (frames of MD after each chunk).
+    """
+
+    sampler: ChunkSampler
+    checks: Guard
+    guard: str
+    seed: int
+    clock: Clock
+    coupling: Coupling | None = None
+    energy_every: int = 0
+    n_between: int = 0
+
+    def advance(
+        self,
+        last_nm: FloatArray,
+        velocities_nm_ps: FloatArray | None,
+        tallies: Sequence[Tally],
+        *,
+        chunk: int,
+        step: int,
+    ) -> Chunk:
+        """Return the chunk number `chunk` after `last_nm (b, n_conditioning, n_atoms, 3)`, `step` frames into the run.
+
+        Tallies are brought up to date. Frames stand in it as they are to be written; where `failure` is set, the
+        rollout must stop.
+        """
+        run = _Advance(self, last_nm, velocities_nm_ps, tallies, chunk, step)
+        run.draw()
+        if self.guard not in ("off", "flag"):
+            run.help_rows()
+        run.judge()
+        if self.n_between and run.chunk.failure is None:
+            run.add_md()
+        for tally, marks in zip(tallies, run.chunk.marks, strict=True):
+            tally.note_marks(marks)
+            tally.chunks += 1
+        return run.chunk
+
+
+class _Advance:
+    """One chunk in the making."""
+
+    def __init__(self, plan: Interventions, last_nm: FloatArray, velocities: FloatArray | None,
+                 tallies: Sequence[Tally], number: int, step: int) -> None:  # fmt: skip
+        self.plan, self.last, self.velocities = plan, last_nm, velocities
+        self.tallies, self.number, self.step = tallies, number, step
+
+    def draw(self) -> None:
+        with self.plan.clock.timed("draw"):
+            drawn = self.plan.sampler.draw(self.last, self._seeds(range(len(self.last)), 0), self.velocities)
+        shape = drawn.frames_nm.shape[:2]
+        self.chunk = Chunk(
+            drawn.frames_nm,
+            np.zeros(shape, dtype=np.uint16),
+            np.zeros(shape, dtype=np.uint8),
+            np.full(shape, np.nan),
+            drawn.velocities_nm_ps,
+        )
+        self._check(np.arange(shape[0]))
+        for row, tally in enumerate(self.tallies):
+            bad = np.flatnonzero(caught(self.chunk.flags[row]))
+            if len(bad):
+                tally.note_caught(self.chunk.flags[row, bad], self.step + 1 + int(bad[0]))
+
+    def help_rows(self) -> None:
+        """Bring every row through, or say why not."""
+        pending = self._caught_rows()
+        none_passed = {row for row in pending if self._none_passes(row)}
+        for attempt in range(MOST_DRAWS + 1):
+            if attempt:
+                self._draw_again(pending, attempt)
+            wrong = [row for row in pending if attempt == 1 and row in none_passed and self._none_passes(row)]
+            if wrong:
+                self.chunk.failure = (wrong[0], f"two draws gave no frame that passes ({self._reasons(wrong[0])})")
+                return
+            pending = [row for row in pending if not self._settle(row)]
+            if not pending:
+                return
+        first = pending[0]
+        what = f"{MOST_DRAWS} further draws gave no chunk that passes ({self._reasons(first)})"
+        if self.tallies[first].md_in_a_row > MOST_MD_IN_A_ROW:
+            what = f"MD had to finish {MOST_MD_IN_A_ROW} chunks in a row, and {what}"
+        self.chunk.failure = (first, what)
+
+    def judge(self) -> None:
+        """Stop where there is nothing to go on from."""
+        if self.chunk.failure is not None:
+            return
+        for row in range(len(self.last)):
+            if not finite(self.chunk.flags[row, -1]) or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
+                self.chunk.failure = (row, "the model's frames are no longer finite")
+            elif self.plan.guard == "flag" and (self.chunk.flags[row] & np.uint16(INVALID)).all():
+                self.chunk.failure = (row, f"a chunk without one valid frame ({self._reasons(row)})")
+
+    def add_md(self) -> None:
+        """Append a stretch of MD to every row."""
+        assert self.plan.coupling is not None
+        chunk, n = self.chunk, self.plan.n_between
+        starts = chunk.frames_nm[:, -1]
+        added = np.empty((len(starts), n, *starts.shape[1:]), dtype=chunk.frames_nm.dtype)
+        for row, start in enumerate(starts):
+            try:
+                with self.plan.clock.timed("md"):
+                    segment = self.plan.coupling.simulate(start, n, seed=self._seed(row, _BETWEEN_ATTEMPT))
+            except SimulationError as error:
+                chunk.failure = (row, f"MD cannot go on from the last frame of a chunk: {error}")
+                return
+            added[row] = segment.frames_nm
+            if chunk.velocities_nm_ps is not None:
+                chunk.velocities_nm_ps[row] = segment.velocities_nm_ps
+        flags = self.plan.checks.check(added, starts)
+        marks = np.full(flags.shape, MD_BETWEEN, dtype=np.uint8)
+        chunk.frames_nm = np.concatenate([chunk.frames_nm, added], axis=1)
+        chunk.flags = np.concatenate([chunk.flags, flags], axis=1)
+        chunk.marks = np.concatenate([chunk.marks, marks], axis=1)
+        chunk.energies_kj_mol = np.concatenate([chunk.energies_kj_mol, np.full(flags.shape, np.nan)], axis=1)
+
+    def _settle(self, row: int) -> bool:
+        """Do what the guard says about a row that was just drawn; return whether it can stay as it is then."""
+        bad = np.flatnonzero(caught(self.chunk.flags[row]))
+        if not len(bad):
+            self.tallies[row].md_in_a_row = 0
+            return True
+        if self._none_passes(row):
+            return False
+        if self.plan.guard == "repair":
+            return self._repair(row)
+        return self.plan.guard == "fallback" and self._fall_back(row, int(bad[0]))
+
+    def _repair(self, row: int) -> bool:
+        """Relax the caught frames of a row, first to last; return whether all of them are valid then."""
+        assert self.plan.coupling is not None
+        while True:
+            bad = np.flatnonzero(caught(self.chunk.flags[row]))
+            if not len(bad):
+                return True
+            frame = int(bad[0])
+            if self.chunk.marks[row, frame] == REPAIRED:
+                return False
+            try:
+                with self.plan.clock.timed("relax"):
+                    relaxed = self.plan.coupling.relax(self.chunk.frames_nm[row, frame])
+            except SimulationError:
+                return False
+            self.chunk.frames_nm[row, frame] = relaxed.positions_nm
+            self.chunk.marks[row, frame] = REPAIRED
+            self.chunk.energies_kj_mol[row, frame] = np.nan
+            self._check(np.array([row]))
+
+    def _fall_back(self, row: int, first: int) -> bool:
+        """Replace a row from frame `first` on by MD; return whether it could be done."""
+        assert self.plan.coupling is not None
+        tally = self.tallies[row]
+        tally.md_in_a_row += 1
+        if tally.md_in_a_row > MOST_MD_IN_A_ROW:
+            return False
+        n = self.chunk.frames_nm.shape[1] - first
+        try:
+            with self.plan.clock.timed("md"):
+                segment = self.plan.coupling.simulate(
+                    self._history(row, first)[-1], n, seed=self._seed(row, _MD_ATTEMPT)
+                )
+        except SimulationError:
+            return False
+        self._replace(row, first, segment.frames_nm, MD_AFTER_FAILURE)
+        if self.chunk.velocities_nm_ps is not None:
+            self.chunk.velocities_nm_ps[row] = segment.velocities_nm_ps
+        self._check(np.array([row]))
+        return True
+
+    def _draw_again(self, rows: Sequence[int], attempt: int) -> None:
+        """Draw the rows anew, each from its last valid frame, or from where the chunk began once that has failed."""
+        keep = attempt <= _DRAWS_FROM_LAST_VALID
+        firsts = [int(np.argmax(caught(self.chunk.flags[row]))) if keep else 0 for row in rows]
+        histories = np.stack([self._history(row, first) for row, first in zip(rows, firsts, strict=True)])
+        velocities = None
+        if self.chunk.velocities_nm_ps is not None:
+            velocities = np.full((len(rows), *self.last.shape[2:]), np.nan)
+            for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+                if first == 0 and self.velocities is not None:
+                    velocities[k] = self.velocities[row]
+        with self.plan.clock.timed("draw again"):
+            drawn = self.plan.sampler.draw(histories, self._seeds(rows, attempt), velocities)
+        for k, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+            self.tallies[row].draws += 1
+            self._replace(row, first, drawn.frames_nm[k, : drawn.frames_nm.shape[1] - first], DRAWN_AGAIN)
+            if self.chunk.velocities_nm_ps is not None and drawn.velocities_nm_ps is not None:
+                # Those of the draw belong to its last frame, which is cut off where the row began before it.
+                self.chunk.velocities_nm_ps[row] = drawn.velocities_nm_ps[k] if first == 0 else np.nan
+        self._check(np.asarray(rows))
+
+    def _replace(self, row: int, first: int, frames_nm: FloatArray, mark: int) -> None:
+        self.chunk.frames_nm[row, first:] = frames_nm
+        self.chunk.marks[row, first:] = mark
+        self.chunk.energies_kj_mol[row, first:] = np.nan
+
+    def _history(self, row: int, first: int) -> FloatArray:
+        """The frames `(n_conditioning, n_atoms, 3)` before frame `first` of a row."""
+        n = self.last.shape[1]
+        return np.concatenate([self.last[row], self.chunk.frames_nm[row, :first]])[-n:]
+
+    def _check(self, rows: npt.NDArray[np.int64]) -> None:
+        with self.plan.clock.timed("check"):
+            frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
+            self.chunk.flags[rows] = self.plan.checks.check(frames, before, from_start=self.step == 0)
+        if self.plan.energy_every:
+            with self.plan.clock.timed("energy"):
+                for row in rows.tolist():
+                    self._check_energies(row)
+
+    def _check_energies(self, row: int) -> None:
+        """Flag frames whose turn it is and whose energy, after stiff bonds are relaxed, no MD reaches."""
+        assert self.plan.coupling is not None
+        steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
+        energies = self.chunk.energies_kj_mol[row]
+        for k in np.flatnonzero((steps % self.plan.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
+            if np.isnan(energies[k]):
+                try:
+                    energies[k] = self.plan.coupling.relax(self.chunk.frames_nm[row, k]).potential_kj_mol
+                except SimulationError:
+                    energies[k] = np.inf
+            if energies[k] > self.plan.coupling.energy_limit_kj_mol:
+                self.chunk.flags[row, k] |= np.uint16(ENERGY)
+
+    def _caught_rows(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(caught(self.chunk.flags).any(axis=1)).tolist()
+        for row, tally in enumerate(self.tallies):
+            if row not in rows:
+                tally.md_in_a_row = 0
+        return rows
+
+    def _none_passes(self, row: int) -> bool:
+        return bool(caught(self.chunk.flags[row]).all())
+
+    def _reasons(self, row: int) -> str:
+        return ", ".join(flag_names(int(np.bitwise_or.reduce(self.chunk.flags[row]))))
+
+    def _seed(self, row: int, attempt: int) -> int:
+        return noise_seed(self.plan.seed, row, self.number, attempt)
+
+    def _seeds(self, rows: Sequence[int] | range, attempt: int) -> list[int]:
+        return [self._seed(row, attempt) for row in rows]
