@@ -11,8 +11,10 @@ import numpy as np
 
 from surrogate.judge import curves, metrics, relaxation, verdict
 from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
-from surrogate.judge.curves import Chart, Curves
+from surrogate.judge.charts import Chart
+from surrogate.judge.curves import Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags
+from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
@@ -74,7 +76,7 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything a report says, and nothing that needs computing."""
+    """Everything a report says, and nothing that needs computing. `movies`: one per judgement, for the viewer."""
 
     scene_name: str
     formula: str
@@ -87,12 +89,12 @@ class Comparison:
     notes: tuple[str, ...]
     options: Options
     versions: dict[str, str]
+    movies: tuple[Movie, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""
-        plain: dict[str, Any] = _jsonable(
-            {k: v for k, v in vars(self).items() if k not in ("judgements", "reference", "replicate", "options")}
-        )
+        apart = ("judgements", "reference", "replicate", "options", "movies")
+        plain: dict[str, Any] = _jsonable({k: v for k, v in vars(self).items() if k not in apart})
         plain["reference"] = _jsonable(asdict(self.reference))
         plain["replicate"] = None if self.replicate is None else _jsonable(asdict(self.replicate))
         plain["options"] = _jsonable(asdict(self.options))
@@ -171,6 +173,10 @@ def compare(
         notes=tuple(dict.fromkeys(notes)),
         options=chosen,
         versions=_versions(),
+        movies=tuple(
+            make_movie(thinned[0], rolled, measured[0], features, judgement.n_frames)
+            for rolled, features, judgement in zip(thinned[1:], measured[1:], judgements, strict=False)
+        ),
     )
 
 

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from io import StringIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,21 +19,21 @@ from surrogate.judge.distributions import free_energy_kj
 FloatArray = npt.NDArray[np.float64]
 
 MAP_MAX_KJ = 20.0
-_MAP_SIZE, _CURVE_SIZE = (2.95, 2.5), (2.95, 2.3)
+MAP_SIZE, CURVE_SIZE = (2.95, 2.5), (2.95, 2.3)
 DIFFERENCE_MAX_KJ = 4.0
 # The two ends of the difference map, in words: high (too rare) and low (too frequent).
 DIFFERENCE_COLOURS = ("orange", "purple")
 _MIN_COUNT = 5
 # Stand-ins that matplotlib carries through; each becomes a CSS variable in the finished SVG.
-_TEXT, _CANDIDATE, _REPLICATE, _FAULT, _STRAINED, _LINE, _EMPTY = (f"#01010{i}" for i in range(1, 8))
+TEXT, CANDIDATE, REPLICATE, FAULT, STRAINED, LINE, EMPTY = (f"#01010{i}" for i in range(1, 8))
 _VARIABLES = {
-    _TEXT: "currentColor",
-    _CANDIDATE: "var(--candidate)",
-    _REPLICATE: "var(--replicate)",
-    _FAULT: "var(--fault)",
-    _STRAINED: "var(--strained)",
-    _LINE: "var(--line)",
-    _EMPTY: "var(--map-empty)",
+    TEXT: "currentColor",
+    CANDIDATE: "var(--candidate)",
+    REPLICATE: "var(--replicate)",
+    FAULT: "var(--fault)",
+    STRAINED: "var(--strained)",
+    LINE: "var(--line)",
+    EMPTY: "var(--map-empty)",
 }
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -41,18 +41,25 @@ _STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.facecolor": "none",
     "font.family": "sans-serif",
-    "axes.edgecolor": _LINE,
-    "axes.labelcolor": _TEXT,
-    "text.color": _TEXT,
-    "xtick.color": _TEXT,
-    "ytick.color": _TEXT,
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": TEXT,
+    "text.color": TEXT,
+    "xtick.color": TEXT,
+    "ytick.color": TEXT,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "lines.linewidth": 1.6,
 }
 
 
-def _draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None]) -> str:
+class Figure(NamedTuple):
+    """One SVG with its caption."""
+
+    svg: str
+    caption: str
+
+
+def draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None]) -> str:
     """Return one SVG of `size` inches; `paint(figure, axes)` draws it. Nothing of matplotlib's global state is kept."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -74,6 +81,16 @@ def _draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], Non
     return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(title, quote=True)}"', 1)
 
 
+def _visible(colours: str) -> Any:
+    """Return a colour map without its darkest ends where it diverges: they would vanish on a dark page."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    if colours != "PuOr_r":
+        return colormaps[colours]
+    return ListedColormap(colormaps[colours](np.linspace(0.14, 0.86, 256)))
+
+
 def _degrees(axes: Any, *, both: bool) -> None:
     ticks = [-180, -90, 0, 90, 180]
     axes.set_xticks(ticks)
@@ -88,9 +105,9 @@ def ramachandran(title: str, counts: FloatArray, temperature_k: float) -> str:
     energy = free_energy_kj(counts, temperature_k)
 
     def paint(figure: Any, axes: Any) -> None:
-        _map(figure, axes, np.clip(energy, 0.0, MAP_MAX_KJ), "viridis_r", (0.0, MAP_MAX_KJ), MAP_MAX_KJ / 4)
+        _torsion_map(figure, axes, np.clip(energy, 0.0, MAP_MAX_KJ), "viridis_r", (0.0, MAP_MAX_KJ), MAP_MAX_KJ / 4)
 
-    return _draw(title, _MAP_SIZE, paint)
+    return draw(title, MAP_SIZE, paint)
 
 
 def difference(title: str, data: RamachandranMap, temperature_k: float) -> str:
@@ -98,35 +115,60 @@ def difference(title: str, data: RamachandranMap, temperature_k: float) -> str:
 
     Bins with fewer than 5 counts on both sides are noise and stay empty.
     """
-    rt_kj = 8.31446261815324e-3 * temperature_k
-    p_reference = data.reference / max(data.reference.sum(), 1.0)
-    p_candidate = data.candidate / max(data.candidate.sum(), 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change = -rt_kj * np.log(p_candidate / p_reference)
-    enough = np.maximum(data.reference, data.candidate) >= _MIN_COUNT
-    change = np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan)
+    change, limit = difference_kj(data.reference, data.candidate, temperature_k)
 
     def paint(figure: Any, axes: Any) -> None:
-        limits = (-DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ)
-        _map(figure, axes, change, "PuOr_r", limits, DIFFERENCE_MAX_KJ / 2)
+        _torsion_map(figure, axes, change, "PuOr_r", (-limit, limit), limit / 2)
 
-    return _draw(title, _MAP_SIZE, paint)
+    return draw(title, MAP_SIZE, paint)
 
 
-def _map(figure: Any, axes: Any, values: FloatArray, colours: str, limits: tuple[float, float], step: float) -> None:
-    axes.set_facecolor(_EMPTY)
+def difference_kj(reference: FloatArray, candidate: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
+    """Return candidate minus reference in kJ/mol, cut off at the second number; NaN where there are too few counts."""
+    rt_kj = 8.31446261815324e-3 * temperature_k
+    p_reference, p_candidate = (counts / max(counts.sum(), 1.0) for counts in (reference, candidate))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = -rt_kj * np.log(p_candidate / p_reference)
+    enough = np.maximum(reference, candidate) >= _MIN_COUNT
+    return np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan), DIFFERENCE_MAX_KJ
+
+
+def map_caption() -> str:
+    """Return what a difference map shows."""
+    rare, often = DIFFERENCE_COLOURS
+    return f"Candidate minus reference: {rare} where the candidate comes too rarely, {often} where too often"
+
+
+def _torsion_map(
+    figure: Any, axes: Any, values: FloatArray, colours: str, limits: tuple[float, float], step: float
+) -> None:
+    paint_map(figure, axes, values, colours, limits, step, (-180, 180, -180, 180))
+    _degrees(axes, both=True)
+    axes.set_xlabel("φ / °")
+    axes.set_ylabel("ψ / °", labelpad=-5)
+
+
+def paint_map(
+    figure: Any,
+    axes: Any,
+    values: FloatArray,
+    colours: str,
+    limits: tuple[float, float],
+    step: float,
+    extent: tuple[float, float, float, float],
+) -> None:
+    """Paint `values (n_x, n_y)` kJ/mol over `extent` (left, right, bottom, top) with a colour bar; NaN stays empty."""
+    axes.set_facecolor(EMPTY)
     image = axes.imshow(
         values.T,
         origin="lower",
-        extent=(-180, 180, -180, 180),
-        cmap=colours,
+        extent=extent,
+        aspect="auto",
+        cmap=_visible(colours),
         vmin=limits[0],
         vmax=limits[1],
         interpolation="nearest",
     )
-    _degrees(axes, both=True)
-    axes.set_xlabel("φ / °")
-    axes.set_ylabel("ψ / °", labelpad=-5)
     bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
     bar.outline.set_visible(False)
     bar.set_ticks(np.arange(limits[0], limits[1] + 0.5 * step, step).tolist())
@@ -137,21 +179,19 @@ def correlation(data: CorrelationCurve) -> str:
     """Return the autocorrelation curves with their 95 % bands."""
 
     def paint(figure: Any, axes: Any) -> None:
-        axes.axhline(0.0, color=_LINE, linewidth=0.8)
-        axes.fill_between(data.lag_ps, data.reference_low, data.reference_high, color=_TEXT, alpha=0.15, linewidth=0)
-        axes.fill_between(
-            data.lag_ps, data.candidate_low, data.candidate_high, color=_CANDIDATE, alpha=0.2, linewidth=0
-        )
-        axes.plot(data.lag_ps, data.reference, color=_TEXT)
-        axes.plot(data.lag_ps, data.replicate, color=_REPLICATE, linestyle=(0, (4, 2)))
-        axes.plot(data.lag_ps, data.candidate, color=_CANDIDATE)
+        axes.axhline(0.0, color=LINE, linewidth=0.8)
+        axes.fill_between(data.lag_ps, data.reference_low, data.reference_high, color=TEXT, alpha=0.15, linewidth=0)
+        axes.fill_between(data.lag_ps, data.candidate_low, data.candidate_high, color=CANDIDATE, alpha=0.2, linewidth=0)
+        axes.plot(data.lag_ps, data.reference, color=TEXT)
+        axes.plot(data.lag_ps, data.replicate, color=REPLICATE, linestyle=(0, (4, 2)))
+        axes.plot(data.lag_ps, data.candidate, color=CANDIDATE)
         axes.set_xlim(0, data.lag_ps[-1])
         lowest = np.nanmin(np.concatenate([data.reference, np.nan_to_num(data.candidate), [-0.05]]))
         axes.set_ylim(max(1.1 * float(lowest), -1.0), 1.02)
         axes.set_xlabel("lag / ps")
         axes.set_ylabel("C(lag)")
 
-    return _draw(f"Autocorrelation of {data.label}", _CURVE_SIZE, paint)
+    return draw(f"Autocorrelation of {data.label}", CURVE_SIZE, paint)
 
 
 def histogram(data: Histogram) -> str:
@@ -160,9 +200,9 @@ def histogram(data: Histogram) -> str:
 
     def paint(figure: Any, axes: Any) -> None:
         for values, colour, style in (
-            (data.reference, _TEXT, "solid"),
-            (data.replicate, _REPLICATE, (0, (4, 2))),
-            (data.candidate, _CANDIDATE, "solid"),
+            (data.reference, TEXT, "solid"),
+            (data.replicate, REPLICATE, (0, (4, 2))),
+            (data.candidate, CANDIDATE, "solid"),
         ):
             axes.stairs(
                 values / scale,
@@ -180,7 +220,7 @@ def histogram(data: Histogram) -> str:
         axes.set_ylabel("density")
         axes.set_yticks([])
 
-    return _draw(f"Distribution of {data.label}", _CURVE_SIZE, paint)
+    return draw(f"Distribution of {data.label}", CURVE_SIZE, paint)
 
 
 def timeline(data: Timeline) -> str:
@@ -190,18 +230,18 @@ def timeline(data: Timeline) -> str:
         unit, scale = ("ns", 1e-3) if data.edges_ps[-1] >= 2000 else ("ps", 1.0)
         edges = data.edges_ps * scale
         top = 100.0 * float((data.invalid + data.strained).max())
-        axes.stairs(100 * (data.invalid + data.strained), edges, fill=True, color=_STRAINED)
-        axes.stairs(100 * data.invalid, edges, fill=True, color=_FAULT)
+        axes.stairs(100 * (data.invalid + data.strained), edges, fill=True, color=STRAINED)
+        axes.stairs(100 * data.invalid, edges, fill=True, color=FAULT)
         for at in data.chunks_ps[1:]:
-            axes.axvline(at * scale, color=_LINE, linewidth=0.5)
+            axes.axvline(at * scale, color=LINE, linewidth=0.5)
         for at in data.segments_ps[1:]:
-            axes.axvline(at * scale, color=_TEXT, linewidth=0.9, linestyle=(0, (1, 1)))
+            axes.axvline(at * scale, color=TEXT, linewidth=0.9, linestyle=(0, (1, 1)))
         axes.set_xlim(edges[0], edges[-1])
         axes.set_ylim(0, 1.1 * top if top > 0 else 1.0)
         axes.set_xlabel(f"time, segments end to end / {unit}")
         axes.set_ylabel("frames / %")
 
-    return _draw(f"Faulty frames of {data.label} along time", _CURVE_SIZE, paint)
+    return draw(f"Faulty frames of {data.label} along time", CURVE_SIZE, paint)
 
 
 def by_position(data: Timeline) -> str:
@@ -209,10 +249,10 @@ def by_position(data: Timeline) -> str:
 
     def paint(figure: Any, axes: Any) -> None:
         place = np.arange(len(data.by_position) + 1)
-        axes.stairs(100 * data.by_position, place, fill=True, color=_FAULT)
+        axes.stairs(100 * data.by_position, place, fill=True, color=FAULT)
         axes.set_xlim(0, place[-1])
         axes.set_ylim(0, 110 * float(data.by_position.max()) or 1.0)
         axes.set_xlabel("frame within its chunk")
         axes.set_ylabel("invalid frames / %")
 
-    return _draw(f"Invalid frames of {data.label} by place in the chunk", _CURVE_SIZE, paint)
+    return draw(f"Invalid frames of {data.label} by place in the chunk", CURVE_SIZE, paint)

@@ -13,14 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import report
+from surrogate.judge import report, wording
+from surrogate.judge.cards import side_by_side
+from surrogate.judge.charts import BarChart, Landscape, Line, LineChart
 from surrogate.judge.comparison import Comparison, compare
 from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.markdown import to_markdown
+from surrogate.judge.pictures import Album, albums
 from surrogate.judge.report import write_report
 from surrogate.judge.statistics import Estimate
 from systems.errors import InputError, StorageError
 
-VOID = {"meta", "link", "br", "img", "hr"}
+VOID = {"meta", "link", "br", "img", "hr", "input"}
 
 
 class Page(HTMLParser):
@@ -66,15 +70,15 @@ def comparison(simulate: Callable[..., Ensemble]) -> Comparison:
 
 @pytest.fixture(scope="module")
 def written(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, object]]:
-    html, beside = write_report(comparison, tmp_path_factory.mktemp("report") / "report.html")
-    return html.read_text("utf-8"), json.loads(beside.read_text("utf-8"))
+    files = write_report(comparison, tmp_path_factory.mktemp("report") / "report.html")
+    return files.html.read_text("utf-8"), json.loads(files.json.read_text("utf-8"))
 
 
 def test_page_is_well_formed_and_asks_for_nothing(written: tuple[str, dict[str, object]]) -> None:
     page = Page(written[0])
     assert not page.open
     assert all(a.startswith(("#", "data:")) for a in page.addresses), page.addresses
-    assert "script" not in page.tags
+    assert "default-src 'none'" in written[0]
     without_namespaces = re.sub(r'xmlns(:\w+)?="[^"]*"', "", written[0])
     assert not re.search(r"https?://|@import|url\((?!#)", without_namespaces)
 
@@ -117,6 +121,65 @@ def test_json_is_strict_and_holds_every_row_and_curve(
     assert data["replicate"] is not None
 
 
+def test_candidates_stand_side_by_side(written: tuple[str, dict[str, object]], comparison: Comparison) -> None:
+    lines = side_by_side(comparison)
+    keys = {row.key for judgement in comparison.judgements for row in judgement.rows}
+    assert {line.first.key for line in lines} == keys and len(lines) == len(keys)
+    for line in lines:
+        for judgement, row in zip(comparison.judgements, line.rows, strict=True):
+            assert row in (*judgement.rows, None)
+    seams = next(line for line in lines if line.first.key == "chunk_step")
+    assert seams.rows[0] is None and seams.rows[1] is not None
+    html = written[0]
+    assert html.index('id="side-by-side"') < html.index('id="candidate-1"') < html.index('id="candidate-2"')
+
+
+def test_markdown_has_the_verdicts_every_row_and_no_markup_from_outside(comparison: Comparison) -> None:
+    text = to_markdown(comparison, command="surromd compare a b")
+    assert "<script>" not in text and "&lt;script>alert(1)&lt;/script>" in text
+    assert text.index("Broken: 2 % of frames") < text.index("## Side by side") < text.index("| Metric |")
+    cells = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    for judgement in comparison.judgements:
+        for row in judgement.rows:
+            shown = f"{wording.number(row.candidate)} {wording.interval(row.candidate)}".strip()
+            assert any(shown in line and any(f"{wording.MARKS[row.verdict]} {row.verdict}" in c for c in line)
+                       for line in cells), row.key  # fmt: skip
+    assert all(len(line) == len(cells[k - 1]) or cells[k - 1][0] != line[0] for k, line in enumerate(cells) if k > 1)
+    assert "surromd compare a b" in text
+
+
+def test_markdown_goes_beside_the_page(comparison: Comparison, tmp_path: Path) -> None:
+    files = write_report(comparison, tmp_path / "r.html")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r.html", "r.json", "r.md"]
+    assert files.markdown.read_text("utf-8").startswith("# alanine-dipeptide (C6H12N2O2, 22 atoms) against")
+
+
+def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> None:
+    x = np.linspace(1.0, 10.0, 5)
+    counts = np.random.default_rng(0).poisson(20.0, (8, 6)).astype(float)
+    charts = (
+        LineChart("forecast", "Forecast <error>", "against time", "time / ps", "ADE / nm",
+                  (Line("reference", "reference", x, x**2, x**2 - 1, x**2 + 1), Line("frozen", "other", x, 0 * x + 3)),
+                  log_y=True),
+        Landscape("kinetics", "TIC 0 and 1", "TIC 0", "TIC 1", np.linspace(-2, 2, 9), np.linspace(-1, 1, 7),
+                  counts, counts.T.reshape(8, 6), counts),
+        BarChart("experiment", "Couplings", "J(HN,HA)", "Hz", ("ALA 2", "ALA 3"), x[:2], x[1:3], x[:2],
+                 x[:2] - 0.1, x[:2] + 0.1, x[1:3] - 0.2, x[1:3] + 0.2),
+    )  # fmt: skip
+    first = comparison.judgements[0]
+    with_charts = replace(first, curves=replace(first.curves, charts=charts))
+    plain = {a.title: a for a in albums(first, 300.0)}
+    drawn = {a.title: a for a in albums(with_charts, 300.0)}
+    assert len(drawn["Forecast error"].figures) == len(plain.get("Forecast error", Album("", [], "")).figures) + 1
+    assert len(drawn["How fast things move"].figures) == len(plain["How fast things move"].figures) + 4
+    figure = drawn["Forecast error"].figures[-1]
+    assert figure.caption == "Forecast <error>: against time" and 'aria-label="Forecast &lt;error&gt;"' in figure.svg
+    assert "frozen" in figure.svg and "#0101" not in figure.svg
+    records = with_charts.curves.to_dict()["charts"]
+    assert [r["type"] for r in records] == ["LineChart", "Landscape", "BarChart"]
+    assert records[0]["lines"][0]["y"] == pytest.approx((x**2).tolist(), rel=1e-5)
+
+
 def test_same_input_same_page(comparison: Comparison) -> None:
     once = replace(comparison, judgements=comparison.judgements[1:])
     assert report.render(once, command="x") == report.render(once, command="x")
@@ -154,16 +217,16 @@ def test_a_full_disk_leaves_the_old_report_alone(
 
 
 def test_numbers_show_as_many_digits_as_they_have() -> None:
-    assert report.number(Estimate(0.12345, error=0.02)) == "0.123"
-    assert report.number(Estimate(123.456, error=20.0)) == "123"
-    assert report.number(Estimate(99.9871, error=0.002)) == "99.987"
-    assert report.number(Estimate(float("nan"))) == "not defined"
-    assert report.number(None) == "–"
-    assert report.interval(Estimate(1.0, 0.9, 1.1, 0.05)) == "[0.900, 1.100]"
-    assert report.interval(Estimate(1.0, 1.0, 1.0, 0.0)) == ""
-    assert report.setting("temperature_k", 300.0) == "temperature 300 K"
-    assert report.setting("friction_per_ps", 1.0) == "friction 1 /ps"
-    assert report.setting("force_field", "ff14SB") == "force field ff14SB"
+    assert wording.number(Estimate(0.12345, error=0.02)) == "0.123"
+    assert wording.number(Estimate(123.456, error=20.0)) == "123"
+    assert wording.number(Estimate(99.9871, error=0.002)) == "99.987"
+    assert wording.number(Estimate(float("nan"))) == "not defined"
+    assert wording.number(None) == "–"
+    assert wording.interval(Estimate(1.0, 0.9, 1.1, 0.05)) == "[0.900, 1.100]"
+    assert wording.interval(Estimate(1.0, 1.0, 1.0, 0.0)) == ""
+    assert wording.setting("temperature_k", 300.0) == "temperature 300 K"
+    assert wording.setting("friction_per_ps", 1.0) == "friction 1 /ps"
+    assert wording.setting("force_field", "ff14SB") == "force field ff14SB"
 
 
 def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:
@@ -176,6 +239,6 @@ def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     made = [Ensemble(f"w{k}", [(positions + rng.normal(0, 0.002, (500, 3, 3))).astype(np.float32)], 0.5, water)
             for k in range(2)]  # fmt: skip
-    html, _ = write_report(compare(made[0], [made[1]]), tmp_path / "water.html")
-    text = html.read_text("utf-8")
+    written = write_report(compare(made[0], [made[1]]), tmp_path / "water.html")
+    text = written.html.read_text("utf-8")
     assert "the scene has no φ or ψ torsion" in text and not Page(text).open

@@ -1,0 +1,86 @@
+"""Numbers as people read them: shared by the HTML page, the Markdown and the cards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from surrogate.judge.rows import Row
+from surrogate.judge.statistics import Estimate
+
+MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?"}
+STATUS_MARKS = {"indistinguishable": "✓", "close": "≈", "different": "✗", "broken": "‼", "undecided": "?"}
+GROUP_TITLES = {
+    "validity": "Validity of frames",
+    "structure": "Structure",
+    "populations": "Populations",
+    "distributions": "Distributions",
+    "kinetics": "Kinetics",
+    "forecast": "Forecast",
+    "experiment": "To lay beside experiment",
+    "energies": "Energies",
+}
+_SEVERITY = ("agrees", "undecided", "close", "differs", "fails")
+_UNITS = {"_per_ps": "/ps", "_k": "K", "_ps": "ps", "_da": "Da", "_nm": "nm", "_s": "s"}
+
+
+def number(estimate: Estimate | None) -> str:
+    """Return the value, with as many digits as its error leaves meaningful (one more than the first uncertain one)."""
+    if estimate is None:
+        return "–"
+    value, error = estimate.value, estimate.error
+    if not math.isfinite(value):
+        return "not defined"
+    if math.isfinite(error) and error > 0:
+        decimals = min(max(1 - math.floor(math.log10(error)), 0), 4 if abs(value) < 10 else 3)
+        return f"{value:.{decimals}f}"
+    return f"{value:.4g}"
+
+
+def interval(estimate: Estimate | None) -> str:
+    """Return the 95 % interval in brackets, or an empty string."""
+    if estimate is None or not (math.isfinite(estimate.low) and math.isfinite(estimate.high)):
+        return ""
+    if estimate.low == estimate.high:
+        return ""
+    low = number(Estimate(estimate.low, error=estimate.error))
+    high = number(Estimate(estimate.high, error=estimate.error))
+    return f"[{low}, {high}]"
+
+
+def plain(estimate: Estimate | None) -> str:
+    """Return a ratio with two or three digits."""
+    if estimate is None or not math.isfinite(estimate.value):
+        return "–"
+    return f"{estimate.value:.2f}" if estimate.value < 10 else f"{estimate.value:.3g}"
+
+
+def sort_key(estimate: Estimate | None) -> str:
+    """Return the number that a table sorts by; empty where there is none."""
+    return "" if estimate is None or not math.isfinite(estimate.value) else f"{estimate.value:.9g}"
+
+
+def setting(key: str, value: object) -> str:
+    """Return an entry of a record for people: ('temperature_k', 300.0) -> 'temperature 300 K'."""
+    shown = f"{value:g}" if isinstance(value, float) else str(value)
+    for ending, unit in _UNITS.items():
+        if key.endswith(ending):
+            return f"{key.removesuffix(ending).replace('_', ' ')} {shown} {unit}"
+    return f"{key.replace('_', ' ')} {shown}"
+
+
+def per_day(ns_per_day: float | None) -> str:
+    """Return a speed, or that it is not recorded."""
+    if ns_per_day is None:
+        return "not recorded"
+    return f"{ns_per_day / 1000:.3g} µs/day" if ns_per_day >= 1000 else f"{ns_per_day:.3g} ns/day"
+
+
+def severity(row: Row) -> int:
+    """Return how bad a row's word is, 0 for 'agrees'."""
+    return _SEVERITY.index(row.verdict)
+
+
+def worst(rows: Sequence[Row]) -> Row | None:
+    """Return the row with the worst word, among equals the one with the greatest value; None for no rows."""
+    return max(rows, key=lambda r: (severity(r), r.candidate.value), default=None)
