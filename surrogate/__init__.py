@@ -1,7 +1,8 @@
 """Learned simulators, the judge that compares them with the truth, and the command line.
 
 `import surrogate as sm; sm.rollout(scene, weights, out, time_ps=...)`: the verbs of `surrogate.api`, loaded on use
-(PEP 562), so that importing the package costs nothing.
+(PEP 562), so that importing the package costs nothing. Beside them `sm.Simulation`, a surrogate that OpenMM's reporters
+take for `openmm.app.Simulation`, and `sm.to_mdtraj` and `sm.to_mdanalysis`, trajectories as these libraries' objects.
 """
 
 from __future__ import annotations
@@ -10,17 +11,42 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from surrogate.api import campaign, compare, demo, info, plan, reference, rollout, systems, train, windows
+    from surrogate.sampling.simulation import Simulation
+    from systems.converted import to_mdanalysis, to_mdtraj
 
 __version__ = "0.1.0"
 
-__all__ = ["campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows"]
+_VERBS = ("campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows")
+_ELSEWHERE = {
+    "Simulation": "surrogate.sampling.simulation",
+    "to_mdanalysis": "systems.converted",
+    "to_mdtraj": "systems.converted",
+}
+
+__all__ = [
+    "Simulation",
+    "campaign",
+    "compare",
+    "demo",
+    "info",
+    "plan",
+    "reference",
+    "rollout",
+    "systems",
+    "to_mdanalysis",
+    "to_mdtraj",
+    "train",
+    "windows",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        from surrogate import api
+    from importlib import import_module
 
-        return getattr(api, name)
+    if name in _VERBS:
+        return getattr(import_module("surrogate.api"), name)
+    if name in _ELSEWHERE:
+        return getattr(import_module(_ELSEWHERE[name]), name)
     raise AttributeError(f"module 'surrogate' has no attribute {name!r}")
 
 

@@ -13,9 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from surrogate.data.shipped import weights_path
 from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, find_trajectories, guarded_outputs
 from surrogate.progress import progress_bar
-from systems.errors import InputError, UnknownNameError, nearest
+from systems.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:
     from md_reference.simulate import MDConfig
@@ -232,6 +233,11 @@ def reference(
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
         progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
+
+        def preparing(share: float) -> None:
+            if progress is not None:
+                progress(round(1000 * share), 1000, "equilibrating" if share else "minimising")
+
         return simulate_replicas(
             molecule,
             replace(
@@ -243,6 +249,7 @@ def reference(
             resume=resume,
             overwrite=overwrite,
             progress=progress,
+            preparing=preparing,
             announce=None if quiet else lambda line: _tell(molecule.name, line),
         )
 
@@ -397,7 +404,7 @@ def compare(
     lag_ps: float | None = None,
     labels: Sequence[str] | None = None,
 ) -> Comparison:
-    """Judge candidates against a reference, write the report (NAME.html and NAME.json) and return the comparison.
+    """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
     The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other. `top`: topology for
@@ -585,22 +592,3 @@ def _device(device: str) -> str:
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return device
-
-
-def weights_path(weights: PathLike) -> Path:
-    """Return the file of shipped weights by name, or the path itself.
-
-    Raises UnknownNameError (with the nearest name) or InputError when there is no such file.
-    """
-    path = Path(weights)
-    if path.suffix == ".safetensors" or path.exists():
-        if not path.is_file():
-            raise InputError(f"{path}: no such weights file.")
-        return path
-    shipped = {p.stem: p for p in sorted((Path(__file__).parent / "pretrained").glob("*.safetensors"))}
-    if str(weights) not in shipped:
-        raise UnknownNameError(
-            f"no weights are called {str(weights)!r}; shipped: {', '.join(shipped) or 'none'}."
-            f"{nearest(str(weights), list(shipped))} A trained file is named by its path (.safetensors)."
-        )
-    return shipped[str(weights)]
