@@ -406,7 +406,7 @@ def compare(
     candidates: Annotated[
         list[str], typer.Argument(metavar="TRAJ...", help="Each argument one candidate, written alike.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; its numbers go to .json.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; .json, .md go beside it.")] = Path(
         "report.html"
     ),
     replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
