@@ -15,7 +15,7 @@ from md_reference.forcefield import resolve
 from md_reference.parent_watch import end_with_parent
 from md_reference.platforms import PlatformChoice, measured_platform
 from md_reference.run_config import MDConfig, check_run
-from md_reference.simulate import checkpoint_path, simulate
+from md_reference.simulate import PreparingFn, checkpoint_path, simulate
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -44,16 +44,18 @@ def simulate_replicas(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
+    preparing: PreparingFn | None = None,
     announce: Callable[[str], None] | None = None,
     workers: int | None = None,
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
-    small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in one
-    line. Ctrl-C and SIGTERM stop them all with
-    checkpoints: KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises
-    SimulationError with the first replica's reason when the others have ended; finished replicas stay on disk.
+    small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in
+    one line; `preparing` the share of the equilibration that is done, until there are frames to count. Ctrl-C and
+    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
+    themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
+    stay on disk.
     """
     for out in outs:
         check_run(scene, config, out)
@@ -78,12 +80,12 @@ def simulate_replicas(
 
             announce(line_of_run(scene, config, choice, replicas=len(outs)))
     if len(outs) == 1:
-        return [
-            simulate(scene, configs[0], outs[0], resume=resume, overwrite=overwrite, progress=progress, choice=choice)
-        ]
+        how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
+        return [simulate(scene, configs[0], outs[0], progress=progress, preparing=preparing, **how)]
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
     done = context.Array("Q", len(outs), lock=False)
+    equilibrated = context.Array("d", len(outs), lock=False)
     errors = context.Queue()
     waiting = list(range(len(outs)))
     running: dict[int, Any] = {}
@@ -94,14 +96,28 @@ def simulate_replicas(
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    args = (scene.to_dict(), configs[k], str(outs[k]), resume, overwrite, choice, done, k, errors)
+                    args = (
+                        scene.to_dict(),
+                        configs[k],
+                        str(outs[k]),
+                        resume,
+                        overwrite,
+                        choice,
+                        done,
+                        equilibrated,
+                        k,
+                        errors,
+                    )
                     running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
                     running[k].start()
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
-                if progress is not None:
-                    progress(int(sum(done[:])), config.n_frames * len(outs))
+                n_done = int(sum(done[:]))
+                if n_done == 0 and preparing is not None:
+                    preparing(sum(equilibrated[:]) / len(outs))
+                elif progress is not None:
+                    progress(n_done, config.n_frames * len(outs))
                 for k in [k for k, process in running.items() if not process.is_alive()]:
                     process = running.pop(k)
                     process.join()
@@ -137,6 +153,7 @@ def _replica(
     overwrite: bool,
     choice: PlatformChoice | None,
     done: Any,
+    equilibrated: Any,
     k: int,
     errors: Any,
 ) -> None:
@@ -146,10 +163,12 @@ def _replica(
     def report(frames: int, _: int) -> None:
         done[k] = frames
 
+    def prepare(share: float) -> None:
+        equilibrated[k] = share
+
+    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
     try:
-        simulate(
-            Scene.from_dict(scene), config, out, resume=resume, overwrite=overwrite, progress=report, choice=choice
-        )
+        simulate(Scene.from_dict(scene), config, out, progress=report, preparing=prepare, **how)
     except SurromdError as error:
         errors.put((k, str(error)))
         raise SystemExit(1) from None

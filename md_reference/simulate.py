@@ -29,6 +29,8 @@ __all__ = ["MDConfig", "checkpoint_path", "simulate"]
 
 # (frames done, frames in all) -> None, called after each block that is on disk.
 ProgressFn = Callable[[int, int], None]
+# Share of the equilibration that is done -> None; 0 while minimising.
+PreparingFn = Callable[[float], None]
 
 # Python sees Ctrl-C only between calls of OpenMM: about so long may pass until it does.
 _SIGNAL_S = 0.25
@@ -44,6 +46,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
+    preparing: PreparingFn | None = None,
     checkpoint_every_s: float = 20.0,
     max_threads: int = 1,
     choice: PlatformChoice | None = None,
@@ -78,6 +81,7 @@ def simulate(
     run = _Run(scene, config, out, checkpoint_every_s, header, overwrite=overwrite)
     with deferred_interrupt() as asked_to_stop:
         run.asked_to_stop = asked_to_stop
+        run.preparing = preparing or run.preparing
         run.prepare(choice, max_threads)
         engine = run.resumed(blob) if header and not equilibrating else run.equilibrated(blob)
         with engine, open_writer(
@@ -105,6 +109,7 @@ class _Run:
         self.checkpoint_every_s, self.header, self.overwrite = checkpoint_every_s, header, overwrite
         self.resuming = bool(header) and "equilibrated_steps" not in header
         self.asked_to_stop: Callable[[], bool] = lambda: False
+        self.preparing: PreparingFn = lambda _: None
         self.done = int(header.get("n_frames", 0))
         self.steps_into_frame = int(header.get("steps_into_frame", 0))
         self.spent_s = float(header.get("wall_s", 0.0))
@@ -178,6 +183,7 @@ class _Run:
     def _equilibrate(self, engine: Engine, blob: bytes) -> None:
         n_steps = max(1, round(self.config.equilibrate_ps / self.config.timestep_ps))
         done = int(self.header.get("equilibrated_steps", 0))
+        self.preparing(done / n_steps)
         if blob:
             engine.restore(blob)
         else:
@@ -185,6 +191,7 @@ class _Run:
             engine.thermalise()
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
+            self.preparing(done / n_steps)
             stop = self.asked_to_stop()
             if stop or time.monotonic() - self.synced_at > self.checkpoint_every_s:
                 self.save(engine, sync=True, equilibrated_steps=done, overwrite=self.overwrite)

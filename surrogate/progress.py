@@ -10,7 +10,8 @@ _LONGEST = 44
 
 
 class ProgressFn(Protocol):
-    """Called by a running verb with what is done and what there is to do; `note` replaces the default account."""
+    """Called by a running verb with what is done and what there is to do; `note` replaces the default account, as
+    for a stage that comes before what is counted."""
 
     def __call__(self, done: int, total: int, note: str | None = None) -> None: ...
 
@@ -40,22 +41,28 @@ def progress_bar(label: str, *, quiet: bool, ps_per_frame: float | None = None) 
     )
     bar = Progress(*columns, console=Console(stderr=True))
     first: tuple[int, float] | None = None
+    started = False
     task = bar.add_task(label if len(label) <= _LONGEST else label[: _LONGEST - 3] + "...", total=None, note="")
 
     def advance(done: int, total: int, note: str | None = None) -> None:
-        nonlocal first
+        nonlocal first, started
         now = time.monotonic()
+        if not started:
+            started = True
+            bar.start()  # only now, so that input refused by the verb leaves no empty bar behind
+        if note is not None:
+            bar.update(task, completed=done, total=total, note=note)
+            return
         if first is None:
             first = (done, now)
-            bar.start()  # only now, so that input refused by the verb leaves no empty bar behind
+            bar.reset(task, total=total)  # what came before, such as an equilibration, is no guide to the time left
         rate = (done - first[0]) / (now - first[1]) if now > first[1] else 0.0
-        text = _note(done, total, rate, ps_per_frame) if note is None else note
-        bar.update(task, completed=done, total=total, note=text)
+        bar.update(task, completed=done, total=total, note=_note(done, total, rate, ps_per_frame))
 
     try:
         yield advance
     finally:
-        if first is not None:
+        if started:
             bar.stop()
 
 
