@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,12 @@ from systems.geometry import superpose
 from systems.scene import Scene
 from systems.whole_file import create_whole
 
+if TYPE_CHECKING:
+    from systems.trajectory_types import TrajectoryReader
+
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
+_BLOCK = 8192
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
 
 
@@ -26,7 +30,8 @@ class TrainingFrames:
     """Frames of several trajectories of one scene, ready to be cut into windows.
 
     `coordinates` (n_frames, n_atoms, 3) int16 in units of QUANTUM_NM, centred, and superposed on the scene by its
-    heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames.
+    heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames. Frames that
+    carry `velocities` (n_frames, n_atoms, 3) nm/ps have their centre of mass at the origin and at rest.
     """
 
     scene: Scene
@@ -36,6 +41,7 @@ class TrainingFrames:
     canonical: bool
     conditions: dict[str, Any]
     sources: tuple[dict[str, Any], ...]
+    velocities: npt.NDArray[np.float32] | None = None
 
     @property
     def n_frames(self) -> int:
@@ -86,6 +92,8 @@ class TrainingFrames:
                 handle.create_dataset("coordinates", data=self.coordinates, compression="gzip", shuffle=True,
                                       compression_opts=1, chunks=chunks)  # fmt: skip
                 handle.create_dataset("starts", data=self.starts)
+                if self.velocities is not None:
+                    handle.create_dataset("velocities", data=self.velocities, chunks=chunks)
 
         create_whole(Path(path), fill)
 
@@ -105,6 +113,7 @@ def load_frames(path: str | Path) -> TrainingFrames:
                 canonical=header["canonical"],
                 conditions=header["conditions"],
                 sources=tuple(header["sources"]),
+                velocities=handle["velocities"][:] if "velocities" in handle else None,
             )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a windows file of `surromd windows` ({error}).") from error
@@ -120,13 +129,18 @@ def is_windows_file(path: str | Path) -> bool:
         return "surromd_windows" in handle.attrs
 
 
-def collect_frames(paths: list[Path], *, canonical: bool = True) -> TrainingFrames:
-    """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ."""
+def collect_frames(paths: list[Path], *, canonical: bool = True, velocities: bool = False) -> TrainingFrames:
+    """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ.
+
+    With `velocities`, which excludes `canonical`, frames keep their pose and must carry velocities, natural masses'.
+    """
     from systems.trajectory import open_trajectory
 
     if not paths:
         raise InputError("no trajectory given to train on.")
-    blocks, sources, lengths = [], [], []
+    if velocities and canonical:
+        raise InputError("frames with velocities keep their own pose; they cannot be canonical as well.")
+    blocks, sources, lengths, motions = [], [], [], []
     scene: Scene | None = None
     lag_ps, conditions = 0.0, {}
     for path in paths:
@@ -146,17 +160,53 @@ def collect_frames(paths: list[Path], *, canonical: bool = True) -> TrainingFram
             if found != conditions:
                 raise InputError(f"{path} was made under {found}, {paths[0]} under {conditions}.")
             digest = hashlib.sha256()
-            for frames in reader.iter_blocks(8192):
+            for k, frames in enumerate(reader.iter_blocks(_BLOCK)):
                 if not np.isfinite(frames).all():
                     raise InputError(f"{path} holds frames that are not finite; it cannot be trained on.")
-                blocks.append(quantise(canonicalise(frames, scene) if canonical else centre(frames)))
+                if velocities:
+                    moving = _velocities(reader, k * _BLOCK, len(frames))
+                    motions.append(at_rest(moving, scene.masses_da).astype(np.float32))
+                    blocks.append(quantise(at_rest(frames, scene.masses_da)))
+                else:
+                    blocks.append(quantise(canonicalise(frames, scene) if canonical else centre(frames)))
                 digest.update(blocks[-1].tobytes())
             sources.append({"file": Path(path).name, "n_frames": reader.n_frames, "seed": reader.record.get("seed"),
                             "sha256": digest.hexdigest()[:16]})  # fmt: skip
             lengths.append(reader.n_frames)
     assert scene is not None
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    return TrainingFrames(scene, np.concatenate(blocks), starts, lag_ps, canonical, conditions, tuple(sources))
+    return TrainingFrames(
+        scene,
+        np.concatenate(blocks),
+        starts,
+        lag_ps,
+        canonical,
+        conditions,
+        tuple(sources),
+        np.concatenate(motions) if velocities else None,
+    )
+
+
+def _velocities(reader: TrajectoryReader, start: int, n_frames: int) -> npt.NDArray[np.float32]:
+    found = reader.read_velocities(start, start + n_frames)
+    if found is None:
+        raise InputError(
+            f"{reader.path} carries no velocities; make the reference with --save-velocities, or train lam-slide."
+        )
+    if reader.record.get("hydrogen_mass_da") is not None:
+        raise InputError(
+            f"{reader.path} was made with hydrogens of {reader.record['hydrogen_mass_da']:g} Da, so its velocities are "
+            "not the molecule's; make the reference with --hydrogen-mass natural."
+        )
+    if not np.isfinite(found).all():
+        raise InputError(f"{reader.path} holds velocities that are not finite; it cannot be trained on.")
+    return found
+
+
+def at_rest(vectors: npt.NDArray[Any], masses_da: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return positions (or velocities) `(n, n_atoms, 3)` relative to those of the centre of mass."""
+    share = masses_da / masses_da.sum()
+    return vectors - np.einsum("a,nad->nd", share, vectors, dtype=np.float64)[:, None]
 
 
 def canonicalise(frames_nm: npt.NDArray[Any], template: Scene) -> npt.NDArray[Any]:

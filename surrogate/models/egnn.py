@@ -13,7 +13,8 @@ class EgnnLayer(nn.Module):
     """One round of messages: m_ij = MLP(h_i, h_j, kind_ij, d_ij^2), h_i += MLP(h_i, sum_j m_ij),
     x_i += phi_v(h_i) v_i + mean_j (x_i - x_j) phi_x(m_ij), and the same with own factors for the velocity u_i.
 
-    v is the initial velocity, which stays. The last layers of the factors start small: a fresh layer hardly moves.
+    v is the initial velocity, which stays. `reach` scales what is added to x and to u, so that the factors are of
+    order one whatever the horizon; their last layers start small: a fresh layer hardly moves.
     """
 
     def __init__(self, width: int) -> None:
@@ -32,8 +33,10 @@ class EgnnLayer(nn.Module):
             nn.init.xavier_uniform_(factor.weight, gain=0.01)
         nn.init.zeros_(of_own.bias)
 
-    def forward(self, h: Tensor, x: Tensor, u: Tensor, v: Tensor, graph: Graph) -> tuple[Tensor, Tensor, Tensor]:
-        """`h` (b, n, width), positions `x`, velocities `u` and `v` (b, n, 3) -> h, x, u."""
+    def forward(
+        self, h: Tensor, x: Tensor, u: Tensor, v: Tensor, graph: Graph, reach: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """`h` (b, n, width), positions `x`, velocities `u` and `v` (b, n, 3), `reach` (2,) -> h, x, u."""
         difference = x[:, graph.receiver] - x[:, graph.sender]
         squared = difference.square().sum(-1, keepdim=True)
         pre = self.receive(h)[:, graph.receiver] + self.send(h)[:, graph.sender]
@@ -43,8 +46,8 @@ class EgnnLayer(nn.Module):
         pair = self.pair_factor(message).float()
         moved = torch.cat([difference * pair[..., :1], difference * pair[..., 1:]], dim=-1)
         moved = gather_sum(moved, graph.receiver, x.shape[1]) / graph.degree[:, None]
-        x_new = x + own[..., :1] * v + moved[..., :3]
-        u_new = u + own[..., 1:] * v + moved[..., 3:]
+        x_new = x + reach[0] * (own[..., :1] * v + moved[..., :3])
+        u_new = u + reach[1] * (own[..., 1:] * v + moved[..., 3:])
         gathered = gather_sum(message, graph.receiver, x.shape[1])
         return h + self.update(torch.cat([h, gathered], dim=-1)), x_new, u_new
 
@@ -56,11 +59,11 @@ class Egnn(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(EgnnLayer(width) for _ in range(n_layers))
 
-    def forward(self, h: Tensor, x: Tensor, v: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
+    def forward(self, h: Tensor, x: Tensor, v: Tensor, graph: Graph, reach: Tensor) -> tuple[Tensor, Tensor]:
         """Embeddings `(b, n, width)`, positions and velocities `(b, n, 3)` -> positions, velocities `(b, n, 3)`."""
         u = v
         for layer in self.layers:
-            h, x, u = layer(h, x, u, v, graph)
+            h, x, u = layer(h, x, u, v, graph, reach)
         return x, u
 
 

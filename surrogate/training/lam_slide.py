@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import platform
 import shutil
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +13,14 @@ from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.rarity import window_sampler
-from surrogate.data.weights import TrainingDomain, Weights, save_weights
+from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
+from surrogate.training.provenance import provenance_of, training_domain
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
-from systems.limits import limits_from_frames
-from systems.validity import geometry_from_frames
 
 # Share of the whole budget that stage one gets.
 STAGE_ONE_SHARE = 0.2
@@ -230,16 +227,6 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
                      device=device, progress=progress, on_save=on_save)  # fmt: skip
 
 
-def training_domain(frames: TrainingFrames, n_geometry_frames: int = 20_000) -> TrainingDomain:
-    """Return the domain of weights trained on `frames`; its checks are measured on evenly spaced training frames."""
-    starts = frames.window_starts(2, validation=False)
-    picked = starts[np.linspace(0, len(starts) - 1, min(n_geometry_frames, len(starts))).astype(int)]
-    positions = frames.positions_nm(picked)
-    geometry = geometry_from_frames(frames.scene, positions)
-    limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + 1))
-    return TrainingDomain(frames.scene, frames.lag_ps, frames.conditions, geometry.to_dict(), limits.to_dict())
-
-
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
     """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
     name, of = start.path.name, start.domain
@@ -253,17 +240,11 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
 
 def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float,
                 start: Weights | None) -> dict[str, Any]:  # fmt: skip
-    earlier = {} if start is None else {"from": {"hash": start.hash, **start.provenance}}
-    return {
-        **earlier,
-        "trained": datetime.now(UTC).isoformat(timespec="seconds"),
-        "torch": torch.__version__,
-        "machine": platform.machine(),
-        "reference_ns": frames.total_ps * 1e-3,
-        "sources": list(frames.sources),
+    settings = {
         "seed": config.seed,
         "time_reversal": config.time_reversal,
         "rare_draws": config.rare_draws,
         "stage_one_s": round(spent_one, 1),
         "stage_two_s": round(spent_two, 1),
     }
+    return provenance_of(frames, settings, start)

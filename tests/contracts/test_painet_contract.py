@@ -106,21 +106,38 @@ def test_an_attention_step_does_not_raise_the_energy_where_that_is_proved(seed: 
     torch.testing.assert_close(slope, weights, rtol=1e-12, atol=1e-12)
 
 
-def test_the_decoder_alone_sees_bonded_neighbours_only_and_attention_sees_all() -> None:
+def test_the_decoder_sees_neighbours_only_and_attention_sees_all() -> None:
     """Moving one end of a long chain: messages reach two bonds a layer, attention reaches every atom."""
-    molecule = branched_chain(60)
+    model, molecule = lively(SMALL), branched_chain(60)
+    structure = model.structure(molecule)
     x, v = random_state(60, 1, 1)
     moved = v.clone()
     moved[0, 59] += 1.0
+    h, h_moved = (model.embed(x[:, 0], s, molecule.elements) for s in (v, moved))
+    decode = lambda s: model.decoder(h, x[:, 0], s, structure.graph, model.reach)[0]  # noqa: E731
+    decoded = decode(v) - decode(moved)
+    attended = model.steps[0](h, *(args := (molecule.elements, structure.groups))) - model.steps[0](h_moved, *args)
+    assert decoded[0, :40].abs().max() == 0.0
+    assert decoded[0, 59].abs().max() > 1e-3
+    assert attended[0, :40].abs().amax(-1).min() > 1e-6
 
-    def change(model: Painet) -> torch.Tensor:
-        structure = model.structure(molecule)
-        return (model(x[:, 0], moved, structure)[0] - model(x[:, 0], v, structure)[0]).abs().amax((0, 1, 3))
 
-    alone, attended = change(lively(replace(SMALL, attention="none"))), change(lively(SMALL))
-    assert alone[:40].max() == 0.0
-    assert alone[59] > 1e-3
-    assert attended[:40].min() > 1e-8
+def test_the_centre_of_mass_moves_at_its_velocity_and_momentum_is_kept() -> None:
+    model, molecule = lively(SMALL), branched_chain(9)
+    x, v = random_state(9, 2, 1)
+    frames, velocities = model(x[:, 0], v, model.structure(molecule))
+    share = molecule.masses_da / molecule.masses_da.sum()
+    centre = lambda s: (share[:, None] * s).sum(-2)  # noqa: E731
+    for t in range(3):
+        expected = centre(x[:, 0]) + (t + 1) * SMALL.lag_ps * centre(v)
+        torch.testing.assert_close(centre(frames[:, t]), expected, rtol=0, atol=1e-6)
+        torch.testing.assert_close(centre(velocities[:, t]), centre(v), rtol=0, atol=1e-5)
+    # Seen from a moving observer everything moves the other way and nothing else changes.
+    boost = torch.tensor([1.0, -2.0, 0.5])
+    seen, seen_velocities = model(x[:, 0], v + boost, model.structure(molecule))
+    times = SMALL.lag_ps * torch.arange(1, 4)[:, None, None]
+    torch.testing.assert_close(seen, frames + times * boost, rtol=0, atol=2e-6)
+    torch.testing.assert_close(seen_velocities, velocities + boost, rtol=0, atol=1e-5)
 
 
 def test_edges_are_bonds_and_second_neighbours() -> None:

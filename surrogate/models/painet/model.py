@@ -33,15 +33,18 @@ class Structure:
 class Painet(Surrogate):
     """X0, V0 -> X(1..T) and V(T), equivariant to rotations, reflections, translations and atom order.
 
-    Embeddings start from invariants of the state: element, speed, distance to the centroid and the angle between the
-    two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
-    `velocity_scale_nm_ps`, measured on the training frames.
+    Embeddings start from invariants of the state: element, speed, distance to the centre of mass and the angle between
+    the two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
+    `velocity_scale_nm_ps`; `reach` (2,) is what positions and velocities change by over a chunk, in the model's units:
+    both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only
+    the motion about it is learned.
     """
 
     arch: ClassVar[str] = "painet"
     carries_velocities: ClassVar[bool] = True
     config: PainetConfig
     velocity_scale_nm_ps: Tensor
+    reach: Tensor
 
     def __init__(self, config: PainetConfig) -> None:
         super().__init__()
@@ -64,6 +67,7 @@ class Painet(Surrogate):
         )
         self.decoder = Egnn(c.width, c.n_decoder_layers)
         self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
+        self.register_buffer("reach", torch.ones(2))
 
     @property
     def canonical(self) -> bool:
@@ -79,6 +83,12 @@ class Painet(Surrogate):
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return (n_atoms, 3)
+
+    def set_scales(self, velocity_nm_ps: float, displacement_nm: float, change_nm_ps: float) -> None:
+        """Set the units of what is learned: root mean square velocity, displacement and change of velocity over a
+        chunk."""
+        self.velocity_scale_nm_ps.fill_(velocity_nm_ps)
+        self.reach[0], self.reach[1] = displacement_nm / self.config.length_scale_nm, change_nm_ps / velocity_nm_ps
 
     def structure(self, molecule: Molecule) -> Structure:
         """Return what `forward` needs of a molecule. Raises InputError for elements beyond xenon."""
@@ -98,9 +108,10 @@ class Painet(Surrogate):
     def forward(self, positions_nm: Tensor, velocities_nm_ps: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
         """States `(b, n, 3)` -> positions and velocities `(b, n_new, n, 3)` of all future frames, nm and nm/ps."""
         scale = self.config.length_scale_nm
-        centre = positions_nm.mean(1, keepdim=True)
+        share = (structure.molecule.masses_da / structure.molecule.masses_da.sum())[:, None]
+        centre, drift = ((share * s).sum(-2, keepdim=True) for s in (positions_nm, velocities_nm_ps))
         x = (positions_nm - centre) / scale
-        v = velocities_nm_ps / self.velocity_scale_nm_ps
+        v = (velocities_nm_ps - drift) / self.velocity_scale_nm_ps
         h = self.embed(x, v, structure.molecule.elements)
         latents = []
         for t in range(self.n_new):
@@ -109,9 +120,12 @@ class Painet(Surrogate):
             latents.append(h + self.embed_frame[t])
         frames = torch.stack(latents, dim=1).flatten(0, 1)
         over_frames = lambda s: s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1)  # noqa: E731
-        x_new, v_new = self.decoder(frames, over_frames(x), over_frames(v), structure.graph)
+        x_new, v_new = self.decoder(frames, over_frames(x), over_frames(v), structure.graph, self.reach)
         x_new, v_new = (s.unflatten(0, (-1, self.n_new)) for s in (x_new, v_new))
-        return x_new * scale + centre[:, None], v_new * self.velocity_scale_nm_ps
+        x_new, v_new = (s - (share * s).sum(-2, keepdim=True) for s in (x_new, v_new))
+        times = self.config.lag_ps * torch.arange(1, self.n_new + 1, device=x.device)[:, None, None]
+        centres = centre[:, None] + times * drift[:, None]
+        return x_new * scale + centres, v_new * self.velocity_scale_nm_ps + drift[:, None]
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
