@@ -190,7 +190,7 @@ class DcdReader(TrajectoryReader):
                 _scene_from_top(top, path, self.n_atoms)
         else:
             self.n_frames = layout.whole_frames()
-            self.time_ps = layout.times_ps(self.n_frames)
+            self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
             self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
             self.scene = None
             if top is not None or _is_ours(pdb):
@@ -200,6 +200,8 @@ class DcdReader(TrajectoryReader):
         self._frames: npt.NDArray[Any] | None = np.empty(0, dtype=layout.frame_dtype)
         if self.n_frames:
             self._frames = np.memmap(path, layout.frame_dtype, "r", layout.first_frame_at, (self.n_frames,))
+            if self.scene is not None and not self.scene.positions_nm.any():
+                self.scene = self.scene.with_positions(self._read(0, 1, 1)[0])
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         if self._frames is None:

@@ -38,6 +38,7 @@ class DcdLayout:
     file_bytes: int = 0
     path: Path = Path()
     has_our_title: bool = False
+    states_time: bool = True
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, DcdLayout):
@@ -79,11 +80,13 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
         # The time step is float32: digits beyond its seventh are noise.
         interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
+        # MDTraj and VMD write a time step of one unit, whatever the times were.
+        states_time = bool(np.isfinite(interval_ps) and interval_ps > 0) and not (delta == 1.0 and fields[2] == 1)
         if not (np.isfinite(interval_ps) and interval_ps > 0):
             interval_ps = 1.0
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
         return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
-                         first_time_ps, interval_ps, size, path, has_our_title)  # fmt: skip
+                         first_time_ps, interval_ps, size, path, has_our_title, states_time)  # fmt: skip
 
     @property
     def frame_dtype(self) -> np.dtype[Any]:

@@ -1,4 +1,4 @@
-"""Scenes from MDTraj topologies, and trajectories of other programs through MDTraj's readers."""
+"""Scenes from MDTraj topologies and from the structure files that MDTraj reads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.bond_orders import ValenceError, perceive
+from systems.distance_bonds import with_bonds_by_distance
 from systems.element_data import atomic_weight_da
-from systems.errors import InputError, TrajectoryError
+from systems.errors import InputError, TrajectoryError, first_line
 from systems.pdb_records import read_structure
 from systems.scene import Scene
-from systems.trajectory_types import Float32Array, TrajectoryReader
 
 
 def scene_from_mdtraj_topology(
@@ -90,17 +90,26 @@ def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, pat
 
 
 def scene_from_structure(top: Path, *, name: str) -> Scene:
-    """Return the Scene of a structure file that stands beside a trajectory. Raises InputError when it is unreadable.
+    """Return the Scene of a structure or topology file that stands beside a trajectory, by MDTraj or MDAnalysis.
 
-    Bonds are MDTraj's (its residue templates and CONECT records). Elements of PDB and mmCIF files are read here: where
-    the element column is empty MDTraj takes CA for calcium and HG for mercury.
+    Bonds are MDTraj's (its residue templates and CONECT records); atoms that it leaves without one are bonded by their
+    distances. Elements of PDB and mmCIF files are read here: where the element column is empty MDTraj takes CA for
+    calcium and HG for mercury. Files without positions (PSF, prmtop) give positions of zero.
+    Raises InputError when neither library reads the file.
     """
     import mdtraj
 
+    if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
+        topology = _bare_topology(top)
+        if topology is None:
+            from systems.from_mdanalysis import scene_from_universe
+
+            return scene_from_universe(top, name=name)
+        return scene_from_mdtraj_topology(topology, np.zeros((topology.n_atoms, 3)), name=name, source=top.name)
     try:
         structure = mdtraj.load(str(top))
     except Exception as error:  # each MDTraj reader raises its own kinds
-        raise InputError(f"{top} cannot be read as a structure: {_first_line(error)}.") from error
+        raise InputError(f"{top} cannot be read as a structure: {first_line(error)}.") from error
     topology = structure.topology
     elements = None
     with contextlib.suppress(InputError):
@@ -109,39 +118,27 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
         read_nm = np.array([r.position_angstrom for r in records]) / 10.0
         if read_nm.shape == structure.xyz[0].shape and np.allclose(read_nm, structure.xyz[0], atol=1e-4):
             elements = [r.element for r in records]
-    return scene_from_mdtraj_topology(topology, structure.xyz[0], name=name, source=top.name, elements=elements)
+    scene = scene_from_mdtraj_topology(topology, structure.xyz[0], name=name, source=top.name, elements=elements)
+    return with_bonds_by_distance(scene)
 
 
-class MdtrajReader(TrajectoryReader):
-    """Any format that MDTraj reads (XTC, TRR, NetCDF, PDB, ...), whole in memory. Raises TrajectoryError."""
+def _bare_topology(top: Path) -> Any:
+    """Return MDTraj's topology of a file without positions (PSF, prmtop), None when MDTraj does not read it."""
+    import mdtraj
 
-    def __init__(self, path: Path, top: Path | None) -> None:
-        import mdtraj
+    if top.suffix.lower() not in (".psf", ".prmtop", ".parm7", ".top"):
+        return None
+    with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
+        return mdtraj.load_topology(str(top))
+    return None
 
-        self.path = path
-        if not path.exists():
-            raise TrajectoryError(f"{path} does not exist.")
-        try:
-            frames = mdtraj.load(str(path), top=None if top is None else str(top))
-        except Exception as error:  # each MDTraj reader raises its own kinds
-            raise TrajectoryError(f"{path} cannot be read: {_first_line(error)}.") from error
-        self._positions_nm = np.asarray(frames.xyz, dtype=np.float32)
-        self.n_frames, self.n_atoms = frames.n_frames, frames.n_atoms
-        self.time_ps = np.asarray(frames.time, dtype=np.float64)
-        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
-        self.scene = None
-        if self.n_frames and top is not None:
-            self.scene = scene_from_structure(top, name=path.stem).with_positions(self._positions_nm[0])
-        elif self.n_frames:
-            self.scene = scene_from_mdtraj_topology(
-                frames.topology, self._positions_nm[0], name=path.stem, source=path.name
-            )
 
-    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
-        return self._positions_nm[start:stop:stride].copy()
+def is_mdtraj_format(path: Path) -> bool:
+    """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
+    from mdtraj.formats.registry import FormatRegistry
 
-    def close(self) -> None:
-        """Nothing is held open."""
+    name = path.name.lower()
+    return any(name.endswith(s) for s in FormatRegistry.loaders) and not name.endswith((".xyz", ".xyz.gz", ".gsd"))
 
 
 def _mass_da(symbol: str, atom: Any) -> float:
@@ -160,8 +157,3 @@ def _order(bond: Any) -> float:
 def _chain_id(chain: Any) -> str:
     given = getattr(chain, "chain_id", None)
     return str(given) if given else chr(ord("A") + chain.index % 26)
-
-
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0].rstrip(".") if lines else type(error).__name__

@@ -130,6 +130,7 @@ class Hdf5Reader(TrajectoryReader):
         self.n_atoms = int(self._coordinates.shape[1])
         columns = read_columns(self._file, self.path, self.n_frames)
         self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
+        self.times_known = "surromd" in self._file or "time" in self._file
         self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
         self.scene = self._read_scene()
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
@@ -177,6 +178,15 @@ class Hdf5Reader(TrajectoryReader):
 
     def close(self) -> None:
         self._file.close()
+
+
+def is_plain_h5md(path: Path) -> bool:
+    """Whether this is another program's H5MD, without MDTraj's names beside it."""
+    try:
+        with h5py.File(path, "r") as file:
+            return "h5md" in file and "coordinates" not in file and "surromd" not in file
+    except (OSError, RuntimeError, KeyError):  # damaged: its own reader says how
+        return False
 
 
 def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, Any, dict[str, Any]]:

@@ -55,24 +55,32 @@ def open_writer(
 
 
 def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
-    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, or any format MDTraj reads.
+    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, or any format that MDTraj or MDAnalysis reads.
 
-    `top` names a structure file for formats without topology; a DCD of ours finds its companions itself. A file
-    without our record has `record == {}` and `flags is None`.
+    `top` names a structure or topology file for formats without topology; a DCD of ours finds its companions itself. A
+    file without our record has `record == {}` and `flags is None`; one without times has `times_known` False.
     Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds.
     Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
     InputError when a topology is needed, or does not fit.
     """
     path = Path(path)
     top = None if top is None else Path(top)
-    if path.suffix.lower() in _HDF5:
-        from systems.hdf5_file import Hdf5Reader
+    is_hdf5 = path.suffix.lower() in _HDF5
+    if is_hdf5:
+        from systems.hdf5_file import Hdf5Reader, is_plain_h5md
 
-        return Hdf5Reader(path)
+        if not is_plain_h5md(path):
+            return Hdf5Reader(path)
     if path.suffix.lower() == ".dcd":
         from systems.dcd_file import DcdReader
 
         return DcdReader(path, top)
-    from systems.from_mdtraj import MdtrajReader
+    from systems.from_mdtraj import is_mdtraj_format
 
-    return MdtrajReader(path, top)
+    if is_mdtraj_format(path) and not is_hdf5:
+        from systems.mdtraj_file import MdtrajReader
+
+        return MdtrajReader(path, top)
+    from systems.from_mdanalysis import MdanalysisReader
+
+    return MdanalysisReader(path, top)

@@ -161,7 +161,10 @@ class TrajectoryWriter(ABC):
 
 
 class TrajectoryReader(ABC):
-    """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say."""
+    """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say.
+
+    `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames.
+    """
 
     path: Path
     scene: Scene | None
@@ -172,6 +175,7 @@ class TrajectoryReader(ABC):
     flags: npt.NDArray[np.uint16] | None
     chunk_idx: npt.NDArray[np.int32] | None
     scalars: dict[str, Float64Array]
+    times_known: bool = True
 
     def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
         """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).

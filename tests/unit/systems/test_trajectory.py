@@ -311,8 +311,8 @@ def test_xtc_through_mdtraj(tmp_path: Path, alanine_dipeptide: Scene) -> None:
         np.testing.assert_allclose(reader.time_ps, [2.0, 4.0, 6.0])
         assert reader.scene is not None
         assert reader.scene.elements == alanine_dipeptide.elements
-    with pytest.raises(TrajectoryError, match=r"a\.xtc cannot be read"):
-        open_trajectory(tmp_path / "a.xtc")
+    with open_trajectory(tmp_path / "a.xtc") as reader:
+        assert reader.scene is None and reader.n_atoms == 22
 
 
 def test_big_endian_dcd_with_cell(tmp_path: Path) -> None:
