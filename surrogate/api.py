@@ -314,6 +314,13 @@ def rollout(
     solver: str | None = None,
     solver_steps: int | None = None,
     precision: str = "auto",
+    guard: str = "flag",
+    energy_every: int = 0,
+    md_between_ps: float = 0.0,
+    select: str | None = None,
+    atoms: str = "all",
+    force: bool = False,
+    temperature_k: float | None = None,
     resume: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
@@ -324,8 +331,16 @@ def rollout(
     the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
     run in one batch and are named as by `reference`. `solver`: 'multistep' or 'euler', None for the one that suits the
     weights. `precision`: 'fp32', 'bf16' or 'auto'.
-    Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError,
-    StorageError.
+
+    Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
+    that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
+    MD from the last valid frame ('off': marked, and nothing stops the run). The energy of every `energy_every`-th frame
+    is checked after stiff bonds are relaxed. `md_between_ps` of real MD follow each chunk. What was done stands in the
+    record (`interventions`) and in a column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy')
+    say which atoms are written. `force` rolls a scene that leaves the training domain where that is possible.
+    `temperature_k` is refused unless it is that of the weights.
+    Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
+    guard cannot bring a chunk through), StorageError.
     """
     from md_reference.replicas import replica_paths
 
@@ -340,7 +355,20 @@ def rollout(
     from surrogate.sampling.rollout import RolloutConfig
     from surrogate.sampling.rollout import rollout as roll
 
-    config = RolloutConfig(time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, solver=solver, precision=precision)
+    config = RolloutConfig(
+        time_ps=time_ps,
+        save_every_ps=save_every_ps,
+        seed=seed,
+        solver=solver,
+        precision=precision,
+        guard=guard,
+        energy_every=energy_every,
+        md_between_ps=md_between_ps,
+        select=select,
+        atoms=atoms,
+        force=force,
+        temperature_k=temperature_k,
+    )
     if solver_steps is not None:
         config = replace(config, solver_steps=solver_steps)
     loaded = load_weights(file)

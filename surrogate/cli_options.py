@@ -21,6 +21,19 @@ class Precision(StrEnum):
     bf16 = "bf16"
 
 
+class Guard(StrEnum):
+    off = "off"
+    flag = "flag"
+    resample = "resample"
+    repair = "repair"
+    fallback = "fallback"
+
+
+class Atoms(StrEnum):
+    all = "all"
+    heavy = "heavy"
+
+
 SceneArg = Annotated[
     str, typer.Argument(metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.")
 ]
@@ -57,6 +70,20 @@ SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep
 SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them with each frame (.h5).")]
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
+]
+GuardOpt = Annotated[
+    Guard,
+    typer.Option("--guard", help="Frames that no reference shows: mark; draw again; relax by OpenMM; MD instead."),
+]
+EnergyEveryOpt = Annotated[
+    int, typer.Option("--energy-every", min=0, help="Check the energy of every so many frames (OpenMM).")
+]
+MdBetweenOpt = Annotated[str | None, typer.Option("--md-between", help="So much real MD after each chunk.")]
+SelectOpt = Annotated[str | None, typer.Option("--select", help="Atoms to write, in MDTraj's words: backbone.")]
+AtomsOpt = Annotated[Atoms, typer.Option("--atoms", help="Write all atoms or no hydrogens.")]
+ForceOpt = Annotated[bool, typer.Option("--force", help="Roll a scene that leaves the training domain, marked.")]
+WantedTemperatureOpt = Annotated[
+    str | None, typer.Option("--temperature", help="Refused if it is not that of the weights.")
 ]
 PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform; auto: the fastest, timed on the scene.")]
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]

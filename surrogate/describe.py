@@ -42,7 +42,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "account": summary_lines(record.get("summary") or {}),
+        "account": summary_lines(record.get("summary") or {}) + intervention_lines(record),
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
@@ -55,6 +55,29 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "size_mb": path.stat().st_size / 1e6,
         "record": record,
     }
+
+
+def intervention_lines(record: dict[str, Any]) -> list[str]:
+    """Return what a rollout's guards caught and did, and what that cost; nothing of other files."""
+    account = record.get("interventions")
+    if not isinstance(account, dict):
+        return []
+    helped, chunks = account["chunks_caught"], account["chunks"]
+    line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
+    if helped:
+        reasons = sorted(account["reasons"].items(), key=lambda r: -r[1])
+        line += f" ({100 * helped / chunks:.2g} %): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
+    lines = [line]
+    if account["frames"]:
+        done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
+        extra = {name: value for name, value in account["seconds"].items() if name != "draw"}
+        shares = ", ".join(f"{name} {100 * v / account['seconds']['draw']:.2g} %" for name, v in extra.items())
+        lines += [
+            f"frames that are not the surrogate's first draw: {done}",
+            f"cost beside drawing chunks: {shares}",
+            *(f"bias: {why}" for why in account["bias"]),
+        ]
+    return lines
 
 
 def is_windows(path: Path) -> bool:

@@ -22,16 +22,15 @@ MARKS = {
     MD_AFTER_FAILURE: "MD after a failure",
     MD_BETWEEN: "MD between chunks",
 }
-# What each guard may do to the statistics of a trajectory.
+# What frames of each kind may do to the statistics of a trajectory.
 BIAS = {
-    "off": "none: nothing is changed",
-    "flag": "none: nothing is changed; caught frames stand among the others, and later ones follow from them",
-    "resample": "states from which the surrogate fails are visited less, and left in other ways than it would leave "
+    DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways than it would leave "
     "them",
-    "repair": "repaired frames have relaxed bonds and angles, colder than the ensemble's, and later frames follow from "
-    "them; where a frame could not be repaired, states from which the surrogate fails are visited less",
-    "fallback": "frames of MD stand among the surrogate's, so that ensemble and kinetics are a mixture; each stretch "
-    "of MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
+    REPAIRED: "repaired frames have relaxed bonds and angles, colder than the ensemble's, and later frames follow from "
+    "them",
+    MD_AFTER_FAILURE: "MD stands where the surrogate failed: ensemble and kinetics are a mixture, and each stretch of "
+    "MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
+    MD_BETWEEN: "MD stands between chunks: ensemble and kinetics are a mixture of the two",
 }
 _LOGGED = 200
 
@@ -74,12 +73,14 @@ class Tally:
     def to_record(self) -> dict[str, Any]:
         """Return what a trajectory's record keeps of it."""
         kept = {k: v for k, v in asdict(self).items() if k != "md_in_a_row"}
-        return {**kept, "share_of_chunks": self.chunks_caught / max(self.chunks, 1)}
+        bias = [why for mark, why in BIAS.items() if self.frames.get(MARKS[mark])]
+        return {**kept, "share_of_chunks": self.chunks_caught / max(self.chunks, 1), "bias": bias}
 
 
 @dataclass
 class Clock:
-    """Wall seconds of a whole batch by what they went into: `draw`, `check`, `draw again`, `relax`, `md`, `energy`."""
+    """Wall seconds of a whole batch by what they went into: `draw`, `check`, `draw again`, `relax`, `md`, `energy`,
+    `energy limit`."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 

@@ -258,11 +258,14 @@ class _Advance:
             frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
             self.chunk.flags[rows] = self.plan.checks.check(frames, before, from_start=self.step == 0)
         if self.plan.energy_every:
+            assert self.plan.coupling is not None
+            with self.plan.clock.timed("energy limit"):
+                limit = self.plan.coupling.energy_limit_kj_mol
             with self.plan.clock.timed("energy"):
                 for row in rows.tolist():
-                    self._check_energies(row)
+                    self._check_energies(row, limit)
 
-    def _check_energies(self, row: int) -> None:
+    def _check_energies(self, row: int, limit_kj_mol: float) -> None:
         """Flag frames whose turn it is and whose energy, after stiff bonds are relaxed, no MD reaches."""
         assert self.plan.coupling is not None
         steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
@@ -273,7 +276,7 @@ class _Advance:
                     energies[k] = self.plan.coupling.relax(self.chunk.frames_nm[row, k]).potential_kj_mol
                 except SimulationError:
                     energies[k] = np.inf
-            if energies[k] > self.plan.coupling.energy_limit_kj_mol:
+            if energies[k] > limit_kj_mol:
                 self.chunk.flags[row, k] |= np.uint16(ENERGY)
 
     def _caught_rows(self) -> list[int]:
