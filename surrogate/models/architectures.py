@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from surrogate.models.baselines import BASELINES, BaselineConfig
 from surrogate.models.interface import Surrogate
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
+from surrogate.models.painet.model import EgnnForecaster, Painet
 from systems.errors import UnknownNameError, nearest
 
 
@@ -25,6 +26,8 @@ class Architecture:
 ARCHITECTURES: dict[str, Architecture] = {
     LamSlide.arch: Architecture(LamSlideConfig.from_dict, LamSlide),
     Painet.arch: Architecture(PainetConfig.from_dict, Painet),
+    EgnnForecaster.arch: Architecture(PainetConfig.from_dict, EgnnForecaster),
+    **{kind.arch: Architecture(BaselineConfig.from_dict, kind) for kind in BASELINES},
 }
 
 

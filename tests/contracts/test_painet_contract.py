@@ -12,15 +12,15 @@ from surrogate.models.graphs import BOND, SECOND_NEIGHBOUR, molecular_graph
 from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.painet.attention import dense_mean, largest_step, linear_mean, pair_energy
 from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
+from surrogate.models.painet.model import EgnnForecaster, Painet
 
 SMALL = PainetConfig(n_new=3, width=24, n_heads=2, head_dim=8, n_decoder_layers=2)
 
 
-def lively(config: PainetConfig) -> Painet:
+def lively(config: PainetConfig, kind: type[Painet] = Painet) -> Painet:
     """A model whose small initial weights are made large enough that every path moves atoms."""
     torch.manual_seed(1)
-    model = Painet(config)
+    model = kind(config)
     with torch.no_grad():
         for name, p in model.named_parameters():
             if "factor.2.weight" in name:
@@ -44,7 +44,7 @@ class TestPainetDense(TestPainet):
 
 class TestEgnnAlone(TestPainet):
     def make(self, n_atoms: int) -> Surrogate:
-        return lively(replace(SMALL, attention="none"))
+        return lively(SMALL, EgnnForecaster)
 
 
 class TestPainetAllPairs(TestPainet):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -143,3 +143,12 @@ class Painet(Surrogate):
             return thermal
         kept = math.exp(-c.friction_per_ps * c.chunk_ps)
         return kept * velocities + math.sqrt(1.0 - kept * kept) * thermal
+
+
+class EgnnForecaster(Painet):
+    """PAINET's decoder alone: every future frame from H(0), messages along observed edges only."""
+
+    arch: ClassVar[str] = "egnn"
+
+    def __init__(self, config: PainetConfig) -> None:
+        super().__init__(replace(config, attention="none"))
