@@ -15,6 +15,7 @@ from surrogate.judge.charts import Chart
 from surrogate.judge.curves import Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags
 from surrogate.judge.movie import Movie, make_movie
+from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
@@ -28,7 +29,7 @@ from systems.validity import Geometry
 
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
-ROOMS: tuple[Room, ...] = ()
+ROOMS: tuple[Room, ...] = (msm_rows,)
 
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
@@ -157,7 +158,7 @@ def compare(
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     accounts = [account_of(e) for e in everyone]
     judgements = tuple(
-        _judge(stage, torsions, geometry, truth, features, other, chosen, accounts[0], account)
+        _judge(stage, torsions, geometry, truth, features, other, chosen, float(temperature), accounts[0], account)
         for features, account in zip(measured[1 : 1 + len(candidates)], accounts[1 : 1 + len(candidates)], strict=True)
     )
     notes += [f"Validity check left out: {x}." for x in geometry.excluded]
@@ -188,10 +189,12 @@ def _judge(
     candidate: Features,
     replicate: Features,
     options: Options,
+    temperature_k: float,
     reference_account: Account,
     account: Account,
 ) -> Judgement:
     trio, correlation = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
+    trio = replace(trio, temperature_k=temperature_k)
     rows = metrics.validity_rows(trio)
     bond_rows, bonds = metrics.bond_rows(trio)
     rows += bond_rows + metrics.population_rows(trio) + metrics.torsion_rows(trio)

@@ -17,6 +17,7 @@ AnyFloat = npt.NDArray[np.floating]
 N_BINS_1D = 100
 N_BINS_2D = 50
 PI = math.pi
+GAS_CONSTANT_KJ = 8.31446261815324e-3
 SQRT_LN2 = math.sqrt(math.log(2.0))
 
 # The cuts lie at the two minima of the psi density of ff99SB and ff14SB alanine dipeptide (about 80 and -120 degrees).
@@ -162,7 +163,6 @@ def block_occupancy(member: Sequence[npt.NDArray[np.bool_]], blocks: Blocks) -> 
 
 def free_energy_kj(counts: FloatArray, temperature_k: float) -> FloatArray:
     """Return -RT ln(p) in kJ/mol above the most populated bin; NaN where nothing was counted."""
-    gas_constant_kj = 8.31446261815324e-3
     with np.errstate(divide="ignore", invalid="ignore"):
-        energy = -gas_constant_kj * temperature_k * np.log(counts / counts.max())
+        energy = -GAS_CONSTANT_KJ * temperature_k * np.log(counts / counts.max())
     return np.where(counts > 0, energy, np.nan)

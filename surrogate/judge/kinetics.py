@@ -198,7 +198,7 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     """
     from deeptime.decomposition import TICA
 
-    runs = [run for s in segments for run in _finite_runs(s) if len(run) > lag_frames]
+    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames]
     if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
         return None
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
@@ -213,7 +213,7 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     return Tica(mean, vector, lag_frames, float(np.real(model.singular_values[0])))
 
 
-def _finite_runs(features: FloatArray) -> list[FloatArray]:
+def finite_runs(features: FloatArray) -> list[FloatArray]:
     """Return the stretches of consecutive finite rows."""
     finite = np.isfinite(features).all(axis=1)
     if finite.all():

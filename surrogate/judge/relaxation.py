@@ -19,6 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 Skipped = tuple[str, str]
 
 MAX_DRAWN_LAGS = 240
+SLOW_KINDS = ("χ", "rotatable")
 _MIN_BOUNDARIES = 20
 
 
@@ -134,12 +135,12 @@ def _time_row(trio: Trio, results: Sequence[_Correlated], label: str) -> Row:
         unit="ps",
         tolerance=0.2,
         tolerance_text="± 20 %",
-        statement=lambda c, r: _speed(f"cos ψ of {label} relaxes", c, r),
+        statement=lambda c, r: speed_words(f"cos ψ of {label} relaxes", c, r),
         log=True,
     )
 
 
-def _speed(what: str, candidate: float, reference: float) -> str:
+def speed_words(what: str, candidate: float, reference: float) -> str:
     if not math.isfinite(candidate):
         return f"{what} not at all: it does not move"
     if candidate <= 0:
@@ -154,11 +155,11 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
     lag_ps = trio.reference.features.lag_ps
     lag = max(1, round(trio.options.tica_lag_ps / lag_ps))
     name = f"TICA at a lag of {format_time_ps(lag * lag_ps)}"
-    if not (len(trio.torsions.phi) or len(trio.torsions.psi)):
-        return [], [], [(name, "the scene has no φ or ψ torsion")]
+    features = [tica_features(s.features) for s in trio.samples]
+    if not features[0][0].shape[1]:
+        return [], [], [(name, "the scene has no torsion to turn about")]
     if min(max(s.features.segment_lengths) for s in trio.samples) < 10 * lag:
         return [], [], [(name, "the segments are shorter than ten lags")]
-    features = [_tica_features(s.features) for s in trio.samples]
     model = kinetics.fit_tica(features[0], lag)
     if model is None:
         return [], [], [(name, "the torsions of the reference do not move")]
@@ -192,15 +193,25 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
             unit="ps",
             tolerance=0.2,
             tolerance_text="± 20 %",
-            statement=lambda c, r: _speed("the slowest motion (TIC 0) decays", c, r),
+            statement=lambda c, r: speed_words("the slowest motion (TIC 0) decays", c, r),
             log=True,
         ),
     ]
     return rows, [curves.histogram(trio, projected, bins, "TIC 0", "")], []
 
 
-def _tica_features(features: Features) -> list[FloatArray]:
-    return [kinetics.circular_features(phi, psi) for phi, psi in zip(features.phi, features.psi, strict=True)]
+def tica_features(features: Features) -> list[FloatArray]:
+    """Return cos and sin of phi, psi, chi and every other rotatable torsion, `(n_frames, k)` per segment.
+
+    Amide bonds and rotors (methyl and the like) are left out: what turns them is not the slow motion looked for.
+    """
+    slow = [k for k, t in enumerate(features.probes.torsions) if t.kind in SLOW_KINDS] if features.probes else []
+    further = features.series.get("torsions") if slow else None
+    out = []
+    for i, (phi, psi) in enumerate(zip(features.phi, features.psi, strict=True)):
+        others = [] if further is None else [further[i][:, slow]]
+        out.append(kinetics.circular_features(phi, psi, *others))
+    return out
 
 
 def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:

@@ -107,6 +107,7 @@ class Trio:
     candidate: Sample
     replicate: Sample
     options: Options
+    temperature_k: float = 300.0
 
     @property
     def samples(self) -> tuple[Sample, Sample, Sample]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions, kinetics
 from surrogate.judge.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
-from surrogate.judge.relaxation import longest_correlation
+from surrogate.judge.relaxation import longest_correlation, tica_features
 from surrogate.judge.rows import Options
 from surrogate.judge.statistics import Blocks, Piece, block_length, make_blocks
 from surrogate.judge.structure import Backbone, Features
@@ -132,7 +132,7 @@ def _bond_measure(three: Three, blocks: ThreeBlocks) -> Measure:
 
 def _tica_measures(three: Three, blocks: ThreeBlocks, options: Options) -> list[Measure]:
     lag = max(1, round(options.tica_lag_ps / three[0].lag_ps))
-    features = [[kinetics.circular_features(a, b) for a, b in zip(f.phi, f.psi, strict=True)] for f in three]
+    features = [tica_features(f) for f in three]
     model = kinetics.fit_tica(features[0], lag) if max(map(len, features[0])) > 10 * lag else None
     if model is None:
         return []

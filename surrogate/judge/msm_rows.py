@@ -1,0 +1,241 @@
+"""Rows and charts of the Markov state model: populations, transitions, timescales, Chapman-Kolmogorov test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge import distributions, msm
+from surrogate.judge.charts import BarChart, Chart, Landscape, Line, LineChart, Role
+from surrogate.judge.kinetics import lagged_eigenvalue, timescale
+from surrogate.judge.relaxation import speed_words, tica_features
+from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.statistics import estimate
+from systems.units import format_time_ps
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Skipped = tuple[str, str]
+
+_CHECKED_LAGS = 5
+_DRAWN_LAGS = (0.2, 0.5, 1.0, 2.0, 3.0, 5.0)
+_LANDSCAPE_BINS = 50
+ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
+
+
+@dataclass(frozen=True, eq=False)
+class _States:
+    """The frames of one sample in the states of the reference, and their sums per block at the model's lag."""
+
+    sample: Sample
+    coordinates: list[FloatArray]
+    micro: list[IntArray]
+    macro: list[IntArray]
+    occupancy: FloatArray
+    transitions: FloatArray
+    micro_counts: FloatArray
+
+
+def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
+    """Return the rows and charts of a Markov state model fitted on the reference, and why there are none."""
+    lag_ps = trio.reference.features.lag_ps
+    lag = max(1, round(trio.options.tica_lag_ps / lag_ps))
+    name = f"Markov state model at a lag of {format_time_ps(lag * lag_ps)}"
+    features = [tica_features(s.features) for s in trio.samples]
+    if not features[0][0].shape[1]:
+        return [], [], [(name, "the scene has no torsion to turn about")]
+    if min(max(s.features.segment_lengths) for s in trio.samples) < 10 * lag:
+        return [], [], [(name, "the segments are shorter than ten lags")]
+    projection = msm.fit_projection(features[0], lag)
+    if projection is None:
+        return [], [], [(name, "the torsions of the reference do not move")]
+    coordinates = [[projection.project(x) for x in segments] for segments in features]
+    model = msm.fit_model(projection, coordinates[0], lag)
+    if model is None:
+        return [], [], [(name, "the reference visits too few states")]
+    states = [_states(model, s, x) for s, x in zip(trio.samples, coordinates, strict=True)]
+    names = state_names(trio, states[0].macro, model.n_states)
+    rows = [_population_row(trio, states), _transition_row(trio, states, format_time_ps(lag * lag_ps))]
+    rows += _timescale_rows(trio, model, states)
+    charts: list[Chart] = [*_landscape(trio, states), _free_energies(trio, model, states, names)]
+    charts += [_check_chart(trio, model, s, role) for s, role in zip(states[:2], ROLES, strict=False)]
+    charts.append(_timescale_chart(trio, model, states))
+    return rows, charts, []
+
+
+def _states(model: msm.Model, sample: Sample, coordinates: list[FloatArray]) -> _States:
+    micro = model.assign(coordinates)
+    macro = model.lump(micro)
+    return _States(
+        sample,
+        coordinates,
+        micro,
+        macro,
+        msm.block_occupancy(macro, sample.blocks, model.n_states),
+        msm.block_transitions(macro, sample.blocks, model.n_states, model.lag_frames),
+        msm.block_transitions(micro, sample.blocks, len(model.centres), model.lag_frames),
+    )
+
+
+def state_names(trio: Trio, macro: Sequence[IntArray], n_states: int) -> list[str]:
+    """Return a name per state: with few torsions their mean angles in the reference, else a number."""
+    columns = trio.torsions
+    few = 1 <= len(columns.phi) + len(columns.psi) <= 2
+    names = []
+    for k in range(n_states):
+        parts = []
+        for symbol, series in (("φ", trio.reference.features.phi), ("ψ", trio.reference.features.psi)):
+            if few and series[0].shape[1]:
+                inside = np.concatenate([x[m == k, 0] for x, m in zip(series, macro, strict=True)])
+                parts.append(f"{symbol} {np.degrees(msm.circular_mean(inside)):.0f}°")
+        names.append(f"state {k + 1}" + (f" ({', '.join(parts)})" if parts else ""))
+    return names
+
+
+def _population_row(trio: Trio, states: Sequence[_States]) -> Row:
+    n = states[0].occupancy.shape[1] - 1
+    return distance_row(
+        trio,
+        [s.occupancy for s in states],
+        key="msm_jsd",
+        group="distributions",
+        metric=f"Populations of {n} metastable states, distance",
+        statement=lambda ratio: f"the metastable states are {ratio:.2g} times as far off as a replicate's",
+    )
+
+
+def _transition_row(trio: Trio, states: Sequence[_States], lag: str) -> Row:
+    return distance_row(
+        trio,
+        [s.transitions for s in states],
+        key="transition_jsd",
+        group="kinetics",
+        metric=f"Transitions between metastable states within {lag}, distance",
+        statement=lambda ratio: f"transitions between states are {ratio:.2g} times as far off as a replicate's",
+    )
+
+
+def _timescale_rows(trio: Trio, model: msm.Model, states: Sequence[_States]) -> list[Row]:
+    lag_ps = trio.reference.features.lag_ps
+    lag = model.lag_frames * lag_ps
+    n_slow, n_micro = model.n_states - 1, len(model.centres)
+    _, functions = msm.slow_functions(states[0].micro_counts.sum(0).reshape(n_micro, n_micro), n_slow)
+    sums = [[msm.function_sums(s.micro_counts, f) for f in functions] for s in states]
+    rows = []
+    for k in range(n_slow):
+        rows.append(
+            observable_row(
+                trio,
+                [float(timescale(lagged_eigenvalue(own[k]), lag)) for own in sums],
+                [
+                    timescale(lagged_eigenvalue(own[k], s.sample.weights), lag)
+                    for own, s in zip(sums, states, strict=True)
+                ],
+                key=f"msm_timescale:{k + 1}",
+                group="kinetics",
+                metric=f"Implied timescale {k + 1} of the Markov state model",
+                unit="ps",
+                tolerance=0.2,
+                tolerance_text="± 20 %",
+                statement=lambda c, r, k=k: speed_words(f"process {k + 1} of the Markov state model decays", c, r),  # type: ignore[misc]
+                log=True,
+            )
+        )
+    return rows
+
+
+def _landscape(trio: Trio, states: Sequence[_States]) -> list[Chart]:
+    if states[0].coordinates[0].shape[1] < 2:
+        return []
+    edges = [
+        distributions.reference_bins([c[:, k] for c in states[0].coordinates], _LANDSCAPE_BINS).edges for k in range(2)
+    ]
+    counts = []
+    for s in states:
+        x = np.concatenate(s.coordinates)
+        x = x[np.isfinite(x).all(axis=1)]
+        counts.append(np.histogram2d(x[:, 0], x[:, 1], bins=edges)[0])
+    return [Landscape("distributions", "TICA landscape", "TIC 0", "TIC 1", edges[0], edges[1], *counts)]
+
+
+def _free_energies(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:
+    """Free energies of the states above the most populated one, -RT ln(p / p_0), with error bars; not judged twice."""
+    thermal_kj = distributions.GAS_CONSTANT_KJ * trio.temperature_k
+    found = []
+    for s in states:
+        total, drawn = s.occupancy.sum(0), s.sample.weights @ s.occupancy
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = -thermal_kj * np.log(total[1:-1] / total[0])
+            draws = -thermal_kj * np.log(drawn[:, 1:-1] / drawn[:, :1])
+        bars = [estimate(float(v), draws[:, k], s.sample.blocks.n_blocks) for k, v in enumerate(value)]
+        found.append([np.array([getattr(b, end) for b in bars]) for end in ("value", "low", "high")])
+    reference, candidate, replicate = found
+    return BarChart(
+        section="distributions",
+        title="Free energies of the metastable states",
+        caption=f"Above {names[0]}, at {trio.temperature_k:g} K: -RT ln of the ratio of populations, 95 % intervals.",
+        y_label="ΔG / kJ/mol",
+        names=tuple(names[1:]),
+        reference=reference[0],
+        candidate=candidate[0],
+        replicate=replicate[0],
+        reference_low=reference[1],
+        reference_high=reference[2],
+        candidate_low=candidate[1],
+        candidate_high=candidate[2],
+    )
+
+
+def _check_chart(trio: Trio, model: msm.Model, s: _States, role: Role) -> Chart:
+    """Does the model of one lag predict the next four? Circles of the estimate on lines of the prediction."""
+    lag_ps = model.lag_frames * trio.reference.features.lag_ps
+    n = model.n_states
+    longest = max(s.sample.features.segment_lengths)
+    steps = [i for i in range(1, _CHECKED_LAGS + 1) if 2 * i * model.lag_frames < longest]
+    counts = [
+        msm.block_transitions(s.macro, s.sample.blocks, n, i * model.lag_frames).sum(0).reshape(n, n) for i in steps
+    ]
+    predicted, estimated = msm.chapman_kolmogorov(counts)
+    gap = float(np.nanmax(np.abs(predicted - estimated))) if np.isfinite(estimated).any() else math.nan
+    x = np.array(steps) * lag_ps
+    lines = [Line(f"state {k + 1}, observed", role, x, estimated[:, k]) for k in range(n)]
+    lines += [Line(f"state {k + 1}, predicted", "other", x, predicted[:, k]) for k in range(n)]
+    return LineChart(
+        section="kinetics",
+        title=f"Chapman-Kolmogorov test, {role}",
+        caption="Probability to be in the state one started in: observed, and predicted from the shortest lag by a "
+        f"Markov chain of the metastable states. Largest difference {gap:.2g}.",
+        x_label="lag / ps",
+        y_label="probability to be back",
+        lines=tuple(lines),
+    )
+
+
+def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States]) -> Chart:
+    """Implied timescales against the lag they were estimated at: level where the model is Markovian."""
+    lag_ps = trio.reference.features.lag_ps
+    n_micro, n_slow = len(model.centres), model.n_states - 1
+    longest = min(max(s.sample.features.segment_lengths) for s in states)
+    lags = sorted({max(1, round(f * model.lag_frames)) for f in _DRAWN_LAGS})
+    lags = [lag for lag in lags if 10 * lag <= longest]
+    lines = []
+    for s, role in zip(states, ROLES, strict=True):
+        times = []
+        for lag in lags:
+            counts = msm.block_transitions(s.micro, s.sample.blocks, n_micro, lag).sum(0).reshape(n_micro, n_micro)
+            times.append(timescale(msm.slow_functions(counts, n_slow)[0], lag * lag_ps))
+        table = np.array(times)
+        lines += [Line(f"{role}, process {k + 1}", role, np.array(lags) * lag_ps, table[:, k]) for k in range(n_slow)]
+    return LineChart(
+        section="kinetics",
+        title="Implied timescales",
+        caption="Of the Markov state model against the lag it is estimated at; states are those of the reference.",
+        x_label="lag / ps",
+        y_label="timescale / ps",
+        lines=tuple(lines),
+        log_y=True,
+    )
