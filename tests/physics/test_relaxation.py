@@ -1,0 +1,95 @@
+"""Frames relaxed under springs: stiff bonds come back, all else stays, and the energy is the force field's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from md_reference.engine import Engine
+from md_reference.forcefield import ForceFieldSpec, build_system
+from md_reference.relaxation import Relaxer
+from systems.errors import SimulationError
+from systems.scene import Scene
+
+SPEC = ForceFieldSpec("ff14SB", "obc2", 3.0)
+
+
+@pytest.fixture(scope="module")
+def engine(alanine_dipeptide: Scene) -> Iterator[Engine]:
+    with Engine(alanine_dipeptide, SPEC, seed=1) as made:
+        made.minimise(max_iterations=50)
+        made.thermalise()
+        made.step(2000)
+        yield made
+
+
+@pytest.fixture(scope="module")
+def relaxer(alanine_dipeptide: Scene) -> Iterator[Relaxer]:
+    with Relaxer(alanine_dipeptide, build_system(alanine_dipeptide, SPEC)) as made:
+        yield made
+
+
+def lengths(x: np.ndarray, scene: Scene) -> np.ndarray:
+    return np.linalg.norm(x[scene.bonds[:, 0]] - x[scene.bonds[:, 1]], axis=1)
+
+
+def test_a_stretched_bond_comes_back_and_the_rest_stays(
+    engine: Engine, relaxer: Relaxer, alanine_dipeptide: Scene
+) -> None:
+    frame = engine.positions()
+    rest = relaxer.relax(frame)
+    for i, j in ((4, 1), (2, 1), (6, 4)):  # C-CH3, a constrained H-CH3, N-C
+        broken = frame.copy()
+        broken[i] += 0.06 * (frame[i] - frame[j]) / np.linalg.norm(frame[i] - frame[j])
+        found = relaxer.relax(broken)
+        off = np.abs(lengths(found.positions_nm, alanine_dipeptide) - lengths(rest.positions_nm, alanine_dipeptide))
+        assert np.abs(lengths(broken, alanine_dipeptide) - lengths(frame, alanine_dipeptide)).max() > 0.055
+        assert off.max() < 0.002
+        assert np.linalg.norm(found.positions_nm - broken, axis=1).max() < 0.1
+        assert abs(found.potential_kj_mol - rest.potential_kj_mol) < 8.0
+
+
+def test_the_energy_is_that_of_the_force_field_alone(engine: Engine, relaxer: Relaxer) -> None:
+    """Springs pull 5 to 20 kJ/mol on relaxed frames; none of it may be in the number."""
+    frame = engine.positions()
+    before = engine.energy()
+    found = relaxer.relax(frame)
+    with_springs = 0.5 * 2500.0 * ((found.positions_nm - frame) ** 2).sum()
+    assert with_springs > 1.0
+    assert found.potential_kj_mol < before - 10.0, "thermal energy of bonds and angles is gone"
+    assert Engine.energy(engine, found.positions_nm) == pytest.approx(found.potential_kj_mol, abs=1e-3)
+    engine.set_positions(frame)
+
+
+def test_relaxing_keeps_the_conformation(engine: Engine, relaxer: Relaxer) -> None:
+    """Torsions stay within 15 degrees; a minimisation without springs turns at least one of some frames farther."""
+    from systems.geometry import torsion
+
+    quads = np.array([[4, 6, 8, 14], [6, 8, 14, 16]])
+    moved, free = [], []
+    frame = engine.positions()
+    for _ in range(4):
+        engine.set_positions(frame)
+        engine.thermalise()
+        engine.step(500)
+        frame = engine.positions()
+        engine.minimise()
+        for into, x in ((moved, relaxer.relax(frame).positions_nm), (free, engine.positions())):
+            change = torsion(x, quads) - torsion(frame, quads)
+            into.append(np.abs((change + np.pi) % (2 * np.pi) - np.pi).max())
+    assert np.rad2deg(max(moved)) < 15.0
+    assert np.rad2deg(max(free)) > 2 * np.rad2deg(max(moved))
+
+
+def test_what_is_beyond_repair_is_said_in_one_line(relaxer: Relaxer, alanine_dipeptide: Scene) -> None:
+    lost = alanine_dipeptide.positions_nm.copy()
+    lost[3] = np.nan
+    with pytest.raises(SimulationError, match="not finite"):
+        relaxer.relax(lost)
+    on_top = np.zeros_like(lost)
+    with pytest.raises(SimulationError, match="finite"):
+        relaxer.relax(on_top)
+    # And the relaxer still works.
+    assert relaxer.relax(alanine_dipeptide.positions_nm).potential_kj_mol < 0.0
