@@ -12,7 +12,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +20,15 @@ from md_reference.replicas import replica_paths
 from surrogate import api
 from systems.units import parse_wall_s
 
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+    from surrogate.training.lam_slide import TrainingConfig
+
 SCENE = "alanine-dipeptide"
 # Kind of run: first seed and number of replicas. `more` was added when the first 400 ns turned out to hold a single
-# crossing to phi > 0; the held-out runs are those of the first version.
+# crossing to phi > 0, `later` and `last` for the further training; the held-out runs are those of the first version.
 TRAIN = {"train": (100, 4), "more": (106, 3)}
+FURTHER = {"later": (109, 1), "last": (116, 1)}
 HELD = {"held": (104, 2)}
 REPLICA_PS = 100_000.0
 ROLLOUT_SEED = 1
@@ -31,6 +36,8 @@ ROLLOUT_REPLICAS = 16
 CURVE_PS = 20_000.0
 FIGURES = ("joint_jsd", "correlation:1", "correlation_time", "valid:2", "valid:4")
 SNAPSHOT_S = 600.0
+# The second training starts from the weights of the first, at a lower rate, and draws rare windows more often.
+FURTHER_RATE, FURTHER_SEED, RARE_DRAWS = 7e-4, 10, 0.3
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,11 @@ class Paths:
     folder: Path
 
     def reference(self, kind: str, n: int) -> list[Path]:
-        return [self.folder / f"{kind}_r{k}.h5" for k in range(n)]
+        return replica_paths(self.folder / f"{kind}.h5", n)
+
+    @property
+    def first(self) -> Path:
+        return self.folder / "first.safetensors"
 
     @property
     def weights(self) -> Path:
@@ -59,24 +70,40 @@ def make_reference(paths: Paths, kinds: dict[str, tuple[int, int]]) -> list[Path
     return [path for kind, (_, n) in kinds.items() for path in paths.reference(kind, n)]
 
 
-def train(paths: Paths, references: list[Path], budget_s: float, *, compile_: bool) -> Path:
-    """Train and write float32 weights, with a snapshot every ten minutes for the curve of error against time."""
+def train(paths: Paths, references: list[Path], further: list[Path], budgets_s: tuple[float, float], *,
+          compile_: bool) -> Path:  # fmt: skip
+    """Train on `references`, then further on these and `further`, and write float32 weights.
+
+    Snapshots every ten minutes stay beside both, for the curve of error against time.
+    """
+    from surrogate.data.weights import load_weights
+    from surrogate.training.lam_slide import TrainingConfig
+
+    common: dict[str, Any] = {"snapshot_every_s": SNAPSHOT_S, "time_reversal": True, "compile": compile_}
+    first = TrainingConfig(budget_s=budgets_s[0], **common)
+    _train(paths.first, references, first, None)
+    second = TrainingConfig(
+        budget_s=budgets_s[1], stage_two_rate=FURTHER_RATE, seed=FURTHER_SEED, rare_draws=RARE_DRAWS, **common
+    )
+    return _train(paths.weights, [*references, *further], second, load_weights(paths.first))
+
+
+def _train(out: Path, references: list[Path], config: TrainingConfig, start: Weights | None) -> Path:
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import LamSlideConfig
     from surrogate.progress import progress_bar
-    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+    from surrogate.training.lam_slide import train_lam_slide
 
-    if paths.weights.exists() and not list(paths.folder.glob("model.*.train.safetensors")):
-        return paths.weights
-    config = TrainingConfig(budget_s=budget_s, snapshot_every_s=SNAPSHOT_S, time_reversal=True, compile=compile_)
-    with progress_bar("training", quiet=False) as advance:
+    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
+        return out
+    with progress_bar(f"training {out.stem}", quiet=False) as advance:
 
         def report(stage: str, share: float, metrics: dict[str, float]) -> None:
             if advance is not None:
                 advance(round(1000 * share), 1000, stage)
 
         frames = collect_frames(references)
-        return train_lam_slide(frames, paths.weights, LamSlideConfig(), config, resume=True, progress=report)
+        return train_lam_slide(frames, out, LamSlideConfig(), config, start=start, resume=True, progress=report)
 
 
 def ship(source: Path, target: Path) -> Path:
@@ -149,7 +176,8 @@ def noise_floor(references: list[Path], rollout: list[Path]) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/alanine-dipeptide"))
-    parser.add_argument("--budget", default="65min", help="training time, both stages (default 65min)")
+    parser.add_argument("--budget", default="65min", help="of the first training, both stages (default 65min)")
+    parser.add_argument("--further", default="94min", help="of the further training, second stage (default 94min)")
     parser.add_argument("--compile", action="store_true", help="compile the network (needs a C++ compiler)")
     parser.add_argument("--solver-steps", type=int, default=None)
     parser.add_argument("--curve", action="store_true", help="also judge every snapshot of the training")
@@ -157,17 +185,20 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     paths = Paths(args.out)
     references = make_reference(paths, TRAIN)
+    further = make_reference(paths, FURTHER)
     held = make_reference(paths, HELD)
-    train(paths, references, parse_wall_s(args.budget), compile_=args.compile)
+    budgets_s = (parse_wall_s(args.budget), parse_wall_s(args.further))
+    train(paths, references, further, budgets_s, compile_=args.compile)
     ship(paths.weights, paths.shipped)
     steps = args.solver_steps
     figures: dict[str, Any] = {}
     figures["rollout"] = judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)
     rolled = replica_paths(paths.folder / "rollout.h5", ROLLOUT_REPLICAS)
-    figures["floor"] = noise_floor([*references, *held], rolled)
+    figures["floor"] = noise_floor([*references, *further, *held], rolled)
     if args.curve:
-        for weights in [*sorted(paths.folder.glob("model.at*min.safetensors")), paths.weights]:
-            name = weights.stem.replace("model", "curve").replace(".at", "_")
+        snapshots = [p for stem in ("first", "model") for p in sorted(paths.folder.glob(f"{stem}.at*min.safetensors"))]
+        for weights in [*snapshots, paths.first, paths.weights]:
+            name = "curve_" + weights.stem.replace(".at", "_")
             figures[name] = judge(weights, held, paths.folder, name, total_ps=CURVE_PS, solver_steps=steps)
     (paths.folder / "figures.json").write_text(json.dumps(figures, indent=1))
 
