@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from surrogate.data.shipped import weights_path
 from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, find_trajectories, guarded_outputs
 from surrogate.progress import progress_bar
-from systems.errors import InputError, UnknownNameError
+from systems.errors import InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
     from md_reference.simulate import MDConfig
@@ -510,17 +510,25 @@ def info(path: PathLike) -> dict[str, Any]:
 
 
 def windows(
-    references: Trajectories, out: PathLike, *, canonical: bool = True, overwrite: bool = False, quiet: bool = False
+    references: Trajectories,
+    out: PathLike,
+    *,
+    canonical: bool = True,
+    velocities: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
 ) -> Path:
     """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
 
-    Raises InputError when scenes, save intervals or conditions differ, TrajectoryError for damaged files.
+    `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when scenes,
+    save intervals or conditions differ, TrajectoryError for damaged files.
     """
     from surrogate.data.frames import collect_frames
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=overwrite)
-    collect_frames(find_trajectories(references, verify=True), canonical=canonical).save(out)
+    paths = find_trajectories(references, verify=True)
+    collect_frames(paths, canonical=canonical and not velocities, velocities=velocities).save(out)
     return out
 
 
@@ -543,21 +551,38 @@ def train(
 ) -> Path:
     """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
-    Ends after `budget_s` seconds of training or `steps` optimiser steps over both stages, whichever is given. `config`:
-    a TOML file of model settings. `start_from`: weights (name or file) whose second stage is trained further, with
-    their configuration. `time_reversal` shows every other window backwards, right for a reference in equilibrium;
-    `rare_draws` is the share of windows drawn for a rare state they show (surrogate.data.rarity). Beside `out`, a CSV
-    holds the training curves and, until done, files the state that `resume` goes on from. Raises InputError,
-    TrajectoryError, SimulationError (training diverged), StorageError.
+    `arch`: lam-slide; painet or its decoder alone, egnn, which learn from velocities (a reference made with
+    --save-velocities and natural hydrogen masses); or a baseline that is fitted in one go: frozen, constant-velocity,
+    resampling, normal-modes, msm. The others end after `budget_s` seconds of training or `steps` optimiser steps over
+    all stages, whichever is given. `config`: a TOML file of model settings. `start_from`: weights (name or file) whose
+    second stage is trained further, with their configuration. `time_reversal` shows every other window backwards,
+    right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
+    (surrogate.data.rarity). Beside `out`, a CSV holds the training curves and, until done, files the state that
+    `resume` goes on from. Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
-    architectures = ["lam-slide"]
+    from surrogate.trainings import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
+
+    architectures = [*GENERATIVE, *FORECASTERS, *FITTED]
     if arch not in architectures:
-        raise UnknownNameError(f"unknown architecture {arch!r}; known: {', '.join(architectures)}.")
-    if budget_s is None and steps is None:
-        raise InputError("say how long to train: --budget 30min or --steps 10000.")
-    if steps is not None and steps < 2:
-        raise InputError("--steps must be at least 2: one for each stage.")
+        raise UnknownNameError(
+            f"unknown architecture {arch!r}; known: {', '.join(architectures)}.{nearest(arch, architectures)}"
+        )
     out = Path(out)
+    request = TrainingRequest(
+        arch=arch,
+        paths=[],
+        out=out,
+        config=None if config is None else Path(config),
+        budget_s=budget_s,
+        steps=steps,
+        start_from=None if start_from is None else weights_path(start_from),
+        time_reversal=time_reversal,
+        rare_draws=rare_draws,
+        seed=seed,
+        device=device,
+        resume=resume,
+    )
+    request.check()
     check_outputs([out], [".safetensors"], resume=resume, overwrite=overwrite)
     states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
     if states and not (resume or overwrite):
@@ -565,48 +590,15 @@ def train(
     if resume and out.exists() and not states:
         return out
     paths = find_trajectories(references, verify=True)
+    prepared = prepare_training(replace(request, paths=paths, device=_device(device)))
+    with progress_bar(f"training {prepared.scene}", quiet=quiet) as bar:
 
-    from surrogate.data.frames import collect_frames, load_frames
-    from surrogate.describe import is_windows
-    from surrogate.models.lam_slide.config import LamSlideConfig
-    from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
-
-    start = None
-    if start_from is not None:
-        from surrogate.data.weights import load_weights
-
-        if config is not None:
-            raise InputError("--from takes the configuration of its weights; leave --config out.")
-        start = load_weights(weights_path(start_from))
-        model_config = start.model.config
-    else:
-        model_config = LamSlideConfig() if config is None else LamSlideConfig.from_toml(config)
-    in_windows = [is_windows(path) for path in paths]
-    if any(in_windows) and len(paths) > 1:
-        raise InputError("give either trajectories or one windows file to train on.")
-    frames = load_frames(paths[0]) if any(in_windows) else collect_frames(paths, canonical=model_config.canonical)
-    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
-        frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
-    first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
-    settings = TrainingConfig(
-        budget_s=budget_s,
-        stage_one_steps=first,
-        stage_two_steps=None if steps is None or first is None else steps - first,
-        seed=seed,
-        device=_device(device),
-        time_reversal=time_reversal,
-        rare_draws=rare_draws,
-    )
-    share_one = 0.0 if start is not None else STAGE_ONE_SHARE
-    with progress_bar(f"training {frames.scene.name}", quiet=quiet) as advance:
-
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            done = share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one)
-            if advance is not None:
-                advance(round(1000 * done), 1000, stage)
+        def advance(stage: str, share: float) -> None:
+            if bar is not None:
+                bar(round(1000 * share), 1000, stage)
 
         try:
-            return train_lam_slide(frames, out, model_config, settings, start=start, resume=resume, progress=report)
+            return prepared.start(advance)
         except KeyboardInterrupt:
             kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
             if not kept:

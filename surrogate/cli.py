@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 
 from surrogate.cli_bench import bench
 from surrogate.cli_options import (
+    ArchOpt,
     Atoms,
     AtomsOpt,
     DropLigandOpt,
@@ -47,6 +48,7 @@ from surrogate.cli_options import (
     Solver,
     TemperatureOpt,
     TimestepOpt,
+    VelocitiesOpt,
     WantedTemperatureOpt,
     parse_hydrogen_mass_da,
 )
@@ -305,6 +307,7 @@ def windows(
         list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
+    velocities: VelocitiesOpt = False,
     overwrite: OverwriteOpt = False,
     quiet: QuietOpt = False,
     as_json: JsonOpt = False,
@@ -312,7 +315,8 @@ def windows(
     """Turn reference trajectories into training data: one compact file."""
     from surrogate import api
 
-    print_written([api.windows(references, out, overwrite=overwrite, quiet=quiet)], as_json, quiet)
+    written = api.windows(references, out, velocities=velocities, overwrite=overwrite, quiet=quiet)
+    print_written([written], as_json, quiet)
 
 
 @app.command()
@@ -321,7 +325,7 @@ def train(
         list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write, .safetensors.")],
-    arch: Annotated[str, typer.Option("--arch", help="lam-slide.")] = "lam-slide",
+    arch: ArchOpt = "lam-slide",
     config: Annotated[Path | None, typer.Option("--config", help="TOML of model and training settings.")] = None,
     budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,

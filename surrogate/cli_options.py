@@ -68,6 +68,14 @@ EnsembleOpt = Annotated[str | None, typer.Option("--ensemble", help="nvt, nve or
 PressureOpt = Annotated[float | None, typer.Option("--pressure", help="Of the barostat (npt), in bar. [default: 1]")]
 SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep them with each frame (.h5).")]
 SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them with each frame (.h5).")]
+ArchOpt = Annotated[
+    str,
+    typer.Option(
+        "--arch",
+        help="lam-slide, painet, egnn; baselines: frozen, constant-velocity, resampling, normal-modes, msm.",
+    ),
+]
+VelocitiesOpt = Annotated[bool, typer.Option("--velocities", help="Keep velocities, which painet learns from.")]
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
 ]

@@ -1,0 +1,165 @@
+"""One training per architecture: what the verb `train` reads, sets up and starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.data.frames import TrainingFrames
+
+# (stage, share of all that is to be done) -> None
+AdvanceFn = Callable[[str, float], None]
+# Names on the command line, what each needs: checked before torch is imported.
+GENERATIVE = ("lam-slide",)
+FORECASTERS = ("painet", "egnn")
+FITTED = ("frozen", "constant-velocity", "resampling", "normal-modes", "msm")
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """What `api.train` was asked for, checked as far as names and numbers go."""
+
+    arch: str
+    paths: list[Path]
+    out: Path
+    config: Path | None
+    budget_s: float | None
+    steps: int | None
+    start_from: Path | None
+    time_reversal: bool
+    rare_draws: float
+    seed: int
+    device: str
+    resume: bool
+
+    def check(self) -> None:
+        """Raise InputError for options that mean nothing to this architecture."""
+        if self.arch in FITTED:
+            given = {"--budget": self.budget_s, "--steps": self.steps, "--config": self.config}
+            self._refuse([k for k, v in given.items() if v is not None], "is fitted in one go")
+        elif self.budget_s is None and self.steps is None:
+            raise InputError("say how long to train: --budget 30min or --steps 10000.")
+        if self.arch in GENERATIVE:
+            if self.steps is not None and self.steps < 2:
+                raise InputError("--steps must be at least 2: one for each stage.")
+            if self.start_from is not None and self.config is not None:
+                raise InputError("--from takes the configuration of its weights; leave --config out.")
+        else:
+            others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws}
+            self._refuse([k for k, v in others.items() if v], "does not know it")
+
+    def _refuse(self, options: list[str], why: str) -> None:
+        if options:
+            raise InputError(f"{', '.join(options)}: {self.arch} {why}; leave it out.")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A training whose input has been read and found fit: `start(advance)` does it and returns the weights written."""
+
+    scene: str
+    start: Callable[[AdvanceFn], Path]
+
+
+def prepare_training(request: TrainingRequest) -> Prepared:
+    """Read the frames and settings of a training. Errors are those of `api.train`."""
+    if request.arch in GENERATIVE:
+        return _lam_slide(request)
+    return _forecaster(request) if request.arch in FORECASTERS else _fitted(request)
+
+
+def _lam_slide(request: TrainingRequest) -> Prepared:
+    from surrogate.data.weights import load_weights
+    from surrogate.models.lam_slide.config import LamSlideConfig
+    from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
+
+    start = None
+    if request.start_from is not None:
+        start = load_weights(request.start_from)
+        if start.model.arch != request.arch:
+            raise InputError(f"{request.start_from} holds {start.model.arch}, not {request.arch}.")
+        model_config = start.model.config
+    else:
+        model_config = LamSlideConfig() if request.config is None else LamSlideConfig.from_toml(request.config)
+    frames = read_frames(request, canonical=model_config.canonical)
+    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+        frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
+    steps = request.steps
+    first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
+    settings = TrainingConfig(
+        budget_s=request.budget_s,
+        stage_one_steps=first,
+        stage_two_steps=None if steps is None or first is None else steps - first,
+        seed=request.seed,
+        device=request.device,
+        time_reversal=request.time_reversal,
+        rare_draws=request.rare_draws,
+    )
+    share_one = 0.0 if start is not None else STAGE_ONE_SHARE
+
+    def run(advance: AdvanceFn) -> Path:
+        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+            advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
+
+        return train_lam_slide(
+            frames, request.out, model_config, settings, start=start, resume=request.resume, progress=report
+        )
+
+    return Prepared(frames.scene.name, run)
+
+
+def _forecaster(request: TrainingRequest) -> Prepared:
+    from surrogate.models.painet.config import PainetConfig
+    from surrogate.models.painet.model import EgnnForecaster, Painet
+    from surrogate.models.settings import read_toml
+    from surrogate.training.painet import PainetTraining, train_painet
+
+    model_config = PainetConfig() if request.config is None else PainetConfig.from_dict(read_toml(request.config))
+    frames = read_frames(request, canonical=False, velocities=True)
+    span = model_config.n_new * model_config.frame_stride
+    frames.window_starts(2 * span + 1, validation=False)
+    frames.window_starts(span + 1, validation=True)
+    settings = PainetTraining(budget_s=request.budget_s, steps=request.steps, seed=request.seed, device=request.device)
+    kind = EgnnForecaster if request.arch == EgnnForecaster.arch else Painet
+
+    def run(advance: AdvanceFn) -> Path:
+        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+            advance(stage, share)
+
+        return train_painet(
+            frames, request.out, model_config, settings, model_class=kind, resume=request.resume, progress=report
+        )
+
+    return Prepared(frames.scene.name, run)
+
+
+def _fitted(request: TrainingRequest) -> Prepared:
+    from surrogate.training.baselines import fit_baseline
+
+    frames = read_frames(request, canonical=True)
+    return Prepared(
+        frames.scene.name, lambda advance: fit_baseline(request.arch, frames, request.out, seed=request.seed)
+    )
+
+
+def read_frames(request: TrainingRequest, *, canonical: bool, velocities: bool = False) -> TrainingFrames:
+    """Return the frames of one windows file or of trajectories, as the architecture wants them."""
+    from surrogate.data.frames import collect_frames, load_frames
+    from surrogate.describe import is_windows
+
+    if not any(is_windows(path) for path in request.paths):
+        return collect_frames(request.paths, canonical=canonical, velocities=velocities)
+    if len(request.paths) > 1:
+        raise InputError("give either trajectories or one windows file to train on.")
+    frames = load_frames(request.paths[0])
+    if velocities and frames.velocities is None:
+        raise InputError(
+            f"{request.paths[0]} holds no velocities, which {request.arch} learns from; make it with "
+            "`surromd windows --velocities`."
+        )
+    return frames

@@ -1,0 +1,85 @@
+"""Architectures beside LaM-SLidE through the command line: reference, windows, train, info, rollout."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from surrogate.cli import app
+from systems.trajectory import open_trajectory
+
+TINY = "n_new = 4\nwidth = 16\nn_heads = 2\nhead_dim = 8\nn_decoder_layers = 1\n"
+
+
+def run(*arguments: str) -> Any:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def done(*arguments: str) -> Any:
+    result = run(*arguments, "--quiet")
+    assert result.exit_code == 0, result.output + result.stderr
+    return result
+
+
+def refusal(*arguments: str) -> str:
+    result = run(*arguments)
+    assert result.exit_code == 1, result.output
+    (line,) = result.stderr.splitlines()
+    return line
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ethanol with velocities: 160 frames, 5 fs apart, natural masses."""
+    path = tmp_path_factory.mktemp("moving") / "ethanol.h5"
+    done("reference", "ethanol", "--time", "0.8ps", "--save-every", "5fs", "--save-velocities", "-o", str(path))
+    return path
+
+
+@pytest.mark.parametrize("arch", ["painet", "egnn"])
+def test_a_forecaster_is_trained_and_rolls_out(tmp_path: Path, moving: Path, arch: str) -> None:
+    (tmp_path / "tiny.toml").write_text(TINY)
+    windows, weights, out = (str(tmp_path / name) for name in ("w.h5", "m.safetensors", "roll.h5"))
+    done("windows", str(moving), "--velocities", "-o", windows)
+    done("train", windows, "--arch", arch, "--config", str(tmp_path / "tiny.toml"), "--steps", "3", "-o", weights)
+    told = json.loads(run("info", weights, "--json").stdout)
+    assert told["config"]["attention"] == ("none" if arch == "egnn" else "linear")
+    assert told["config"]["temperature_k"] == 500.0
+    assert told["lag_ps"] == pytest.approx(0.005)
+    done("rollout", "ethanol", "--weights", weights, "--time", "0.1ps", "--replicas", "2", "-o", out)
+    with open_trajectory(tmp_path / "roll_r1.h5") as reader:
+        assert reader.n_frames == 20
+        assert reader.record["model"] == arch
+        assert reader.record["solver"] is None
+        assert np.isfinite(reader.read()).all()
+    solver = refusal("rollout", "ethanol", "--weights", weights, "--time", "0.1ps", "--solver", "euler", "-o", "x.h5")
+    assert "no solver" in solver
+
+
+@pytest.mark.parametrize("arch", ["frozen", "normal-modes", "msm"])
+def test_a_baseline_is_fitted_and_rolls_out(tmp_path: Path, moving: Path, arch: str) -> None:
+    weights, out = str(tmp_path / "b.safetensors"), tmp_path / "roll.h5"
+    done("train", str(moving), "--arch", arch, "-o", weights)
+    done("rollout", "ethanol", "--weights", weights, "--time", "0.2ps", "-o", str(out))
+    with open_trajectory(out) as reader:
+        frames = reader.read()
+        assert reader.record["model"] == arch
+    assert (np.abs(frames - frames[0]).max() > 1e-3) == (arch != "frozen")
+
+
+def test_what_an_architecture_cannot_use_is_refused(tmp_path: Path, moving: Path) -> None:
+    out = ["-o", str(tmp_path / "m.safetensors")]
+    assert "Did you mean 'painet'?" in refusal("train", str(moving), "--arch", "painte", "--steps", "4", *out)
+    assert "--rare-draws" in refusal("train", str(moving), "--arch", "painet", "--steps", "4", "--rare-draws", "0.5",
+                                     *out)  # fmt: skip
+    assert "--budget" in refusal("train", str(moving), "--arch", "msm", "--budget", "1min", *out)
+    assert "--budget 30min" in refusal("train", str(moving), "--arch", "painet", *out)
+    still = str(tmp_path / "still.h5")
+    done("windows", str(moving), "-o", still)
+    assert "surromd windows --velocities" in refusal("train", still, "--arch", "painet", "--steps", "4", *out)
+    assert not Path(out[1]).exists()
