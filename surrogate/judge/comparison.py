@@ -13,7 +13,7 @@ from surrogate.judge import curves, metrics, relaxation, verdict
 from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.charts import Chart
 from surrogate.judge.curves import Curves
-from surrogate.judge.ensemble import Ensemble, equal_lags
+from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
@@ -122,7 +122,8 @@ def compare(
 ) -> Comparison:
     """Judge each candidate against the reference, beside a replicate of equal length.
 
-    All ensembles must hold the atoms of `scene` (the reference's by default) in its order. Without a replicate the
+    All ensembles must hold the atoms of `scene` (the reference's by default) in its order, or some of them, named in
+    `Ensemble.kept`: then all are compared on the atoms that they share. Without a replicate the
     reference is cut in two halves, the second serving as the replicate of the first. Each candidate is judged by
     itself, at the longest length that it shares with reference and replicate: adding a candidate changes no other's
     numbers. Raises InputError when there is no candidate, atoms differ, or too few frames are left.
@@ -131,14 +132,16 @@ def compare(
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
     chosen = options or Options()
     stage = scene or reference.scene
-    everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
+    everyone, kept = on_common_atoms([reference, *candidates, *([] if replicate is None else [replicate])])
+    # Torsions and rings are found in the whole molecule; only hydrogens or side chains may be missing.
+    whole, stage = stage, stage if kept is None else everyone[0].scene
     for ensemble in everyone:
         if ensemble.scene.elements != stage.elements:
             raise InputError(f"{ensemble.label}: its atoms are not those of {stage.name!r} in the same order.")
     thinned = equal_lags(everyone)
-    torsions = backbone(stage)
+    torsions = backbone(whole, kept)
     geometry = reference_geometry(thinned[0])
-    probes = reference_probes(thinned[0])
+    probes = reference_probes(thinned[0], parent=whole, kept=kept)
     measured = [measure(e, torsions, geometry, probes) for e in thinned]
     notes = [note for e in thinned for note in e.notes]
     truth = measured[0]

@@ -12,23 +12,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.errors import InputError, OutOfDomainError, TrajectoryError
+from surrogate.judge.reading import common_lag, merged_record, open_matched, time_axis
+from surrogate.judge.stored_frames import StoredFrames
+from systems.errors import InputError
 from systems.scene import Scene
+from systems.selection import part_of
 from systems.units import format_time_ps
 
-Frames = npt.NDArray[np.float32]
+Frames = npt.NDArray[np.float32] | StoredFrames
 Flags = npt.NDArray[np.uint16]
 IntArray = npt.NDArray[np.int64]
 
-_READ_FRAMES = 8192
-_SETTINGS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "model", "weights_hash")
+IN_MEMORY_BYTES = 128 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
     """Frames of one candidate: one or several segments (replicas, or stretches of unbroken time).
 
-    `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`; `lag_ps`: time between frames;
+    `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
+    by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
     `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
     the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
     said of them; `notes`: what was done on reading.
@@ -46,6 +49,7 @@ class Ensemble:
     top: str | None = None
     stated_lag_ps: float | None = None
     notes: tuple[str, ...] = ()
+    kept: IntArray | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
@@ -81,12 +85,18 @@ class Ensemble:
             return self
         return replace(
             self,
-            segments=[s[::stride] for s in self.segments],
+            segments=[s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments],
             flags=None if self.flags is None else [f[::stride] for f in self.flags],
             chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
             lag_ps=self.lag_ps * stride,
             notes=(*self.notes, f"{self.label}: every {stride}th frame used, for equal save intervals."),
         )
+
+    def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
+        """Return the same frames with `atoms` `(k,)` only, which are those of `scene`."""
+        segments = [s.restricted(atoms) if isinstance(s, StoredFrames) else s[:, atoms] for s in self.segments]
+        kept = atoms if self.kept is None else self.kept[atoms]
+        return replace(self, segments=segments, scene=scene, kept=kept)
 
 
 def load_ensemble(
@@ -96,17 +106,19 @@ def load_ensemble(
     template: Scene | None = None,
     top: str | Path | None = None,
     lag_ps: float | None = None,
+    in_memory_bytes: int = IN_MEMORY_BYTES,
 ) -> Ensemble:
     """Read one or several trajectory files as the replicas of one candidate.
 
-    Atoms are put in the order of `template` (matched by the bond graph where order or names differ); without one the
-    first file's scene is the template. A file whose time jumps is cut there into segments. `lag_ps` overrides the
-    times in the files. `top` is the topology for formats that hold none.
-    Raises InputError (no files, nothing known of the topology, replicas with different lags or uneven time without
-    `lag_ps`), OutOfDomainError (another molecule) and TrajectoryError (a damaged file).
+    Any format that MDTraj or MDAnalysis reads. Atoms are put in the order of `template` (matched by the bond graph
+    where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
+    those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
+    periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
+    the files. `top` is the topology for formats that hold none. A file with more than `in_memory_bytes` of coordinates
+    is left where it is and read block by block.
+    Raises InputError (no files, nothing known of the topology, no times without `lag_ps`, replicas with different lags
+    or atoms), OutOfDomainError (another molecule) and TrajectoryError (a damaged file, uneven time).
     """
-    from systems.trajectory import open_trajectory
-
     if not paths:
         raise InputError("No trajectory file was given.")
     name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
@@ -116,43 +128,71 @@ def load_ensemble(
     records: list[dict[str, Any]] = []
     lags: list[float] = []
     notes: list[str] = []
+    kept: list[IntArray] = []
     for path in paths:
-        with open_trajectory(Path(path), top=None if top is None else Path(top)) as reader:
-            if reader.n_frames == 0:
-                raise InputError(f"{path}: no frames.")
-            order, template, note = _atom_order(str(path), reader.scene, reader.n_atoms, template)
-            notes += note
-            lag, cuts, note = _time_axis(str(path), reader.time_ps, lag_ps)
-            notes += note
-            lags.append(lag)
-            frames = np.empty((reader.n_frames, template.n_atoms, 3), dtype=np.float32)
-            for start in range(0, reader.n_frames, _READ_FRAMES):
-                stop = min(start + _READ_FRAMES, reader.n_frames)
-                block = reader.read(start, stop)
-                frames[start:stop] = block if order is None else block[:, order]
-            segments += np.split(frames, cuts)
-            if reader.flags is not None:
-                flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
-            if reader.chunk_idx is not None:
-                chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
-            records.append(dict(reader.record))
-            if records[-1].get("completed") is False:
-                notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
+        opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
+        reader, template = opened.reader, opened.template
+        kept.append(opened.kept)
+        lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        notes += note
+        lags.append(lag)
+        frames = opened.frames
+        if 12 * len(frames) * reader.n_atoms <= in_memory_bytes:
+            segments += np.split(frames[:], cuts)
+            reader.close()
+        else:
+            segments += frames.split(cuts)
+        if reader.flags is not None:
+            flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
+        if reader.chunk_idx is not None:
+            chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
+        records.append(dict(reader.record))
+        if records[-1].get("completed") is False:
+            notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
     assert template is not None
-    lag = _common([x for x in lags if math.isfinite(x)], paths, lag_ps)
+    if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
+        raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
+    lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
+    part = kept[0] if len(kept[0]) < template.n_atoms else None
     return Ensemble(
         label=name,
         segments=segments,
         lag_ps=lag,
-        scene=template,
+        scene=template if part is None else part_of(template, part),
         flags=flags if len(flags) == len(segments) else None,
         chunk_idx=chunks if len(chunks) == len(segments) else None,
-        record=_merged_record(records, name, notes),
+        record=merged_record(records, name, notes),
         sources=tuple(str(p) for p in paths),
         top=None if top is None else str(top),
         stated_lag_ps=lag_ps,
         notes=tuple(notes),
+        kept=part,
     )
+
+
+def on_common_atoms(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
+    """Return the ensembles on the atoms that all of them hold, and which of the first's these are (None: all).
+
+    The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
+    are left.
+    """
+    reference = ensembles[0]
+    if all(e.kept is None for e in ensembles[1:]):
+        return list(ensembles), None
+    common = np.arange(reference.scene.n_atoms)
+    for ensemble in ensembles[1:]:
+        if ensemble.kept is not None:
+            common = np.intersect1d(common, ensemble.kept)
+    if len(common) < 3:
+        raise InputError("The trajectories have fewer than three atoms in common; save more, or compare them apart.")
+    scene = part_of(reference.scene, common)
+    out = []
+    for ensemble in ensembles:
+        held = np.arange(reference.scene.n_atoms) if ensemble is reference or ensemble.kept is None else ensemble.kept
+        out.append(ensemble.restricted(np.searchsorted(held, common), scene))
+    note = f"Compared on the {len(common)} atoms that all trajectories hold, of {reference.scene.n_atoms}."
+    out[0] = replace(out[0], notes=(*out[0].notes, note))
+    return out, common
 
 
 def equal_lags(ensembles: Sequence[Ensemble]) -> list[Ensemble]:
@@ -175,85 +215,3 @@ def equal_lags(ensembles: Sequence[Ensemble]) -> list[Ensemble]:
             )
         out.append(ensemble.strided(stride))
     return out
-
-
-def _atom_order(
-    path: str, scene: Scene | None, n_atoms: int, template: Scene | None
-) -> tuple[IntArray | None, Scene, list[str]]:
-    """Return the index that brings the file's atoms into the template's order (None: as they are), and the template."""
-    if template is None:
-        if scene is None:
-            raise InputError(f"{path} holds no topology; give one with --top FILE.pdb.")
-        return None, scene, []
-    if scene is None:
-        if n_atoms != template.n_atoms:
-            raise OutOfDomainError(
-                f"{path} has {n_atoms} atoms, {template.name!r} has {template.n_atoms}; give its topology with --top."
-            )
-        return None, template, [f"{path}: no topology; its atoms are taken to be in the order of {template.name!r}."]
-    if scene.topology_hash == template.topology_hash:
-        return None, template, []
-    from systems.chemistry import match_atoms
-
-    try:
-        order = np.asarray(match_atoms(scene, template), dtype=np.int64)
-    except OutOfDomainError as error:
-        raise OutOfDomainError(f"{path} does not hold the molecule of the reference: {error}") from error
-    moved = bool((order != np.arange(len(order))).any())
-    how = "reordered" if moved else "in the same order"
-    return (order if moved else None), template, [f"{path}: atoms matched by the bond graph ({how})."]
-
-
-def _time_axis(path: str, time_ps: npt.NDArray[np.float64], stated: float | None) -> tuple[float, list[int], list[str]]:
-    """Return the lag (NaN when one frame leaves it open), the frames at which a new segment starts, and notes."""
-    steps = np.diff(time_ps)
-    measured = float(f"{np.median(steps):.6g}") if len(steps) else math.nan
-    if stated is not None:
-        note = []
-        if math.isfinite(measured) and abs(measured - stated) > 1e-3 * stated:
-            note = [f"{path}: {format_time_ps(stated)} per frame as stated; the file itself says {measured:g} ps."]
-        return stated, [], note
-    if not len(steps):
-        return math.nan, [], []
-    if not (np.isfinite(time_ps).all() and measured > 0):
-        raise InputError(f"{path}: the file holds no usable times; state the time between frames with --lag 1ps.")
-    # Times that passed through float32 are exact only to its spacing.
-    tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
-    odd = np.abs(steps - measured) > tolerance
-    jump = odd & ((steps <= 0) | (steps >= 1.5 * measured))
-    if (odd & ~jump).any() or jump.sum() > 0.02 * len(steps):
-        first = int(np.flatnonzero(odd)[0])
-        raise TrajectoryError(
-            f"{path}: time is uneven (frame {first} to {first + 1}: {steps[first]:g} ps, most steps {measured:g} ps); "
-            "state the time between frames with --lag if you know it to be even."
-        )
-    cuts = (np.flatnonzero(jump) + 1).tolist()
-    notes = [f"{path}: time jumps {len(cuts)} times; the stretches between are treated as segments."] if cuts else []
-    return measured, cuts, notes
-
-
-def _common(lags: Sequence[float], paths: Sequence[str | Path], stated: float | None) -> float:
-    if stated is not None:
-        return stated
-    if not lags:
-        raise InputError(f"{paths[0]}: one frame only, so the time between frames is unknown; state it with --lag 1ps.")
-    if max(lags) - min(lags) > 1e-3 * min(lags):
-        listed = ", ".join(f"{p}: {x:g} ps" for p, x in zip(paths, lags, strict=False))
-        raise InputError(f"Replicas of one candidate must share one save interval ({listed}); thin them or use --lag.")
-    return lags[0]
-
-
-def _merged_record(records: Sequence[dict[str, Any]], label: str, notes: list[str]) -> dict[str, Any]:
-    """Return the first record with costs summed over all, noting settings in which the files differ."""
-    merged = dict(records[0])
-    for key in _SETTINGS:
-        values = {str(r.get(key)) for r in records}
-        if len(values) > 1:
-            notes.append(f"{label}: its files differ in {key} ({', '.join(sorted(values))}).")
-    costs = [c for c in (r.get("cost") for r in records) if isinstance(c, dict)]
-    merged.pop("cost", None)
-    if len(costs) == len(records):
-        shared = set.intersection(*(set(c) for c in costs))
-        numbers = sorted(k for k in shared if all(isinstance(c[k], (int, float)) for c in costs))
-        merged["cost"] = {k: sum(c[k] for c in costs) for k in numbers}
-    return merged

@@ -97,13 +97,18 @@ class Features:
         )
 
 
-def backbone(scene: Scene) -> Backbone:
-    """Return the backbone torsions of `scene`, found in its bond graph, with labels such as 'ALA 2'."""
+def backbone(scene: Scene, kept: IntArray | None = None) -> Backbone:
+    """Return the backbone torsions of `scene`, found in its bond graph, with labels such as 'ALA 2'.
+
+    With `kept`, the atoms of `scene` that are left, those torsions whose atoms all are, counted among them.
+    """
     from systems.chemistry import backbone_torsions
 
     found = backbone_torsions(scene)
     phi = np.asarray(found["phi"], dtype=np.int64).reshape(-1, 4)
     psi = np.asarray(found["psi"], dtype=np.int64).reshape(-1, 4)
+    if kept is not None:
+        phi, psi = (rows[np.isin(rows, kept).all(axis=1)] for rows in (phi, psi))
 
     # phi is C-N-CA-C and psi N-CA-C-N: the residue is that of CA.
     def label(alpha_carbon: int) -> str:
@@ -116,7 +121,10 @@ def backbone(scene: Scene) -> Backbone:
         for k, quad in enumerate(phi)
         if int(quad[2]) in of_carbon
     )
-    return Backbone(phi, psi, tuple(label(int(q[2])) for q in phi), tuple(label(int(q[1])) for q in psi), residues)
+    labels = tuple(label(int(q[2])) for q in phi), tuple(label(int(q[1])) for q in psi)
+    if kept is not None:
+        phi, psi = (np.searchsorted(kept, rows) for rows in (phi, psi))
+    return Backbone(phi, psi, *labels, residues)
 
 
 def sample_frames(ensemble: Ensemble, n_frames: int) -> npt.NDArray[np.float32]:
