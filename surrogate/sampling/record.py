@@ -108,9 +108,9 @@ def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path])
     """Return why a rollout cannot go on, where, and what to do."""
     assert chunk.failure is not None
     row, reason = chunk.failure
-    at = format_time_ps(max(state.steps, 1) * plan.weights.domain.lag_ps)
+    at = f"after {format_time_ps(state.steps * plan.weights.domain.lag_ps)}" if state.steps else "in its first chunk"
     if plan.config.guard in ("off", "flag"):
         advice = f"the frames are marked in {outs[row]}. Try --precision fp32, --guard repair or other weights."
     else:
         advice = f"the frames before are in {outs[row]}. Use other weights, or `surromd reference` for this molecule."
-    return f"replica {row}, after {at}: {reason}; {advice}"
+    return f"replica {row}, {at}: {reason}; {advice}"
