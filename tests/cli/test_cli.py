@@ -92,6 +92,7 @@ def test_every_command_explains_itself(command: str) -> None:
         ["rollout", "alanine-dipeptide", "--no-such-flag"],
         ["reference", "alanine-dipeptide", "--time", "1ns", "-o", "x.h5", "--replicas", "0"],
         ["rollout", "x", "--weights", "w", "--time", "1ns", "-o", "x.h5", "--precision", "fp8"],
+        ["rollout", "x", "--weights", "w", "--time", "1ns", "-o", "x.h5", "--guard", "repare"],
     ],
 )
 def test_bad_usage_exits_with_2(here: Path, arguments: list[str]) -> None:
@@ -378,13 +379,22 @@ def test_damaged_weights_are_refused(here: Path, tiny_weights: Path) -> None:
 def test_rollout_streams_replicas_and_marks_chunks(here: Path, tiny_weights: Path) -> None:
     result = run(
         *["rollout", "alanine-dipeptide", "--weights", str(tiny_weights), "--time", "2ps", "--replicas", "2"],
-        *["-o", "x.h5", "--json", "--quiet"],
+        *["--guard", "off", "-o", "x.h5", "--json", "--quiet"],
     )
     assert result.exit_code == 0, result.stderr
     records = json.loads(result.stdout)
     assert [Path(r["file"]).name for r in records] == ["x_r0.h5", "x_r1.h5"]
     assert [r["n_frames"] for r in records] == [20, 20]
     assert all(r["type"] == "rollout trajectory" and r["invalid_frames"] is not None for r in records)
+
+
+def test_a_model_that_is_wrong_is_stopped_in_one_line(here: Path, tiny_weights: Path) -> None:
+    """Weights trained for no time at all: what `--guard off` lets pass is stopped by every other guard."""
+    for guard in ([], ["--guard", "resample"]):
+        command = ["rollout", "alanine-dipeptide", "--weights", str(tiny_weights), "--time", "1ns", "-o", "x.h5"]
+        result = run(*command, *guard, "--quiet", "--overwrite")
+        assert result.exit_code == 1
+        assert result.stderr.startswith("error: replica 0, in its first chunk: ") and result.stderr.count("\n") == 1
 
 
 def test_rollout_is_the_same_under_one_seed_and_differs_under_another(here: Path, tiny_weights: Path) -> None:
@@ -394,7 +404,7 @@ def test_rollout_is_the_same_under_one_seed_and_differs_under_another(here: Path
     for name, seed in (("a.h5", "1"), ("b.h5", "1"), ("c.h5", "2")):
         result = run(
             *["rollout", "alanine-dipeptide", "--weights", str(tiny_weights), "--time", "2ps", "--seed", seed],
-            *["-o", name, "--quiet"],
+            *["--guard", "off", "-o", name, "--quiet"],
         )
         assert result.exit_code == 0, result.stderr
         with open_trajectory(name) as reader:
@@ -410,7 +420,10 @@ def test_rollout_keeps_the_order_and_names_of_the_pdb(here: Path, tiny_weights: 
 
     lines = alanine_dipeptide_lines(alanine_dipeptide)
     (here / "mine.pdb").write_text("\n".join([*lines, "END"]) + "\n")
-    result = run("rollout", "mine.pdb", "--weights", str(tiny_weights), "--time", "2ps", "-o", "out.dcd", "--quiet")
+    result = run(
+        *["rollout", "mine.pdb", "--weights", str(tiny_weights), "--time", "2ps", "--guard", "off"],
+        *["-o", "out.dcd", "--quiet"],
+    )
     assert result.exit_code == 0, result.stderr
     names = [line[12:16].strip() for line in lines]
     trajectory = mdtraj.load("out.dcd", top="mine.pdb")
