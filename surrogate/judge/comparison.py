@@ -16,6 +16,7 @@ from surrogate.judge.curves import Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
+from surrogate.judge.peptide_protocol import peptide_charts
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
@@ -29,7 +30,7 @@ from systems.validity import Geometry
 
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
-ROOMS: tuple[Room, ...] = (msm_rows,)
+ROOMS: tuple[Room, ...] = (msm_rows, peptide_charts)
 
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.

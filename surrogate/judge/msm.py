@@ -79,8 +79,12 @@ class Model:
         return [table[m] for m in micro]
 
 
-def fit_projection(segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS) -> Projection | None:
+def fit_projection(
+    segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
+) -> Projection | None:
     """Fit TICA with kinetic-map scaling to features `(n, k)`; None when nothing varies.
+
+    At most `dim` coordinates are kept, those whose eigenvalue exceeds `least` and in any case the first.
 
     Source: Noe and Clementi, J. Chem. Theory Comput. 11, 5002 (2015): coordinates are scaled by their eigenvalues.
     """
@@ -95,9 +99,8 @@ def fit_projection(segments: Sequence[FloatArray], lag_frames: int, dim: int = M
     model = TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model()
     values = np.real(np.asarray(model.singular_values))[:dim]
     vectors = np.real(np.asarray(model.singular_vectors_left))[:, : len(values)]
-    # A process that is gone within one lag carries no kinetics, and its negative eigenvalue no distance.
-    kept = max(int((values > 0.01).sum()), 1)
-    matrix = vectors[:, :kept] * np.clip(values[:kept], 1e-3, 1.0)
+    kept = max(int((values > least).sum()), 1)
+    matrix = vectors[:, :kept] * np.clip(np.abs(values[:kept]), 1e-6, 1.0)
     return Projection(
         np.asarray(model.mean_0, dtype=np.float64), matrix, lag_frames, timescale(values[:kept], lag_frames)
     )
