@@ -48,7 +48,8 @@ class Coupling:
 
         self._scene, self._conditions = weights.domain.scene, weights.domain.conditions
         self._platform, self._lag_ps = platform, weights.domain.lag_ps
-        missing = [k for k in ("force_field", "solvent", "temperature_k", "timestep_ps") if k not in self._conditions]
+        needed = ("force_field", "solvent", "temperature_k", "timestep_ps")
+        missing = [key for key in needed if self._conditions.get(key) is None]
         if missing:
             raise InputError(
                 f"{_cannot(weights)}: they do not say which {' and '.join(missing)} they were trained with."
