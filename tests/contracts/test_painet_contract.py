@@ -170,3 +170,18 @@ def test_refreshed_velocities_are_those_of_the_bath() -> None:
     assert kept == pytest.approx(0.5488, abs=0.01)
     frozen = replace(SMALL, friction_per_ps=0.0)
     assert torch.equal(lively(frozen).refreshed(drawn[:5], molecule, noise[:5]), drawn[:5]), "NVE without friction"
+
+
+def test_decoding_row_by_row_is_decoding_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from surrogate.models.painet import model as room
+
+    model, molecule = lively(SMALL), branched_chain(9)
+    x, v = random_state(9, 3, 1)
+    whole = model(x[:, 0], v, model.structure(molecule))
+    calls: list[int] = []
+    model.decoder.register_forward_hook(lambda module, given, found: calls.append(len(given[0])))
+    monkeypatch.setattr(room, "MESSAGE_NUMBERS", 1)
+    single = model(x[:, 0], v, model.structure(molecule))
+    assert calls == [1] * 9, "three replicas of three frames, each alone"
+    for first, second in zip(whole, single, strict=True):
+        torch.testing.assert_close(first, second, rtol=0, atol=1e-6)
