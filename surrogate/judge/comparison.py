@@ -12,14 +12,18 @@ import numpy as np
 from surrogate.judge import curves, metrics, relaxation, verdict
 from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.charts import Chart
+from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
+from surrogate.judge.couplings import coupling_rows
 from surrogate.judge.curves import Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.peptide_protocol import peptide_charts
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
+from surrogate.judge.shape_rows import shape_rows
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.torsion_rows import other_torsion_rows
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
 from systems import validity
@@ -30,7 +34,15 @@ from systems.validity import Geometry
 
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
-ROOMS: tuple[Room, ...] = (msm_rows, peptide_charts)
+ROOMS: tuple[Room, ...] = (
+    shape_rows,
+    other_torsion_rows,
+    contact_rows,
+    hydrogen_bond_rows,
+    coupling_rows,
+    msm_rows,
+    peptide_charts,
+)
 
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
