@@ -62,6 +62,38 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Pérez-Hernández et al., J. Chem. Phys. 139, 015102 (2013); deeptime (Hoffmann et al., 2022)",
     ),
     Definition(
+        "Size and shape",
+        "Radius of gyration: mass-weighted, all atoms. End to end: between the two heavy atoms furthest apart in bonds. "
+        "RMSD and RMSF: heavy atoms (alpha carbons of large molecules) superposed on the mean structure of the "
+        "reference, the same for all trajectories. Values beyond the reference's range are cut a whole range outside it "
+        "in means, and have bins of their own in distances.",
+        "Gower, Psychometrika 40, 33 (1975); Theobald, Acta Cryst. A61, 478 (2005)",
+    ),
+    Definition(
+        "Other torsions",
+        "ω, χ (IUPAC), every other rotatable bond, and rotors (methyl, hydroxyl, ammonium). Where turning by 2π/m gives "
+        "the same molecule (m = 3 for methyl, 2 for phenyl), m times the angle is taken.",
+        "IUPAC-IUB Commission, Biochemistry 9, 3471 (1970)",
+    ),
+    Definition(
+        "Contacts, hydrogen bonds",
+        "Contact: two heavy atoms more than three bonds apart within 4.5 Å; in chains of five residues or more, two "
+        "alpha carbons three or more residues apart within 8 Å. Hydrogen bond: H to acceptor (N, O) below 2.5 Å, angle "
+        "at H above 120°.",
+        "Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97 (1984)",
+    ),
+    Definition(
+        "Ring pucker",
+        "Amplitude Q, and the phase φ₂ (θ for six-membered rings), of rings of 4 to 7 atoms that are not flat.",
+        "Cremer and Pople, J. Am. Chem. Soc. 97, 1354 (1975)",
+    ),
+    Definition(
+        "³J(HN,HA)",
+        "8.40 cos²θ - 1.36 cos θ + 0.33 Hz with θ = φ - 60° (φ + 60° for D residues, the mean of both for glycine), "
+        "averaged over frames.",
+        "Karplus, J. Chem. Phys. 30, 11 (1959); Vögeli et al., J. Am. Chem. Soc. 129, 9377 (2007)",
+    ),
+    Definition(
         "Valid frames",
         "Finite; every bond within 0.5 Å of its mean in the reference (the published stability rule) and, more "
         "strictly, within 20 %; no two atoms (beyond 1-4 neighbours) closer than the reference allows; every "
