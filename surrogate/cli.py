@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from surrogate.cli_bench import bench
+from surrogate.cli_bench import bench, stress
 from surrogate.cli_options import (
     ArchOpt,
     Atoms,
@@ -120,6 +120,7 @@ app = typer.Typer(
     "Durations carry units: 50ns, 10ps, 2fs.",
 )
 app.add_typer(bench, name="bench")
+app.command()(stress)
 
 
 @app.command()

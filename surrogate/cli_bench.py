@@ -1,4 +1,4 @@
-"""The verb `bench`: parsing and printing of benchmarks; each is a function of `surrogate.bench`."""
+"""The verbs `bench` and `stress`: parsing and printing; what they do are functions of `surrogate.bench`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogate.cli_options import JsonOpt, QuietOpt
+from surrogate.cli_options import JsonOpt, QuietOpt, SeedOpt
 from surrogate.cli_printing import print_json
 from systems.units import parse_wall_s
 
@@ -67,3 +67,42 @@ def reference(
     if not result["rows"] or not all(row["equal_energies"] for row in result["rows"]):
         typer.echo("error: no case ran, or energies differ: see above.", err=True)
         raise typer.Exit(1)
+
+
+def stress(
+    weights: Annotated[str, typer.Argument(metavar="WEIGHTS", help="Name of shipped weights, or a .safetensors file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the tables, the plot and the rollouts.")] = Path(
+        "surromd-stress"
+    ),
+    frames: Annotated[
+        list[int] | None, typer.Option("--frames", min=1, help="Length of a rollout, all replicas: 10000 and 100000.")
+    ] = None,
+    replicas: Annotated[int | None, typer.Option("--replicas", min=1, help="Of the rollouts: 16.")] = None,
+    guard: Annotated[list[str] | None, typer.Option("--guard", help="Of the rollouts: flag and repair.")] = None,
+    section: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--section", help="Only this: length, invariance, inputs, precision, batches, solvers, openmm. Repeatable."
+        ),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Short runs of everything: a minute or two.")] = False,
+    seed: SeedOpt = 0,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """How WEIGHTS stand long rollouts, odd inputs, other arithmetic and settings, beside OpenMM itself."""
+    from surrogate.bench.stress import choose_config, stress_weights
+
+    result = stress_weights(
+        weights,
+        out,
+        choose_config(quick=quick, frames=frames, replicas=replicas, guards=guard, sections=section, seed=seed),
+        report=lambda name: None if quiet or as_json else typer.echo(f"running: {name}", err=True),
+    )
+    if as_json:
+        print_json(result)
+    elif not quiet:
+        from surrogate.bench.stress_report import markdown
+
+        typer.echo(markdown(result))
+        typer.echo(f"{out}: stress.json, stress.md, stress.svg")

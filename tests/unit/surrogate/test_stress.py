@@ -1,0 +1,122 @@
+"""The stress test's own measures on frames whose faults are known, and the whole of it on tiny weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogate.bench.stress import StressConfig, choose_config, run_stress
+from surrogate.bench.stress_inputs import measure_invariance, measure_odd_inputs, permuted
+from surrogate.bench.stress_measures import measure_bonds, measure_drift, measure_validity
+from surrogate.bench.stress_report import markdown
+from surrogate.bench.stress_settings import measure_batches, measure_precision
+from surrogate.data.weights import Weights
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.validity import Geometry, geometry_from_frames
+
+
+@pytest.fixture(scope="module")
+def vibrating(alanine_dipeptide: Scene) -> np.ndarray:
+    """Four replicas of 200 frames that vibrate by 0.003 nm, `(4, 200, 22, 3)` nm."""
+    noise = np.random.default_rng(0).normal(scale=0.003, size=(4, 200, 22, 3))
+    return alanine_dipeptide.positions_nm + noise
+
+
+@pytest.fixture(scope="module")
+def geometry(alanine_dipeptide: Scene, vibrating: np.ndarray) -> Geometry:
+    return geometry_from_frames(alanine_dipeptide, vibrating.reshape(-1, 22, 3))
+
+
+def test_broken_frames_are_counted_and_dated(vibrating: np.ndarray, geometry: Geometry) -> None:
+    whole = measure_validity(list(vibrating), geometry, 2.0)
+    assert (whole.frames, whole.broken, whole.first_broken_ps) == (800, 0, None)
+    assert whole.survival == ((0.0, 1.0), (400.0, 1.0))
+    broken = vibrating.copy()
+    broken[1, 49, 0] += 0.3
+    broken[1, 120:, 0] += 0.3
+    broken[3, 9] = np.nan
+    found = measure_validity(list(broken), geometry, 2.0)
+    assert (found.broken, found.invalid, found.first_broken_ps) == (82, 82, 20.0)
+    assert found.survival == ((0.0, 1.0), (20.0, 0.75), (100.0, 0.5), (400.0, 0.5))
+    assert found.to_dict()["valid_half_angstrom_%"] == pytest.approx(100 * (1 - 82 / 800))
+
+
+def test_bonds_tell_length_and_temperature(vibrating: np.ndarray, geometry: Geometry, alanine_dipeptide: Scene) -> None:
+    frames = vibrating.reshape(-1, 22, 3)
+    same = measure_bonds(frames, geometry)
+    assert same["bond_shift_pm"] < 1e-6 and same["bond_variance_%"] == pytest.approx(100.0, abs=1e-6)
+    longer = measure_bonds(frames * 1.01, geometry)
+    assert longer["bond_shift_pm"] == pytest.approx(10.0 * geometry.bond_mean_nm.mean(), rel=0.05)
+    centre = alanine_dipeptide.positions_nm
+    hotter = measure_bonds(centre + np.sqrt(1.5) * (frames - centre), geometry)
+    assert hotter["bond_variance_%"] == pytest.approx(150.0, abs=2.0)
+
+
+def test_drift_between_first_and_last_tenth(
+    vibrating: np.ndarray, geometry: Geometry, alanine_dipeptide: Scene
+) -> None:
+    still = measure_drift(list(vibrating), alanine_dipeptide, geometry)
+    assert abs(still["first"]["bond_variance_%"] - still["last"]["bond_variance_%"]) < 25.0
+    drifting = vibrating.copy()
+    drifting[:, 150:, 14:] += [0.0, 0.06, 0.06]  # all atoms from C of ALA on
+    moved = measure_drift(list(drifting), alanine_dipeptide, geometry)
+    assert moved["last"]["bond_shift_pm"] > 5.0 > moved["first"]["bond_shift_pm"]
+    assert moved["torsion_jsd"] > 3.0 * moved["torsion_jsd_floor"]
+    assert still["torsion_jsd"] < 2.0 * still["torsion_jsd_floor"]
+
+
+def test_moved_and_permuted_input_gives_the_moved_chunk(small_weights: Weights) -> None:
+    rows = {row["input"]: row for row in measure_invariance(small_weights, precision="fp32")}
+    assert len(rows) == 5
+    for name, row in rows.items():
+        assert row["deviation_nm"] < (5e-6 if "1e+06" in name else 1e-6), name
+    scene = small_weights.domain.scene
+    order = np.random.default_rng(1).permutation(22)
+    other = permuted(scene, order)
+    assert [other.elements[k] for k in range(22)] == [scene.elements[i] for i in order]
+    assert other.molecule_key == scene.molecule_key
+
+
+def test_odd_inputs_are_refused_with_their_reason(small_weights: Weights) -> None:
+    rows = {row["input"]: row for row in measure_odd_inputs(small_weights, chunks=1)}
+    assert rows["noise of 0.001 nm"]["outcome"] == "run" and rows["noise of 0.001 nm"]["forced"] == ""
+    assert rows["mirrored"]["reasons"] == "stereo, start" and rows["mirrored"]["forced"] == "run, marked"
+    for name in ("heavy atoms only", "a proton less", "a coordinate that is no number"):
+        assert rows[name]["outcome"] == "refused" and rows[name]["forced"] == "refused too", name
+    assert rows["heavy atoms only"]["reasons"].startswith("size")
+    assert "start" in rows["clashing: two far atoms 0.02 nm apart"]["reasons"]
+
+
+def test_arithmetic_and_batches(small_weights: Weights) -> None:
+    rows = {row["arithmetic"]: row for row in measure_precision(small_weights, compiled=False)}
+    assert 1e-9 < rows["fp32"]["deviation_nm"] < 1e-4 < 50 * rows["bf16"]["deviation_nm"]
+    assert rows["bf16"]["rms_nm"] > 20 * rows["fp32"]["rms_nm"], "bf16 must not be float32 by another name"
+    assert rows["fp32, 1 thread"]["deviation_nm"] < 1e-4
+    one, four = measure_batches(small_weights, batches=(1, 4))
+    assert one["deviation_nm"] == 0.0 and four["deviation_nm"] < 1e-5
+
+
+def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
+    config = StressConfig(frames=(80,), replicas=2, guards=("flag",), sections=("length", "batches"), chunks=1,
+                          compiled=False)  # fmt: skip
+    told: list[str] = []
+    result = run_stress(small_weights, tmp_path, config, report=told.append)
+    assert told == ["length", "batches"]
+    (row,) = result["sections"]["length"]
+    assert row["frames"] == 80 and 0.0 <= row["valid_half_angstrom_%"] <= 100.0 and row["invalid_unmarked"] == 0
+    assert json.loads((tmp_path / "stress.json").read_text())["sections"]["length"][0]["frames"] == 80
+    text = (tmp_path / "stress.md").read_text()
+    assert "## Long rollouts" in text and "invalid unmarked" in text and text == markdown(result)
+    assert (tmp_path / "stress.svg").read_text().rstrip().endswith("</svg>")
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(InputError, match=r"no section 'lenght'.*length"):
+        choose_config(sections=["lenght"])
+    with pytest.raises(InputError, match="ten frames"):
+        choose_config(frames=[100], replicas=16)
+    assert choose_config(quick=True, frames=[5000]).frames == (5000,)
