@@ -53,6 +53,7 @@ from surrogate.cli_options import (
     parse_hydrogen_mass_da,
 )
 from surrogate.cli_printing import print_comparison, print_json, print_library, print_pairs, print_written
+from surrogate.cli_reproduce import reproduce
 from systems.errors import SurromdError
 from systems.units import (
     parse_length_nm,
@@ -121,6 +122,7 @@ app = typer.Typer(
 )
 app.add_typer(bench, name="bench")
 app.command()(stress)
+app.command()(reproduce)
 
 
 @app.command()
