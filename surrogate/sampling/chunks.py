@@ -54,7 +54,7 @@ class ChunkSampler:
             )
         self.solver = solver or (known[0] if known else None)
         self.solver_steps = solver_steps
-        self.bf16 = precision == "bf16" or (precision == "auto" and bf16_in_hardware())
+        self.bf16 = precision == "bf16" or (precision == "auto" and model.bf16_by_default and bf16_in_hardware())
         self.batch: int | None = None
         self._model = with_bf16_weights(model) if self.bf16 else model
         self._molecule = Molecule.of(template)

@@ -45,6 +45,7 @@ class Painet(Surrogate):
 
     arch: ClassVar[str] = "painet"
     carries_velocities: ClassVar[bool] = True
+    bf16_by_default: ClassVar[bool] = False
     config: PainetConfig
     velocity_scale_nm_ps: Tensor
     reach: Tensor
