@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -108,7 +109,8 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     not installed or refuses an entry.
     """
     try:
-        import dask_jobqueue
+        # LocalCluster stands in its own module only.
+        classes = importlib.import_module(f"dask_jobqueue.{spec.kind}")
     except ImportError:
         raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
     exports = [f"export {name}={value}" for name, value in _ONE_THREAD.items()]
@@ -124,7 +126,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     named = ("walltime", "queue", "account", "interface", "python")
     arguments |= {key: value for key in named if (value := getattr(spec, key))}
     try:
-        return getattr(dask_jobqueue, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": ":0"}, **arguments)
+        return getattr(classes, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": ":0"}, **arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
     except OSError as error:

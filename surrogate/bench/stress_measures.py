@@ -97,8 +97,7 @@ def measure_drift(replicas: Sequence[Frames], scene: Scene, geometry: Geometry) 
         out["torsion_jsd"] = _torsion_distance(first, last, quads)
     if len(quads) and len(replicas) > 1:
         ends = [np.concatenate([r[:tenth], r[-tenth:]]) for r in replicas]
-        halves = [np.concatenate(ends[k::2]) for k in (0, 1)]
-        out["torsion_jsd_floor"] = _torsion_distance(*halves, quads)
+        out["torsion_jsd_floor"] = _torsion_distance(np.concatenate(ends[::2]), np.concatenate(ends[1::2]), quads)
     return out
 
 
