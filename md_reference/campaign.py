@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign_file import Campaign, Run, first_seed
+from md_reference.campaign_file import JOB_LOGS, Campaign, Run, first_seed
 from md_reference.campaign_manifest import check_same_campaign, new_manifest
 from md_reference.campaign_worker import LOCKS, RunTask, SceneTask, poll, prepare_scene, simulate_run, stop
 from systems.errors import InputError, SimulationError
@@ -78,7 +78,7 @@ def open_campaign(campaign: Campaign) -> Manifest:
         manifest = check_same_campaign(read_manifest(folder), manifest, folder)
     elif folder.is_file():
         raise InputError(f"{folder} is a file; name another folder (out = ..., or --out).")
-    elif folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
+    elif folder.is_dir() and any(not path.name.startswith(".") and path.name != JOB_LOGS for path in folder.iterdir()):
         raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or --out).")
     try:
         folder.mkdir(parents=True, exist_ok=True)

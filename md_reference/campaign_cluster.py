@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import logging
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign_file import ClusterSpec
+from md_reference.campaign_file import JOB_LOGS, ClusterSpec
 from md_reference.replicas import available_cores
 from systems.errors import InputError, SimulationError
 
@@ -113,18 +114,26 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
         classes = importlib.import_module(f"dask_jobqueue.{spec.kind}")
     except ImportError:
         raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
-    exports = [f"export {name}={value}" for name, value in _ONE_THREAD.items()]
+    one_thread = [f"{name}={value}" for name, value in _ONE_THREAD.items()]
+    python, prologue = spec.python, [*(f"export {entry}" for entry in one_thread), *spec.prologue]
+    if spec.kind == "local":
+        # Its jobs are started without a shell: the command is all there can be.
+        if spec.prologue:
+            raise InputError("[cluster] local takes no prologue; what it holds must be done before surromd is started.")
+        python, prologue = " ".join(["env", *one_thread, spec.python or sys.executable]), []
     arguments: dict[str, Any] = {
         "cores": spec.cores,
         "processes": spec.cores,
         "memory": spec.memory,
         "job_extra_directives": list(spec.directives),
-        "job_script_prologue": [*exports, *spec.prologue],
+        "job_script_prologue": prologue,
         "worker_extra_args": ["--preload", _PRELOAD],
-        "log_directory": str((folder / "jobs").resolve()),
+        "log_directory": str((folder / JOB_LOGS).resolve()),
     }
-    named = ("walltime", "queue", "account", "interface", "python")
+    named = ("walltime", "queue", "account", "interface")
     arguments |= {key: value for key in named if (value := getattr(spec, key))}
+    if python:
+        arguments["python"] = python
     try:
         return getattr(classes, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": ":0"}, **arguments)
     except (TypeError, ValueError) as error:

@@ -21,6 +21,8 @@ SUFFIXES = ("h5", "dcd")
 _SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
 # Batch systems that dask-jobqueue knows; `local` starts the same jobs as processes here, to try a file out.
 CLUSTER_KINDS = ("slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local")
+# Folder of the batch system's logs, inside the campaign's.
+JOB_LOGS = "jobs"
 _LONGEST_NAME = 40
 _SEEDS = 2**31
 

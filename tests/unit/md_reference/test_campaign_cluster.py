@@ -49,6 +49,14 @@ def test_one_worker_in_a_job_without_a_queue(tmp_path: Path) -> None:
     assert "--nthreads 1" in script
 
 
+def test_local_jobs_start_without_a_shell(tmp_path: Path) -> None:
+    with job_cluster(ClusterSpec(kind="local"), tmp_path) as cluster:
+        words = cluster.job_script().split()
+    assert words[:2] == ["env", "OMP_NUM_THREADS=1"] and "export" not in words
+    with pytest.raises(InputError, match="local takes no prologue"):
+        job_cluster(ClusterSpec(kind="local", prologue=("module load x",)), tmp_path)
+
+
 def test_no_scheduler_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(campaign_cluster, "_ANSWER_S", 0.5)
     with (

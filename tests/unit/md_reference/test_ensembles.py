@@ -243,7 +243,9 @@ def without_news(out: Path) -> None:
 def age_record(out: Path) -> None:
     with h5py.File(out, "r+") as file:
         record = json.loads(file["surromd/record"][()])
-        old = {key: value for key, value in record.items() if key not in (*NEW_SETTINGS, "threads", "platform_reason")}
+        news = (*NEW_SETTINGS, "threads", "platform_reason", "_seal")
+        old = {key: value for key, value in record.items() if key not in news}
+        del file["surromd/checksums"]
         file["surromd/record"][()] = np.bytes_(json.dumps(old).encode())
 
 
