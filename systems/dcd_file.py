@@ -13,9 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.atomic_file import storage_error, write_whole
+from systems.checksums import Checksums
 from systems.dcd_layout import DcdLayout, cell_blocks, cells_of_blocks, header_bytes, step_fields, title_bytes
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.frame_store import (
+    CELLS,
+    FRAMES,
     FrameStore,
     add_column,
     consistent_length,
@@ -26,7 +29,7 @@ from systems.frame_store import (
     refuse_existing,
     write_new,
 )
-from systems.hdf5_file import read_columns
+from systems.hdf5_file import check_read, read_checksums, read_columns
 from systems.pdb_text import pdb_text
 from systems.scene import Scene
 from systems.trajectory_types import (
@@ -86,7 +89,12 @@ class DcdWriter(TrajectoryWriter):
         made: list[Path] = []
         try:
             create_store(
-                self._meta, self.scene, record, lambda file: add_column(file, "time", 0, "<f8"), overwrite=overwrite
+                self._meta,
+                self.scene,
+                record,
+                lambda file: add_column(file, "time", 0, "<f8"),
+                overwrite=overwrite,
+                checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
             )
             made.append(self._meta)
             write_new(self._pdb, topology)
@@ -107,18 +115,20 @@ class DcdWriter(TrajectoryWriter):
             raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
         self._store.announce(len(block))
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
+        angstrom = block.positions_nm * np.float32(10.0)
+        stored: dict[str, npt.NDArray[Any]] = {FRAMES: angstrom}
         for axis in range(3):
             frames[f"before{axis}"] = frames[f"after{axis}"] = 4 * self.scene.n_atoms
-            frames[f"x{axis}"] = block.positions_nm[:, :, axis] * np.float32(10.0)
+            frames[f"x{axis}"] = angstrom[:, :, axis]
         if self._layout.has_cell:
             own = np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
-            frames["cell"] = cell_blocks(own if block.cell_nm is None else block.cell_nm)
+            stored[CELLS] = frames["cell"] = cell_blocks(own if block.cell_nm is None else block.cell_nm)
         first_times = self._first_times
         try:
             write_whole(self._fd, frames.tobytes(), self._layout.offset(self.n_frames))
             self._first_times = np.concatenate([first_times, block.time_ps])[:2]
             self._set_length(self.n_frames + len(block))
-            self._store.append(block, {})
+            self._store.append(block, {}, stored)
         except BaseException as error:
             # Taking space back needs none, so this also succeeds on a full disk.
             self._first_times = first_times
@@ -174,6 +184,7 @@ class DcdReader(TrajectoryReader):
     def __init__(self, path: Path, top: Path | None) -> None:
         self.path = path
         self._layout = layout = DcdLayout.read(path)
+        self._checksums: dict[str, Checksums] = {}
         self.n_atoms = layout.n_atoms
         pdb, meta = companions(path)
         if meta.exists():
@@ -182,6 +193,7 @@ class DcdReader(TrajectoryReader):
                     raise TrajectoryError(f"{meta} is not the record of {path.name}; move it to read the DCD alone.")
                 self.n_frames = consistent_length(file, meta)
                 self.time_ps, self.flags, self.chunk_idx, self.scalars = read_columns(file, meta, self.n_frames)
+                self._checksums = read_checksums(file, self.n_frames)
                 self.record = get_json(file, "surromd/record")
                 self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
                 in_flight = int(file["surromd"].attrs["largest_append"])
@@ -213,7 +225,9 @@ class DcdReader(TrajectoryReader):
             if not lengths.all():
                 bad = start + stride * int(np.argmin(lengths))
                 raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
-            np.multiply(frames[f"x{axis}"], np.float32(0.1), out=out[:, :, axis])
+            out[:, :, axis] = frames[f"x{axis}"]
+        check_read(self, self._checksums, FRAMES, out, slice(start, stop, stride))
+        out *= np.float32(0.1)
         return out
 
     def _read_cells(self, start: int, stop: int, stride: int) -> npt.NDArray[np.float64] | None:
@@ -221,7 +235,9 @@ class DcdReader(TrajectoryReader):
             raise InputError(f"{self.path} is closed.")
         if not self._layout.has_cell:
             return None
-        return cells_of_blocks(np.asarray(self._frames["cell"][start:stop:stride]), self._layout.byte_order)
+        blocks = np.asarray(self._frames["cell"][start:stop:stride])
+        check_read(self, self._checksums, CELLS, blocks, slice(start, stop, stride))
+        return cells_of_blocks(blocks, self._layout.byte_order)
 
     def close(self) -> None:
         self._frames = None

@@ -1,8 +1,8 @@
 """Per-frame columns, a record and a scene in one HDF5 file: the part that HDF5 trajectories and DCD companions share.
 
 Layout: `/time` (n,) float64 ps, `/surromd/chunk_idx` (n,) int32, `/surromd/flags` (n,) uint16 where frames were
-checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/record` and `/surromd/scene` JSON text; more columns as the
-format asks.
+checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/checksums/NAME` (n,) uint32 (systems.checksums; not in files
+of earlier versions), `/surromd/record` and `/surromd/scene` JSON text with a seal; more columns as the format asks.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import io
 import json
 import os
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.atomic_file import AtomicFile, storage_error, write_whole
+from systems.checksums import frame_checksums, sealed, unsealed
 from systems.errors import InputError, StorageError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory_types import FrameBlock
@@ -30,6 +31,9 @@ _COLUMN_CHUNK = 2048
 _RECORD_BYTES = 4096
 # Box vectors of each frame, where H5MD wants them.
 EDGES = "particles/trajectory/box/edges/value"
+CHECKSUMS = "surromd/checksums"
+# The checksum of a frame's positions, time, chunk, flags and scalars; what else there is has one of its own.
+FRAMES, CELLS = "frames", "cells"
 _EXTRA = ("velocities", "forces", "cell_lengths", "cell_angles", EDGES)
 
 
@@ -94,16 +98,28 @@ def damage_reported(path: Path) -> Iterator[None]:
 
 def get_json(file: h5py.File, name: str) -> Any:
     """Return the JSON value of a text dataset. Raises KeyError or ValueError when it is missing or damaged."""
-    return json.loads(file[name][()])
+    text = file[name][()].decode("ascii")
+    return json.loads(unsealed(text) if CHECKSUMS in file else text)
+
+
+def _sealed_as_the_file_is(file: h5py.File, text: str) -> str:
+    return sealed(text) if CHECKSUMS in file else text  # files of earlier versions stay readable by those
 
 
 def create_store(
-    path: Path, scene: Scene, record: dict[str, Any], lay_out: Callable[[h5py.File], None], *, overwrite: bool
+    path: Path,
+    scene: Scene,
+    record: dict[str, Any],
+    lay_out: Callable[[h5py.File], None],
+    *,
+    overwrite: bool,
+    checksums: Sequence[str] = (FRAMES,),
 ) -> None:
     """Create the file with all headers and no frames; it appears under its name only when it is whole.
 
-    `lay_out` adds the format's own groups and columns. Raises TrajectoryError when the file exists and `overwrite` is
-    False, InputError for a record that is not JSON, StorageError when the disk refuses.
+    `lay_out` adds the format's own groups and columns, `checksums` names what each frame has one of. Raises
+    TrajectoryError when the file exists and `overwrite` is False, InputError for a record that is not JSON,
+    StorageError when the disk refuses.
     """
     refuse_existing(path, overwrite)
     image = io.BytesIO()
@@ -112,9 +128,11 @@ def create_store(
         group.attrs["format_version"] = np.int64(FORMAT_VERSION)
         group.attrs["largest_append"] = np.int64(0)
         group.create_group("scalars")
-        set_text(group, "record", json_text(record, "record"), _RECORD_BYTES)
-        set_text(group, "scene", json_text(scene.to_dict(), "scene"))
+        set_text(group, "record", sealed(json_text(record, "record")), _RECORD_BYTES)
+        set_text(group, "scene", sealed(json_text(scene.to_dict(), "scene")))
         add_column(file, "surromd/chunk_idx", 0, "<i4")
+        for name in checksums:
+            add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
         lay_out(file)
     write_new(path, image.getvalue())
 
@@ -163,8 +181,8 @@ def column_names(file: h5py.File) -> list[str]:
     names = [name for name in fixed if name in file]
     if "surromd" in file:
         names += [name for name in _EXTRA if name in file]
-    if "surromd/scalars" in file:
-        names += [f"surromd/scalars/{name}" for name in file["surromd/scalars"]]
+    for group in ("surromd/scalars", CHECKSUMS):
+        names += [f"{group}/{name}" for name in file.get(group, ())]
     return names
 
 
@@ -185,6 +203,21 @@ def consistent_length(file: h5py.File, path: Path) -> int:
         if column.chunks and "surromd" in file and column.id.get_num_chunks() < -(-shortest // column.chunks[0]):
             raise TrajectoryError(f"{path} is damaged: blocks of /{name} are missing.")
     return shortest
+
+
+def columns_with_frames(
+    time_ps: npt.NDArray[np.float64],
+    chunk_idx: npt.NDArray[np.int32],
+    flags: npt.NDArray[np.uint16] | None,
+    scalars: Mapping[str, npt.NDArray[np.float64]],
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the columns `(n,)` that have one checksum with the positions."""
+    given: dict[str, npt.NDArray[Any]] = {
+        "time": time_ps,
+        "chunk_idx": chunk_idx,
+        **{f"scalars/{name}": values for name, values in scalars.items()},
+    }
+    return given if flags is None else given | {"flags": flags}
 
 
 class FrameStore:
@@ -239,17 +272,23 @@ class FrameStore:
         scalars = {name.rpartition("/")[2]: c[:] for name, c in self._columns.items() if "/scalars/" in name}
         return self._columns["time"][:], scalars
 
-    def append(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
-        """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError."""
+    def append(
+        self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]], stored: Mapping[str, npt.NDArray[Any]]
+    ) -> None:
+        """Append a block and the format's own `columns` (by dataset name). Raises InputError, StorageError.
+
+        `stored`: what has a checksum, as it is on disk: positions `(n, n_atoms, 3)` as FRAMES, and more by name.
+        """
         n, start = len(block), self.n_frames
         self.check_flags(block)
         self.announce(n)
-        for name in block.scalars:
-            self._need_column(f"surromd/scalars/{name}", "<f8")
+        self._need_columns(block)
         values: dict[str, npt.NDArray[Any]] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}
         if block.flags is not None:
-            self._need_column("surromd/flags", "<u2")
             values["surromd/flags"] = block.flags
+        for name, array in stored.items():
+            more = columns_with_frames(block.time_ps, block.chunk_idx, block.flags, block.scalars)
+            values[f"{CHECKSUMS}/{name}"] = frame_checksums({name: array} | (more if name == FRAMES else {}))
         for name, column in self._columns.items():
             column.resize(start + n, axis=0)
             if name in values:
@@ -266,9 +305,19 @@ class FrameStore:
             self._commit()
             self.largest_append = n_frames
 
-    def _need_column(self, name: str, dtype: str) -> None:
-        if name not in self._columns:
-            self._columns[name] = add_column(self.file, name, self.n_frames, dtype)
+    def _need_columns(self, block: FrameBlock) -> None:
+        """Make the columns that a block brings. In a transaction of their own: if its frames could be there before the
+        names of its columns, a reader would take them for frames without."""
+        if not self.n_frames and block.flags is None and self._columns.pop("surromd/flags", None) is not None:
+            del self.file["surromd/flags"]
+        wanted = {f"surromd/scalars/{name}": "<f8" for name in block.scalars}
+        if block.flags is not None:
+            wanted["surromd/flags"] = "<u2"
+        missing = [name for name in wanted if name not in self._columns]
+        for name in missing:
+            self._columns[name] = add_column(self.file, name, self.n_frames, wanted[name])
+        if missing:
+            self._commit()
 
     def check_flags(self, block: FrameBlock) -> None:
         """Raise InputError when this block has flags and the frames before have none, or the reverse."""
@@ -295,7 +344,7 @@ class FrameStore:
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
         merged = {**self.record, **entries}
-        set_text(self.file["surromd"], "record", json_text(merged, "record"))
+        set_text(self.file["surromd"], "record", _sealed_as_the_file_is(self.file, json_text(merged, "record")))
         self._commit()
         self.record = merged
 

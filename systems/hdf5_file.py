@@ -15,13 +15,20 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
+from systems.checksums import Checksums, check_frames_read, frame_checksums
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError, TrajectoryError
-from systems.extra_columns import check_wanted, extra_values, lay_out_extras, read_cells
+from systems.extra_columns import PER_ATOM, check_wanted, extra_values, lay_out_extras, read_cells
 from systems.frame_store import (
+    CELLS,
+    CHECKSUMS,
+    EDGES,
+    FRAMES,
     FrameStore,
     add_column,
+    columns_with_frames,
     consistent_length,
     create_store,
     damage_reported,
@@ -61,7 +68,15 @@ class Hdf5Writer(TrajectoryWriter):
         self.path, self.scene = path, scene
         check_wanted(columns, path)
         if not append:
-            create_store(path, scene, record, lambda file: _lay_out(file, scene, columns), overwrite=overwrite)
+            names = (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS]))
+            create_store(
+                path,
+                scene,
+                record,
+                lambda file: _lay_out(file, scene, columns),
+                overwrite=overwrite,
+                checksums=names,
+            )
         self._store = FrameStore(path)
         try:
             check_same_topology(path, self._store.scene, scene)
@@ -83,7 +98,10 @@ class Hdf5Writer(TrajectoryWriter):
         else:
             step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
         extra = extra_values(self._store.file, self.scene, block, f"{self.path}, after frame {self.n_frames}")
-        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra})
+        stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
+        if EDGES in extra:
+            stored[CELLS] = extra[EDGES]
+        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
 
     def truncate(self, n_frames: int) -> None:
         self._refuse_closed()
@@ -130,6 +148,7 @@ class Hdf5Reader(TrajectoryReader):
         self.n_atoms = int(self._coordinates.shape[1])
         columns = read_columns(self._file, self.path, self.n_frames)
         self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
+        self._checksums = read_checksums(self._file, self.n_frames)
         self.times_known = "surromd" in self._file or "time" in self._file
         self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
         self.scene = self._read_scene()
@@ -147,18 +166,26 @@ class Hdf5Reader(TrajectoryReader):
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._gather(self._coordinates, start, stop, stride)
+        check_read(self, self._checksums, FRAMES, frames, slice(start, stop, stride))
         return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
 
     def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
         if not self._file:
             raise InputError(f"{self.path} is closed.")
-        return self._gather(self._file[name], start, stop, stride) if name in self._file else None
+        if name not in self._file:
+            return None
+        values = self._gather(self._file[name], start, stop, stride)
+        check_read(self, self._checksums, name, values, slice(start, stop, stride))
+        return values
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
         if not self._file:
             raise InputError(f"{self.path} is closed.")
         with damage_reported(self.path):
-            return read_cells(self._file, start, stop, stride)
+            cells = read_cells(self._file, start, stop, stride)
+        if cells is not None:
+            check_read(self, self._checksums, CELLS, cells, slice(start, stop, stride))
+        return cells
 
     def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
         if start >= stop:
@@ -202,6 +229,29 @@ def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, 
     if not np.isfinite(time_ps).all():
         raise TrajectoryError(f"{path} is damaged: some frames have no time.")
     return time_ps, flags, chunk_idx, scalars
+
+
+def read_checksums(file: h5py.File, n_frames: int) -> dict[str, Checksums]:
+    """Return the checksums `(n_frames,)` of the first frames by what they are of; older files have none."""
+    return {name: column[:n_frames] for name, column in file.get(CHECKSUMS, {}).items()}
+
+
+def check_read(
+    reader: TrajectoryReader, checksums: dict[str, Checksums], name: str, stored: npt.NDArray[Any], frames: slice
+) -> None:
+    """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written.
+
+    With positions (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars.
+    """
+    if name not in checksums or not len(stored):
+        return
+    columns = {name: stored}
+    if name == FRAMES and reader.chunk_idx is not None:
+        flags = None if reader.flags is None else reader.flags[frames]
+        scalars = {key: values[frames] for key, values in reader.scalars.items()}
+        columns |= columns_with_frames(reader.time_ps[frames], reader.chunk_idx[frames], flags, scalars)
+    found = frame_checksums(columns)
+    check_frames_read(reader.path, checksums[name][frames], found, frames.start, frames.step)
 
 
 def _nm_per_unit(dataset: h5py.Dataset, path: Path) -> float:

@@ -245,7 +245,9 @@ def age_record(out: Path) -> None:
         record = json.loads(file["surromd/record"][()])
         news = (*NEW_SETTINGS, "threads", "platform_reason", "_seal")
         old = {key: value for key, value in record.items() if key not in news}
-        del file["surromd/checksums"]
+        scene = json.loads(file["surromd/scene"][()])
+        del scene["_seal"], file["surromd/checksums"]
+        file["surromd/scene"][()] = np.bytes_(json.dumps(scene).encode())
         file["surromd/record"][()] = np.bytes_(json.dumps(old).encode())
 
 
