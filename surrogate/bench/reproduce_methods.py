@@ -151,7 +151,7 @@ def egnn(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fit
 
 
 def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """A learned force between each pair, integrated; from the last two given positions, told of charges and springs."""
+    """A learned force between each pair, integrated; from given positions alone, told of charges and springs."""
     import torch
 
     from surrogate.models.particles import PairForces, PairForcesConfig
@@ -167,7 +167,9 @@ def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings)
         given, pairs = torch.from_numpy(data.positions_nm[:, :N_GIVEN]), torch.from_numpy(data.pairs)
         return model.forecast(given, pairs, N_NEW).numpy()[None]
 
-    note = "last two positions, pair kinds; beyond the papers: integrates learned pair forces"
+    note = (
+        f"last {model.config.velocity_frames} positions, pair kinds; beyond the papers: integrates learned pair forces"
+    )
     return Fitted(forecast, note, seconds, _size(model))
 
 

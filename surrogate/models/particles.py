@@ -7,6 +7,7 @@ types and pairs, so they stand beside the contract of `surrogate.models.interfac
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -71,13 +72,16 @@ def all_pairs(n: int, pairs: Tensor) -> Graph:
 
 @dataclass(frozen=True)
 class PairForcesConfig:
-    """`substeps` of the integrator between two frames, in training and in forecasts: what is learned is a force, so the
-    second may be finer."""
+    """`substeps` of the integrator between two frames: coarse ones for the first part of a training, whose losses they
+    keep smooth, finer ones for the second, which resolve close encounters; what is learned is a force, so forecasts may
+    be finer still. `velocity_frames`: given frames that the last one's velocity is found from."""
 
     width: int = 32
     lag_ps: float = 0.1
     training_substeps: int = 4
-    forecast_substeps: int = 20
+    fine_substeps: int = 16
+    velocity_frames: int = 6
+    forecast_substeps: int = 50
 
 
 class PairForces(nn.Module):
@@ -126,27 +130,53 @@ class PairForces(nn.Module):
             v = v + 0.5 * dt * force
         return x, v
 
-    def last_velocity(self, before: Tensor, last: Tensor, pairs: Tensor, rounds: int = 5) -> Tensor:
-        """Return the velocity at the last of two frames `(b, n, 3)`: that of the motion which joins them, found by
-        shooting from the first."""
+    def last_velocity(self, frames: Tensor, pairs: Tensor) -> Tensor:
+        """Return the velocity at the last of two or more frames `(b, n_frames, n, 3)`: that of the motion which joins
+        them, found by shooting from each to the next.
+
+        Where a close pair turns between two frames several motions join them: of that which starts along a straight
+        line and that which starts as the one before arrived, each system takes the one that goes on more smoothly.
+        """
+        velocity = None
+        for before, last in pairwise(frames.unbind(1)):
+            straight = (last - before) / self.config.lag_ps
+            departure, found, missed = self._shoot(before, last, straight, pairs)
+            if velocity is not None:
+                going_on, other, other_missed = self._shoot(before, last, velocity, pairs)
+                scores = [
+                    miss / self.config.lag_ps + (start - velocity).square().sum((-1, -2)).sqrt()
+                    for start, miss in ((departure, missed), (going_on, other_missed))
+                ]
+                found = torch.where((scores[1] < scores[0])[:, None, None], other, found)
+            velocity = found
+        if velocity is None:
+            raise ValueError("a velocity takes two frames")
+        return velocity
+
+    def _shoot(
+        self, before: Tensor, last: Tensor, start: Tensor, pairs: Tensor, rounds: int = 5
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """From velocities `start` at `before`: velocities there and at `last` of a motion that joins the two, and the
+        distance by which it misses, `(b,)`."""
         lag, n_substeps = self.config.lag_ps, self.config.forecast_substeps
-        start = (last - before) / lag
         missed = torch.full(last.shape[:1], float("inf"), dtype=last.dtype, device=last.device)
-        found = start
+        departure = arrival = start
         for _ in range(rounds):
             x, v = self.step(before, start, pairs, n_substeps)
             # Past a close encounter the iteration may leave again: each system keeps its best round.
-            error = (last - x).square().sum((-1, -2))
+            error = (last - x).square().sum((-1, -2)).sqrt().nan_to_num(float("inf"))
             better = error < missed
-            missed, found = torch.where(better, error, missed), torch.where(better[:, None, None], v, found)
-            start = start + (last - x) / lag
-        return found
+            missed = torch.where(better, error, missed)
+            departure = torch.where(better[:, None, None], start, departure)
+            arrival = torch.where(better[:, None, None], v, arrival)
+            start = torch.where(error.isfinite()[:, None, None], start + (last - x) / lag, departure)
+        return departure, arrival, missed
 
     def forecast(self, given: Tensor, pairs: Tensor, n_new: int) -> Tensor:
         """Frames `(b, n_given, n, 3)`, positions alone -> the next n_new, `(b, n_new, n, 3)`; in the dtype of the
         parameters (float64 keeps what the frames say of velocities)."""
         x, frames = given[:, -1], []
-        v = self.last_velocity(given[:, -2], x, pairs)
+        v = self.last_velocity(given[:, -self.config.velocity_frames :], pairs)
         for _ in range(n_new):
             x, v = self.step(x, v, pairs, self.config.forecast_substeps)
             frames.append(x)

@@ -17,6 +17,10 @@ from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flo
 
 # Share of LaM-SLidE's budget that the autoencoder gets.
 STAGE_ONE_SHARE = 0.35
+# Share of the pair forces' budget that coarse steps get.
+COARSE_SHARE = 0.4
+# Error of a particle's step beyond which it is left out of the fine part, nm/ps.
+_LARGEST_MISS = 0.5
 _VALIDATION = 100
 
 
@@ -116,32 +120,40 @@ def train_egnn(
 def train_pair_forces(model: PairForces, train: ParticleSet, validation: ParticleSet, training: Training) -> float:
     """Train on single frame steps from the true state anywhere in a trajectory: position and velocity one frame on.
 
-    The loss grows with the distance, not its square: a close encounter that no step resolves counts once.
+    The loss grows with the distance, not its square: a close encounter that no step resolves counts once. The first
+    part takes coarse steps, the second fine ones, where a window that is `_LARGEST_MISS` off or more teaches nothing:
+    its gradient runs through a collision and points anywhere.
     """
     data, held = Tensors.of(train), Tensors.of(validation.first(min(_VALIDATION, len(validation))))
-    stage = training.stage("pair-forces", 1.0, batch=256, rate=1e-2, bf16=False)
     lag, n_frames = train.lag_ps, data.x.shape[1]
+    rows_held = torch.arange(len(held.x)).repeat_interleave(n_frames - 1)
+    at_held = torch.arange(n_frames - 1).repeat(len(held.x))
 
-    def one_step(source: Tensors, rows: Tensor, at: Tensor) -> Tensor:
+    def one_step(source: Tensors, rows: Tensor, at: Tensor, substeps: int) -> Tensor:
         x, v = source.x[rows, at], source.v[rows, at]
-        x_new, v_new = model.step(x, v, source.pairs[rows], model.config.training_substeps)
+        x_new, v_new = model.step(x, v, source.pairs[rows], substeps)
         wrong_x = (x_new - source.x[rows, at + 1]) / lag
         wrong_v = v_new - source.v[rows, at + 1]
-        return torch.cat([wrong_x, wrong_v], dim=-1).square().sum(-1).add(1e-8).sqrt().mean()
+        return torch.cat([wrong_x, wrong_v], dim=-1).square().sum(-1).add(1e-8).sqrt()
 
-    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        rows = torch.randint(len(train), (stage.batch,), generator=generator)
-        at = torch.randint(n_frames - 1, (stage.batch,), generator=generator)
-        loss = one_step(data, rows, at)
-        return loss, {"step": loss.detach()}
+    def part(name: str, share: float, substeps: int, rate: float, largest: float) -> float:
+        stage = training.stage(name, share, batch=256, rate=rate, bf16=False)
 
-    @torch.no_grad()
-    def validate() -> dict[str, float]:
-        rows = torch.arange(len(held.x)).repeat_interleave(n_frames - 1)
-        at = torch.arange(n_frames - 1).repeat(len(held.x))
-        return {"validation_step": float(one_step(held, rows, at))}
+        def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+            rows = torch.randint(len(train), (stage.batch,), generator=generator)
+            at = torch.randint(n_frames - 1, (stage.batch,), generator=generator)
+            loss = one_step(data, rows, at, substeps).clamp(max=largest).mean()
+            return loss, {"step": loss.detach()}
 
-    return _run(model, stage, loss_fn, validate, training)
+        @torch.no_grad()
+        def validate() -> dict[str, float]:
+            return {"validation_step": float(one_step(held, rows_held, at_held, substeps).clamp(max=largest).mean())}
+
+        return _run(model, stage, loss_fn, validate, training)
+
+    c = model.config
+    spent = part("pair-forces", COARSE_SHARE, c.training_substeps, 1e-2, float("inf"))
+    return spent + part("pair-forces-fine", 1.0 - COARSE_SHARE, c.fine_substeps, 1e-3, _LARGEST_MISS)
 
 
 def train_lam_slide_on_windows(

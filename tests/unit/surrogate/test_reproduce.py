@@ -202,13 +202,32 @@ def test_pair_forces_are_the_true_law_when_given_it_and_keep_momentum(charges: P
     forecast = model.forecast(given, pairs, 20)
     errors = (forecast - truth).norm(dim=-1).mean((1, 2))
     assert errors.median() < 5e-3
-    velocity = model.last_velocity(x[:, 8], x[:, 9], pairs)
+    velocity = model.last_velocity(x[:, 4:10], pairs)
     assert (velocity - v[:, 9]).norm(dim=-1).median() < 5e-3
     torch.testing.assert_close(model.forces(x[:, 0], pairs).sum(1), torch.zeros(len(x), 3).double(), atol=1e-9, rtol=0)
     with torch.no_grad():
         model.constant.neg_()  # negative control: the wrong sign
     wrong = (model.forecast(given, pairs, 20) - truth).norm(dim=-1).mean((1, 2))
     assert wrong.median() > 0.3
+
+
+def test_the_velocity_of_a_pair_that_turns_between_two_frames_needs_more_than_two() -> None:
+    model = PairForces(PairForcesConfig(forecast_substeps=100)).double()
+    pairs = torch.zeros(1, 2, 2, dtype=torch.int64)
+    x = torch.tensor([[[0.15, 0.0, 0.0], [-0.15, 0.0, 0.0]]]).double()
+    v = torch.tensor([[[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]]).double()
+    frames = [x]
+    with torch.no_grad():
+        model.constant[0, 3] = -1.0  # unlike charges on an ellipse, the nearest point between the last two frames
+        for _ in range(5):
+            x, v = model.step(x, v, pairs, 400)
+            frames.append(x)
+        given = torch.stack(frames, 1)
+        assert (model.last_velocity(given, pairs) - v).norm() < 0.01
+        # Negative control: a straight line between the last two starts the search on the wrong side.
+        assert (model.last_velocity(given[:, -2:], pairs) - v).norm() > 1.0
+    with pytest.raises(ValueError, match="two frames"):
+        model.last_velocity(given[:, :1], pairs)
 
 
 # ---- the whole way -------------------------------------------------------------------------------------------------
