@@ -23,7 +23,8 @@ def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes, *, sync: b
     hundredth of the cost. Raises StorageError; the checkpoint before then stays.
     """
     temporary = path.with_name(path.name + ".new")
-    header = {**header, "sha256": hashlib.sha256(blob).hexdigest()}
+    bare = {key: value for key, value in header.items() if key != "sha256"}
+    header = {**bare, "sha256": _digest(json.dumps(bare).encode(), blob)}
     try:
         with open(temporary, "wb") as handle:
             handle.write(json.dumps(header).encode() + b"\n" + blob)
@@ -41,9 +42,14 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], bytes]:
     try:
         line, _, blob = path.read_bytes().partition(b"\n")
         header = json.loads(line)
-        # OpenMM loads a truncated checkpoint without a word.
-        if hashlib.sha256(blob).hexdigest() != header["sha256"]:
+        bare = {key: value for key, value in header.items() if key != "sha256"}
+        # OpenMM loads a truncated checkpoint without a word. Earlier versions left the header out of the checksum.
+        if header["sha256"] not in (_digest(json.dumps(bare).encode(), blob), _digest(blob)):
             raise ValueError("its checksum is wrong")
         return header, blob
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"checkpoint {path} is damaged ({error}); start again with --overwrite.") from error
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()

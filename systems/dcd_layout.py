@@ -21,6 +21,7 @@ from systems.errors import TrajectoryError
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
 _HEADER_BYTES = 92
+_MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
 _TITLE = b"Written by surromd"
 
 
@@ -76,7 +77,7 @@ class DcdLayout:
             raise TrajectoryError(f"{path} {reason}.") from error
         except (ValueError, IndexError) as error:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
-        if n_atoms < 1:
+        if not 1 <= n_atoms < _MOST_ATOMS:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
         # The time step is float32: digits beyond its seventh are noise.
         interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")

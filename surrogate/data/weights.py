@@ -66,15 +66,26 @@ def save_weights(
     }
     dtype = torch.float16 if half else torch.float32
     tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
-    metadata = {"format": FORMAT, "surromd": json.dumps(header)}
+    text = json.dumps(header)
+    metadata = {"format": FORMAT, "surromd": text, "sha256": _digest(text, tensors)}
     create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
 def read_header(path: str | Path) -> dict[str, Any]:
     """Return a weights file's record without loading it. Raises InputError (no such file) or WeightsError."""
+    path = Path(path)
+    try:
+        header = json.loads(_metadata(path)["surromd"])
+    except (ValueError, KeyError) as error:
+        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+    if not isinstance(header, dict):
+        raise WeightsError(f"{path} is damaged: its record is no JSON object.")
+    return header
+
+
+def _metadata(path: Path) -> dict[str, str]:
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
     if not path.is_file():
         raise InputError(f"weights file {path} does not exist.")
     try:
@@ -82,25 +93,43 @@ def read_header(path: str | Path) -> dict[str, Any]:
             metadata = handle.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
-            return json.loads(metadata["surromd"])
-    except (SafetensorError, OSError, ValueError, KeyError) as error:
+            unknown = set(metadata) - {"format", "surromd", "sha256"}
+            if unknown:
+                raise WeightsError(f"{path} is damaged or of a later version: it holds {min(unknown)!r}.")
+            return dict(metadata)
+    except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+
+
+def _digest(header: str, tensors: dict[str, torch.Tensor]) -> str:
+    found = hashlib.sha256(header.encode())
+    for name, tensor in sorted(tensors.items()):
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        found.update(tensor.contiguous().numpy().tobytes())
+    return found.hexdigest()
 
 
 def load_weights(path: str | Path) -> Weights:
     """Load a weights file in evaluation mode. Raises InputError, WeightsError (damaged, non-finite, other shapes)."""
+    from safetensors import SafetensorError
     from safetensors.torch import load
 
     path = Path(path)
-    header = read_header(path)
+    metadata, header = _metadata(path), read_header(path)
     data = path.read_bytes()
+    try:
+        state = load(data)
+    except (SafetensorError, ValueError) as error:
+        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+    # Files of earlier versions state no checksum.
+    if "sha256" in metadata and metadata["sha256"] != _digest(metadata["surromd"], state):
+        raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
     try:
         arch = architecture(header["arch"])
     except UnknownNameError as error:
         raise WeightsError(f"{path} is of another version of surromd: {error}") from error
     model = arch.model(arch.config(header["config"]))
     try:
-        state = load(data)
         model.load_state_dict(state)
     except RuntimeError as error:
         raise WeightsError(f"{path} does not fit its own configuration: {str(error).splitlines()[0]}") from error

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,9 @@ from systems.whole_file import create_whole
 Float32Array = npt.NDArray[np.float32]
 
 _FORMAT = 2
+# What zipfile and NumPy raise on files that are damaged, or made to harm; nothing in them is ever run.
+_UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+               OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
 
 @dataclass
@@ -72,8 +77,9 @@ def read_checkpoint(path: Path, settings: dict[str, Any]) -> Progress:
         of_this_version = header.get("format") == _FORMAT
         tallies = [Tally(**tally) for tally in plain.pop("tallies", [])]
         progress = Progress(**arrays, **plain, tallies=tallies) if of_this_version else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
+    except _UNREADABLE as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"checkpoint {path} cannot be read ({reason}); start again with --overwrite.") from error
     if progress is None:
         raise InputError(f"checkpoint {path} is of another version of surromd; start again with --overwrite.")
     for key, value in settings.items():
