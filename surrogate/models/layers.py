@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+# Keys and values of a block, each (rows, heads, length, head_dim).
+KeysValues = tuple[Tensor, Tensor]
 # Keys up to which `attend` writes the products out.
 _SHORT = 128
 
@@ -31,10 +33,16 @@ def rotary_angles(length: int, head_dim: int, *, base: float = 10_000.0) -> Tens
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Apply RoPE to `(..., length, head_dim)` with cos and sin `(length, head_dim / 2)`."""
-    a, b = x.chunk(2, dim=-1)
-    cos, sin = cos.to(x.dtype), sin.to(x.dtype)
-    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
+    """Apply RoPE to `(..., head_dim)` with cos and sin `(..., head_dim / 2)`: halves a, b turn by the angle."""
+    cos = torch.cat([cos, cos], dim=-1)
+    sin = torch.cat([-sin, sin], dim=-1)
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
+
+
+def gelu(x: Tensor) -> Tensor:
+    """GELU: by tanh in float32; exactly in bf16, where the two forms differ by less than the rounding (5e-4 against
+    2e-3) and the exact one takes a fifth of the time on a CPU, given contiguous numbers."""
+    return F.gelu(x.contiguous()) if x.dtype == torch.bfloat16 else F.gelu(x, approximate="tanh")
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -45,10 +53,12 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
     """
     if q.device.type != "cpu" or k.shape[-2] > _SHORT:
         return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    q, k, v = q.contiguous(), k.contiguous(), v.contiguous()
     scores = (q @ k.transpose(-1, -2)) * q.shape[-1] ** -0.5
     if mask is not None:
         scores = scores.masked_fill(~mask, -math.inf)
-    return scores.softmax(-1).to(v.dtype) @ v
+    # Rows that are no multiple of 32 take five times as long in bf16.
+    return torch.softmax(scores, -1, dtype=torch.float32).to(v.dtype) @ v
 
 
 class TimeEmbedding(nn.Module):
@@ -84,24 +94,33 @@ class ParallelBlock(nn.Module):
         self.mlp_out = nn.Linear(self.hidden, width)
         self.offset = nn.Parameter(torch.zeros(3, width))
 
-    def forward(self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None) -> Tensor:
-        """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width)."""
+    def forward(
+        self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None, past: KeysValues | None = None
+    ) -> tuple[Tensor, KeysValues]:
+        """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width).
+
+        `past`: keys and values that stand before those of `x`, as an earlier call returned them.
+        """
         shift, scale, gate = (modulation + self.offset)[:, None, None].unbind(-2)
-        h = F.layer_norm(x, (self.width,)) * (1.0 + scale) + shift
-        q, k, v, hidden = self.proj_in(h).split([self.width] * 3 + [self.hidden], dim=-1)
+        h = torch.addcmul(shift, F.layer_norm(x, (self.width,)).to(shift.dtype), 1.0 + scale)
+        qk, v, hidden = self.proj_in(h).split([2 * self.width, self.width, self.hidden], dim=-1)
         batch, groups, length, _ = x.shape
-        q, k, v = (t.reshape(batch * groups, length, self.n_heads, -1).transpose(1, 2) for t in (q, k, v))
-        q, k = normalise(q), normalise(k)
+        # Element by element float32 is faster on a CPU than bf16, and queries and keys go through it together.
+        qk = normalise(qk.float().reshape(batch * groups, length, 2 * self.n_heads, -1))
         if rope is not None:
-            q, k = rotate(q, *rope), rotate(k, *rope)
+            qk = rotate(qk, *(angles[:, None] for angles in rope))
+        q, k = qk.to(v.dtype).transpose(1, 2).chunk(2, dim=1)
+        v = v.reshape(batch * groups, length, self.n_heads, -1).transpose(1, 2)
+        if past is not None:
+            k, v = (torch.cat([old, new], dim=2) for old, new in zip(past, (k, v), strict=True))
         attended = attend(q, k, v)
         attended = attended.transpose(1, 2).reshape(batch, groups, length, self.width)
-        update = self.attention_out(attended) + self.mlp_out(F.gelu(hidden, approximate="tanh"))
-        return x + gate * update
+        update = self.attention_out(attended) + self.mlp_out(gelu(hidden))
+        return x + gate * update, (k, v)
 
 
 def normalise(x: Tensor) -> Tensor:
-    """RMS-normalise the last dimension, in the input's dtype."""
+    """RMS-normalise the last dimension."""
     return x * (x.square().mean(-1, keepdim=True) + 1e-6).rsqrt()
 
 

@@ -17,7 +17,8 @@ from systems.scene import Scene
 from systems.trajectory import open_trajectory
 
 
-def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: str = "linear") -> LamSlide:
+def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: str = "linear",
+                n_conditioning: int = 1, clean: bool = False) -> LamSlide:  # fmt: skip
     """A model whose zero-initialised layers are filled, so that every path carries signal."""
     torch.manual_seed(3)
     config = LamSlideConfig(
@@ -30,6 +31,8 @@ def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: s
             n_heads=2,
             precondition=precondition,
             interpolant=interpolant,
+            n_conditioning=n_conditioning,
+            clean_conditioning=clean,
         ),
     )
     model = LamSlide(config)
@@ -53,6 +56,11 @@ class TestLamSlideOneLatent(SurrogateContract):
 class TestLamSlideGvp(SurrogateContract):
     def make(self, n_atoms: int) -> Surrogate:
         return small_model(3, interpolant="gvp")
+
+
+class TestLamSlideCleanConditioning(SurrogateContract):
+    def make(self, n_atoms: int) -> Surrogate:
+        return small_model(3, n_conditioning=3, clean=True)
 
 
 def test_permuting_atoms_with_their_identifiers_permutes_the_frames() -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.config import ApproximatorConfig
-from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
+from surrogate.models.layers import KeysValues, ParallelBlock, TimeEmbedding, rotary_angles
 from systems.errors import InputError
 
 Rope = tuple[Tensor, Tensor]
+# Of each layer, what the conditioning frames say to later ones.
+Memory = list[KeysValues]
 
 
 class LatentLayer(nn.Module):
@@ -23,11 +27,13 @@ class LatentLayer(nn.Module):
         self.spatial = ParallelBlock(width, n_heads) if n_latents > 1 else None
         self.temporal = ParallelBlock(width, n_heads)
 
-    def forward(self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope) -> Tensor:
-        """`o` (b, L, T, width), `modulation` (b, 6, width): three for each block."""
+    def forward(
+        self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope, past: KeysValues | None = None
+    ) -> tuple[Tensor, KeysValues]:
+        """`o` (b, L, T, width), `modulation` (b, 6, width): three for each block; `past` of earlier frames."""
         if self.spatial is not None:
-            o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope_latent).transpose(1, 2)
-        return self.temporal(o, modulation[:, 3:], rope_time)
+            o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope_latent)[0].transpose(1, 2)
+        return self.temporal(o, modulation[:, 3:], rope_time, past)
 
 
 class Approximator(nn.Module):
@@ -62,23 +68,44 @@ class Approximator(nn.Module):
             self.register_buffer(f"cos_{name}", angles.cos(), persistent=False)
             self.register_buffer(f"sin_{name}", angles.sin(), persistent=False)
 
-    def forward(self, o: Tensor, tau: Tensor, conditioning: Tensor) -> Tensor:
+    def forward(self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None) -> Tensor:
         """Return the predicted data `(b, T, L, dim)`.
 
         `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
-        first frames. The first frames of `o` carry no information: they are replaced by the clean ones.
+        first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
+        `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
+        evaluations of one chunk compute it once.
         """
         c = self.config
-        if c.precondition:
-            skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
-            residual = self._network(o * scale_in, tau, conditioning)
-            return skip * o + out * residual
-        return self._network(o, tau, conditioning)
+        if c.clean_conditioning:
+            known = self.remember(conditioning) if memory is None else memory
+            n_known = conditioning.shape[1]
+            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, tau, known, n_known))
+            return torch.cat([conditioning.to(found.dtype), found], dim=1)
+        return self._denoise(o, tau, lambda x: self._network(x, tau, conditioning))
+
+    def remember(self, conditioning: Tensor) -> Memory:
+        """Return keys and values of clean frames `(b, n_conditioning, L, dim)`, which see each other alone and no flow
+        time but that of the data (tau = 1)."""
+        h = self.embed_conditioning(self._tokens(conditioning)) + self.embed_mask.weight[1] + self.embed_latent
+        modulation, _ = self._modulations(torch.ones(len(h), device=h.device))
+        memory: Memory = []
+        h = h.transpose(1, 2)
+        for layer in self.layers:
+            h, kept = layer(h, modulation, *self._ropes(0, conditioning.shape[1]))
+            memory.append(kept)
+        return memory
+
+    def _denoise(self, o: Tensor, tau: Tensor, network: Callable[[Tensor], Tensor]) -> Tensor:
+        c = self.config
+        if not c.precondition:
+            return network(o)
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
+        return skip * o + out * network(o * scale_in)
 
     def _network(self, o: Tensor, tau: Tensor, conditioning: Tensor) -> Tensor:
-        shape, per_token = o.shape, self.config.latents_per_token
-        if per_token > 1:
-            o, conditioning = (t.unflatten(2, (-1, per_token)).flatten(-2) for t in (o, conditioning))
+        shape = o.shape
+        o, conditioning = self._tokens(o), self._tokens(conditioning)
         n_known, n_frames = conditioning.shape[1], o.shape[1]
         known = torch.zeros(n_frames, dtype=torch.long, device=o.device)
         known[:n_known] = 1
@@ -86,13 +113,31 @@ class Approximator(nn.Module):
         noisy = torch.where(known[None, :, None, None] == 1, 0.0, o)
         h = self.embed_noisy(noisy) + self.embed_conditioning(padded)
         h = h + self.embed_mask(known)[None, :, None, :] + self.embed_latent
-        time = F.silu(self.embed_time(tau))
-        modulation = self.modulation(time).unflatten(-1, (6, -1))
-        rope_time = (self.cos_time[:n_frames], self.sin_time[:n_frames])
-        rope_latent = (self.cos_latent, self.sin_latent)
+        return self._transform(h, tau, 0, [None] * len(self.layers)).reshape(shape)
+
+    def _network_after(self, o: Tensor, tau: Tensor, memory: Memory, n_known: int) -> Tensor:
+        h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
+        return self._transform(h, tau, n_known, memory).reshape(o.shape)
+
+    def _transform(self, h: Tensor, tau: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:
+        """Embedded frames `(b, T, L, width)`, of which the first has the place `first`, through all layers."""
+        modulation, final_modulation = self._modulations(tau)
+        ropes = self._ropes(first, h.shape[1])
         h = h.transpose(1, 2)
-        for layer in self.layers:
-            h = layer(h, modulation, rope_latent, rope_time)
-        shift, scale = self.final_modulation(time)[:, None, None, :].chunk(2, dim=-1)
+        for layer, before in zip(self.layers, past, strict=True):
+            h, _ = layer(h, modulation, *ropes, before)
+        shift, scale = final_modulation[:, None, None, :].chunk(2, dim=-1)
         h = F.layer_norm(h.transpose(1, 2), h.shape[-1:]) * (1.0 + scale) + shift
-        return self.final(h).float().reshape(shape)
+        return self.final(h).float()
+
+    def _tokens(self, o: Tensor) -> Tensor:
+        per_token = self.config.latents_per_token
+        return o if per_token == 1 else o.unflatten(2, (-1, per_token)).flatten(-2)
+
+    def _modulations(self, tau: Tensor) -> tuple[Tensor, Tensor]:
+        time = F.silu(self.embed_time(tau))
+        return self.modulation(time).unflatten(-1, (6, -1)), self.final_modulation(time)
+
+    def _ropes(self, first: int, n_frames: int) -> tuple[Rope, Rope]:
+        frames = slice(first, first + n_frames)
+        return (self.cos_latent, self.sin_latent), (self.cos_time[frames], self.sin_time[frames])

@@ -47,6 +47,9 @@ class ApproximatorConfig:
     n_heads: int = 4
     interpolant: str = "linear"
     precondition: bool = True
+    # Conditioning frames see neither the flow time nor the frames that follow them, so that a chunk's evaluations
+    # compute them once; False is the paper.
+    clean_conditioning: bool = False
     # Flow times are logit-normal: a positive location draws more of them near the data end.
     tau_location: float = 0.5
     tau_scale: float = 1.4

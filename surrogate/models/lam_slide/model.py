@@ -79,8 +79,10 @@ class LamSlide(Surrogate):
         interpolant = self.config.approximator.interpolant
         known = self.encode(last_frames_nm, molecule.elements)
 
+        memory = self.approximator.remember(known) if self.config.approximator.clean_conditioning else None
+
         def predict(o: Tensor, tau: Tensor) -> Tensor:
-            return self.approximator(o, tau, known)
+            return self.approximator(o, tau, known, memory)
 
         integrate = flow.SOLVERS[solver or self.solvers[0]]
         latents = integrate(predict, noise, solver_steps, interpolant)
