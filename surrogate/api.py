@@ -98,6 +98,7 @@ def plan(
     friction_per_ps: float | None = None,
     timestep_ps: float | None = None,
     hydrogen_mass_da: float | Default | None = "default",
+    equilibrate_ps: float | None = None,
     ensemble: str | None = None,
     pressure_bar: float | None = None,
     replicas: int = 1,
@@ -133,6 +134,7 @@ def plan(
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
         hydrogen_mass_da=hydrogen_mass_da,
+        equilibrate_ps=equilibrate_ps,
         ensemble=ensemble,
         pressure_bar=pressure_bar,
         platform=platform,
@@ -168,6 +170,7 @@ def reference(
     friction_per_ps: float | None = None,
     timestep_ps: float | None = None,
     hydrogen_mass_da: float | Default | None = "default",
+    equilibrate_ps: float | None = None,
     ensemble: str | None = None,
     pressure_bar: float | None = None,
     replicas: int = 1,
@@ -195,7 +198,7 @@ def reference(
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
     `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
     (`systems(name)`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs,
-    3 Da, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
+    3 Da, 100 ps of equilibration that is not written, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
     `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
@@ -221,6 +224,7 @@ def reference(
         friction_per_ps=friction_per_ps,
         timestep_ps=timestep_ps,
         hydrogen_mass_da=hydrogen_mass_da,
+        equilibrate_ps=equilibrate_ps,
         ensemble=ensemble,
         pressure_bar=pressure_bar,
         platform=platform,

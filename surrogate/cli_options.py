@@ -64,6 +64,9 @@ TimestepOpt = Annotated[str | None, typer.Option("--timestep", help="Integration
 HydrogenMassOpt = Annotated[
     str | None, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'. [default: 3Da]")
 ]
+EquilibrateOpt = Annotated[
+    str | None, typer.Option("--equilibrate", help="So long before the first frame, unwritten. [default: 100ps]")
+]
 EnsembleOpt = Annotated[str | None, typer.Option("--ensemble", help="nvt, nve or npt. [default: nvt]")]
 PressureOpt = Annotated[float | None, typer.Option("--pressure", help="Of the barostat (npt), in bar. [default: 1]")]
 SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep them with each frame (.h5).")]

@@ -44,7 +44,10 @@ def test_a_run_says_its_plan_first_and_its_summary_last(here: Path) -> None:
         assert reader.read_forces() is None
     in_bath = run("reference", "alanine-dipeptide", *FAST, "-o", "b.h5")
     assert "(bath 300 K)" in in_bath.stdout and "drifts" not in in_bath.stdout
-    silent = run("reference", "alanine-dipeptide", *FAST, "-o", "b.h5", "--overwrite", "--quiet")
+    silent = run("reference", "alanine-dipeptide", *FAST, "-o", "b.h5", "--overwrite", "--equilibrate", "50fs", "-q")
+    for name, equilibrate_ps in (("a.h5", 0.2), ("b.h5", 0.05)):
+        with open_trajectory(here / name) as reader:
+            assert reader.record["equilibrate_ps"] == equilibrate_ps
     assert not silent.stderr
 
 
