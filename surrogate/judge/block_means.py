@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from surrogate.judge.probes import Family
 from surrogate.judge.rows import Group, Row, Sample, Trio
-from surrogate.judge.statistics import Estimate, difference_p, estimate, pooled
+from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate, pooled
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
@@ -86,6 +86,28 @@ def block_means(
         )
 
 
+def equal_rows(rows: npt.NDArray[np.int64], classes: npt.NDArray[np.int64]) -> list[npt.NDArray[np.intp]]:
+    """Return the groups of `rows` of atoms `(k, m)`, forwards or backwards, that the molecule's symmetry makes equal.
+
+    `classes` `(n_atoms,)` are equal for atoms without an identity of their own. Groups come in order of their first
+    row: the six C-H bonds of two equal methyl groups are one, and which hydrogen is called the first does not matter.
+    """
+    found: dict[tuple[int, ...], list[int]] = {}
+    for k, row in enumerate(classes[rows].tolist()):
+        found.setdefault(min(tuple(row), tuple(row[::-1])), []).append(k)
+    return [np.array(group, dtype=np.intp) for group in found.values()]
+
+
+def group_labels(labels: Sequence[str], groups: Sequence[npt.NDArray[np.intp]]) -> list[str]:
+    """Return the name of the first of each group, and how many more are equal to it."""
+    return [labels[g[0]] + (f" and {len(g) - 1} equal" if len(g) > 1 else "") for g in groups]
+
+
+def over_groups(values: FloatArray, groups: Sequence[npt.NDArray[np.intp]]) -> FloatArray:
+    """Return the means over groups of the last axis, `(..., n_groups)`."""
+    return np.stack([values[..., g].mean(axis=-1) for g in groups], axis=-1)
+
+
 def shift_row(
     trio: Trio,
     means: Sequence[Means],
@@ -113,8 +135,7 @@ def shift_row(
     found = estimate(float(shift[worst]), sign * (cand.draws[:, worst] - ref.draws[:, worst]), n_blocks)
     least = [1.0, 1.0]
     for k in range(len(shift)):
-        r, c, other = (Estimate(float(m.values[k]), error=float(m.draws[:, k].std()), n_blocks=m.n_blocks)
-                       for m in means)  # fmt: skip
+        r, c, other = (mean_estimate(float(m.values[k]), m.draws[:, k], m.n_blocks) for m in means)
         both = pooled(r, other) if math.isfinite(other.value) else r
         for side, (x, y) in enumerate(((c, both), (other, r))):
             if abs(x.value - y.value) > resolution:

@@ -34,10 +34,16 @@ class Line(NamedTuple):
 
 
 def cards(judgement: Judgement) -> list[Card]:
-    """Return the headline numbers: validity, the worst joint map, the worst relaxation time, speed."""
+    """Return the headline numbers: what it is worth, validity, the worst joint map and relaxation time, speed."""
     valid = judgement.row("valid:all")
     others = "" if valid.reference is None else f"reference {number(valid.reference)} %"
-    out = [Card("Valid frames", f"{number(valid.candidate)} %", others, valid.verdict)]
+    out = []
+    if judgement.worth_words and judgement.worth:
+        best = judgement.worth[0]
+        out.append(
+            Card(f"Worth, by its {best.measure}", f"{best.in_words().split(' [')[0]} of MD", best.in_words(), "")
+        )
+    out.append(Card("Valid frames", f"{number(valid.candidate)} %", others, valid.verdict))
     joint = worst([r for r in judgement.rows if r.key.startswith("joint_jsd")])
     if joint is not None:
         note = f"{plain(joint.ratio)} × a replicate's ({number(joint.replicate)})" if joint.ratio else ""

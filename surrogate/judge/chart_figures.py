@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.charts import BarChart, Chart, Histogram, Landscape, LineChart
+from surrogate.judge.charts import BarChart, Chart, Histogram, Landscape, Line, LineChart
 from surrogate.judge.distributions import free_energy_kj
 from surrogate.judge.figures import (
     CANDIDATE,
@@ -36,6 +36,8 @@ _DASHES: dict[str, Any] = {
     "other": (0, (1, 1.5)),
 }
 _MAX_NAMES = 12
+# Of the height of the axes: what a line of small print takes.
+_NAME_HEIGHT = 0.07
 
 
 def draw_chart(chart: Chart, temperature_k: float) -> list[Figure]:
@@ -61,26 +63,48 @@ def _lines(chart: LineChart) -> str:
             colour, dash = _COLOURS[line.role], _DASHES[line.role]
             if line.low is not None and line.high is not None:
                 axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.17, linewidth=0)
-            marker = "o" if np.count_nonzero(np.isfinite(line.y)) <= 12 else None
+            marker = "o" if line.role != "other" and np.count_nonzero(np.isfinite(line.y)) <= 12 else None
             axes.plot(line.x, line.y, color=colour, linestyle=dash, marker=marker, markersize=3)
-            if line.role == "other" and line.name:
-                _name_at_end(axes, line.x, line.y, line.name)
         if chart.log_x:
             axes.set_xscale("log")
+            _plain_ticks(axes.xaxis, axes.get_xlim())
         if chart.log_y:
             axes.set_yscale("log")
+            _plain_ticks(axes.yaxis, axes.get_ylim())
         axes.set_xlabel(chart.x_label)
         axes.set_ylabel(chart.y_label)
         axes.margins(x=0.01)
+        _name_guides(axes, [line for line in chart.lines if line.role == "other"])
 
     return draw(chart.title, CURVE_SIZE, paint)
 
 
-def _name_at_end(axes: Any, x: FloatArray, y: FloatArray, name: str) -> None:
-    finite = np.flatnonzero(np.isfinite(y))
-    if len(finite):
-        at = finite[-1]
-        axes.annotate(name, (x[at], y[at]), xytext=(-2, 3), textcoords="offset points", ha="right", fontsize=7)
+def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+    """Label a logarithmic axis with plain numbers: decades, or 1-2-5, or even steps where it spans less than three."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+    factor = limits[1] / limits[0]
+    if factor < 3:
+        axis.set_major_locator(MaxNLocator(4))
+        axis.set_minor_locator(NullLocator())
+    elif factor < 300:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if factor < 30 else (1.0, 3.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
+    """Write the name of each guide line at its end, except where it would run into another name."""
+    taken: list[float] = []
+    for line in lines:
+        finite = np.flatnonzero(np.isfinite(line.y))
+        if not line.name or not len(finite):
+            continue
+        x, y = line.x[finite[-1]], line.y[finite[-1]]
+        height = float(axes.transAxes.inverted().transform(axes.transData.transform((x, y)))[1])
+        if all(abs(height - other) > _NAME_HEIGHT for other in taken):
+            taken.append(height)
+            axes.annotate(line.name, (x, y), xytext=(-2, 3), textcoords="offset points", ha="right", fontsize=7)
 
 
 def _bars(chart: BarChart) -> str:

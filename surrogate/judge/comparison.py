@@ -16,6 +16,7 @@ from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
 from surrogate.judge.couplings import coupling_rows
 from surrogate.judge.curves import Curves
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
+from surrogate.judge.interventions import intervention_rows
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.peptide_protocol import peptide_charts
@@ -23,6 +24,7 @@ from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.shape_rows import shape_rows
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.survival import survival_charts
 from surrogate.judge.torsion_rows import other_torsion_rows
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
@@ -42,6 +44,8 @@ ROOMS: tuple[Room, ...] = (
     coupling_rows,
     msm_rows,
     peptide_charts,
+    intervention_rows,
+    survival_charts,
 )
 
 _MIN_FRAMES = 20

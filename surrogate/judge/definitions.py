@@ -63,15 +63,15 @@ DEFINITIONS: tuple[Definition, ...] = (
     ),
     Definition(
         "Size and shape",
-        "Radius of gyration: mass-weighted, all atoms. End to end: between the two heavy atoms furthest apart in bonds. "
+        "Radius of gyration: mass-weighted, all atoms. End to end: the two heavy atoms furthest apart in bonds. "
         "RMSD and RMSF: heavy atoms (alpha carbons of large molecules) superposed on the mean structure of the "
-        "reference, the same for all trajectories. Values beyond the reference's range are cut a whole range outside it "
+        "reference, the same for all trajectories. Values beyond the reference's range are cut a whole range outside "
         "in means, and have bins of their own in distances.",
         "Gower, Psychometrika 40, 33 (1975); Theobald, Acta Cryst. A61, 478 (2005)",
     ),
     Definition(
         "Other torsions",
-        "ω, χ (IUPAC), every other rotatable bond, and rotors (methyl, hydroxyl, ammonium). Where turning by 2π/m gives "
+        "ω, χ (IUPAC), every other rotatable bond, and rotors (methyl, hydroxyl, ammonium). Where a turn by 2π/m gives "
         "the same molecule (m = 3 for methyl, 2 for phenyl), m times the angle is taken.",
         "IUPAC-IUB Commission, Biochemistry 9, 3471 (1970)",
     ),

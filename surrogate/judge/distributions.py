@@ -13,6 +13,7 @@ from surrogate.judge.statistics import Blocks
 
 FloatArray = npt.NDArray[np.float64]
 AnyFloat = npt.NDArray[np.floating]
+IntArray = npt.NDArray[np.int64]
 
 N_BINS_1D = 100
 N_BINS_2D = 50
@@ -95,6 +96,11 @@ def block_counts(segments: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> Fl
         part = index[piece.segment][piece.start : piece.stop]
         counts[piece.block] += np.bincount(part, minlength=bins.n_total)
     return counts
+
+
+def grouped_counts(segments: Sequence[AnyFloat], columns: IntArray, bins: Bins, blocks: Blocks) -> FloatArray:
+    """Return one histogram per block, `(n_blocks, bins.n_total)`, of `columns` of `(n_frames, k)` values together."""
+    return np.sum([block_counts([s[:, k] for s in segments], bins, blocks) for k in columns.tolist()], axis=0)
 
 
 def block_counts_joint(x: Sequence[AnyFloat], y: Sequence[AnyFloat], bins: Bins, blocks: Blocks) -> FloatArray:

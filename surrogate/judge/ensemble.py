@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.judge.account_of_guards import COLUMN, intervention_notes
 from surrogate.judge.reading import common_lag, merged_record, open_matched, time_axis
 from surrogate.judge.stored_frames import StoredFrames
 from systems.errors import InputError
@@ -32,9 +33,9 @@ class Ensemble:
 
     `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
     by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
-    `flags` `(n,)` uint16 and `chunk_idx` `(n,)` int32 per segment, or None where the file does not say; `record`: what
-    the writer said of itself (costs summed over files); `sources`: the files; `top`, `stated_lag_ps`: what the user
-    said of them; `notes`: what was done on reading.
+    `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
+    segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
+    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading.
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -50,6 +51,7 @@ class Ensemble:
     stated_lag_ps: float | None = None
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
+    changed: Sequence[npt.NDArray[np.bool_]] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
@@ -61,7 +63,7 @@ class Ensemble:
                 )
         if self.n_frames == 0:
             raise InputError(f"{self.label}: no frames.")
-        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx)):
+        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx), ("changed", self.changed)):
             if series is not None and [len(s) for s in series] != self.segment_lengths:
                 raise InputError(f"{self.label}: {name} do not match the segments in length.")
 
@@ -88,6 +90,7 @@ class Ensemble:
             segments=[s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments],
             flags=None if self.flags is None else [f[::stride] for f in self.flags],
             chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
+            changed=None if self.changed is None else [c[::stride] for c in self.changed],
             lag_ps=self.lag_ps * stride,
             notes=(*self.notes, f"{self.label}: every {stride}th frame used, for equal save intervals."),
         )
@@ -125,6 +128,7 @@ def load_ensemble(
     segments: list[Frames] = []
     flags: list[Flags] = []
     chunks: list[npt.NDArray[np.int32]] = []
+    changed: list[npt.NDArray[np.bool_]] = []
     records: list[dict[str, Any]] = []
     lags: list[float] = []
     notes: list[str] = []
@@ -146,12 +150,15 @@ def load_ensemble(
             flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
         if reader.chunk_idx is not None:
             chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
+        if COLUMN in reader.scalars:
+            changed += np.split(reader.scalars[COLUMN] > 0, cuts)
         records.append(dict(reader.record))
         if records[-1].get("completed") is False:
             notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
     assert template is not None
     if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
         raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
+    notes += intervention_notes(name, records)
     lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
     part = kept[0] if len(kept[0]) < template.n_atoms else None
     return Ensemble(
@@ -161,6 +168,7 @@ def load_ensemble(
         scene=template if part is None else part_of(template, part),
         flags=flags if len(flags) == len(segments) else None,
         chunk_idx=chunks if len(chunks) == len(segments) else None,
+        changed=changed if len(changed) == len(segments) else None,
         record=merged_record(records, name, notes),
         sources=tuple(str(p) for p in paths),
         top=None if top is None else str(top),

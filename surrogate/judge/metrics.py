@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import distributions
+from surrogate.judge.block_means import equal_rows, group_labels, over_groups
 from surrogate.judge.curves import BondLength
 from surrogate.judge.distributions import RAMACHANDRAN_BINS, TORSION_BINS
 from surrogate.judge.rows import Group, Row, Sample, Trio, distance_row, observable_row
-from surrogate.judge.statistics import Estimate, difference_p, estimate, excess_p, pooled
+from surrogate.judge.statistics import Estimate, difference_p, estimate, excess_p, mean_estimate, pooled
 from surrogate.judge.structure import CONSTRAINED_BELOW_NM, bond_label
 from systems import validity
 from systems.validity import Geometry
@@ -142,7 +143,11 @@ def bond_rows(trio: Trio) -> tuple[list[Row], list[BondLength]]:
         BondLength(labels[b], *(float(x) for m in moments for x in (m.mean[b], m.std[b]))) for b in range(len(labels))
     ]
     rigid = ~(moments[0].std > 10 * CONSTRAINED_BELOW_NM)
-    rows = [_bond_shift_row(trio, moments, labels)]
+    classes = (
+        trio.reference.features.probes.classes if trio.reference.features.probes else np.arange(trio.scene.n_atoms)
+    )
+    groups = equal_rows(np.asarray(pairs), classes)
+    rows = [_bond_shift_row(trio, [_over_groups(m, groups) for m in moments], group_labels(labels, groups))]
     for chosen, name, tolerance, words in (
         (~rigid, "Bond-length width, flexible bonds", None, "± 5 %"),
         (rigid, "Bond-length width, constrained bonds", 0.02, "± 0.02 Å"),
@@ -167,8 +172,8 @@ def bond_rows(trio: Trio) -> tuple[list[Row], list[BondLength]]:
                 resolution=BOND_RESOLUTION_ANGSTROM,
             )
         )
-    flexible = np.flatnonzero(~rigid)
-    if len(flexible):
+    flexible = [g for g in groups if not rigid[g].any()]
+    if flexible:
         rows.append(_bond_distance_row(trio, flexible))
     return rows, table
 
@@ -207,6 +212,14 @@ def _bond_moments(sample: Sample, geometry: Geometry) -> _Moments:
         draws = sample.weights @ first / drawn
         draws_std = np.sqrt(np.maximum(sample.weights @ second / drawn - draws**2, 0.0))
     return _Moments(mean + centre, std, draws + centre, draws_std, sample.blocks.n_blocks)
+
+
+def _over_groups(moments: _Moments, groups: Sequence[npt.NDArray[np.intp]]) -> _Moments:
+    """The moments of bonds that the molecule's symmetry makes equal, averaged."""
+    mean, std, draws_mean, draws_std = (
+        over_groups(x, groups) for x in (moments.mean, moments.std, moments.draws_mean, moments.draws_std)
+    )
+    return _Moments(mean, std, draws_mean, draws_std, moments.n_blocks)
 
 
 def _bond_shift_row(trio: Trio, moments: Sequence[_Moments], labels: Sequence[str]) -> Row:
@@ -249,10 +262,7 @@ def _least_p(ref: _Moments, cand: _Moments, rep: _Moments) -> tuple[float, float
     n_bonds = len(ref.mean)
     least = [1.0, 1.0]
     for b in range(n_bonds):
-        r, c, other = (
-            Estimate(float(m.mean[b]), error=float(m.draws_mean[:, b].std()), n_blocks=m.n_blocks)
-            for m in (ref, cand, rep)
-        )
+        r, c, other = (mean_estimate(float(m.mean[b]), m.draws_mean[:, b], m.n_blocks) for m in (ref, cand, rep))
         both = pooled(r, other) if math.isfinite(other.value) else r
         for k, (x, y) in enumerate(((c, both), (other, r))):
             if abs(x.value - y.value) > BOND_RESOLUTION_ANGSTROM:
@@ -260,24 +270,19 @@ def _least_p(ref: _Moments, cand: _Moments, rep: _Moments) -> tuple[float, float
     return least[0], least[1]
 
 
-def _bond_distance_row(trio: Trio, flexible: npt.NDArray[np.intp]) -> Row:
-    bins = [distributions.normal_bins([s[:, b] for s in trio.reference.features.bonds_nm]) for b in flexible]
+def _bond_distance_row(trio: Trio, flexible: Sequence[npt.NDArray[np.intp]]) -> Row:
+    measured = [s.features.bonds_nm for s in trio.samples]
+    bins = [distributions.normal_bins([x[:, g] for x in measured[0]]) for g in flexible]
     counts = [
-        np.stack(
-            [
-                distributions.block_counts([x[:, b] for x in s.features.bonds_nm], own, s.blocks)
-                for b, own in zip(flexible, bins, strict=True)
-            ],
-            axis=1,
-        )
-        for s in trio.samples
+        np.stack([distributions.grouped_counts(v, g, own, s.blocks) for g, own in zip(flexible, bins, strict=True)], 1)
+        for s, v in zip(trio.samples, measured, strict=True)
     ]
     return distance_row(
         trio,
         counts,
         key="bond_jsd",
         group="structure",
-        metric=f"Bond-length distance, mean of {len(flexible)} flexible bonds",
+        metric=f"Bond-length distance, mean of {sum(map(len, flexible))} flexible bonds",
         statement=lambda ratio: f"bond-length distributions are {ratio:.3g} times as far off as a replicate's",
     )
 

@@ -153,6 +153,8 @@ def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, 
     """Return the recipe's table as a bar chart and the decorrelation of each torsion, or why they were skipped."""
     name = f"The peptide papers' recipe (lag {format_time_ps(LAG_PS)}, {N_CLUSTERS} clusters, {N_STATES} states)"
     reference, candidate, replicate = (s.features for s in trio.samples)
+    if not trio.options.peptide_recipe:
+        return [], [], [(name, "not asked for")]
     if not (len(trio.torsions.phi) or len(trio.torsions.psi)):
         return [], [], [(name, "the scene has no φ or ψ torsion")]
     lag = LAG_PS / reference.lag_ps
@@ -189,7 +191,9 @@ def _decorrelation_chart(trio: Trio) -> Chart:
         backbone, side = torsion_columns(sample.features)
         for kind, group in (("backbone", backbone), ("side chains", side)):
             if group:
-                curves = np.array([decorrelation(s, n_lags) for s in group])
+                curves = np.array([c for s in group if np.isfinite(c := decorrelation(s, n_lags)).any()])
+                if not len(curves):
+                    continue
                 drawn = np.unique(np.geomspace(1, n_lags - 1, 80).astype(int))
                 x = drawn * sample.features.lag_ps
                 lines.append(Line(f"{kind}, {role}", role, x, np.nanmean(curves, axis=0)[drawn]))  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from surrogate.judge import figures
 from surrogate.judge.chart_figures import draw_chart
-from surrogate.judge.charts import Chart, Section
+from surrogate.judge.charts import Chart, Landscape, Section
 from surrogate.judge.comparison import Judgement
 from surrogate.judge.figures import Figure
 from surrogate.judge.wording import number
@@ -55,7 +55,8 @@ def albums(judgement: Judgement, temperature_k: float) -> list[Album]:
     charts: list[Chart] = [*curves.histograms, *curves.charts]
     out = []
     for section, title in _TITLES.items():
-        mine = [c for c in charts if c.section == section]
+        everything = [c for c in charts if c.section == section]
+        mine = [c for c in everything if not isinstance(c, Landscape)]
         most = MAX_DRAWN_HISTOGRAMS if section == "distributions" else 2 * MAX_DRAWN
         drawn = [figure for chart in mine[:most] for figure in draw_chart(chart, temperature_k)]
         n_left = max(len(mine) - most, 0)
@@ -66,6 +67,9 @@ def albums(judgement: Judgement, temperature_k: float) -> list[Album]:
             drawn = [Figure(figures.correlation(c), caption.format(c.label)) for c in shown] + drawn
         if drawn:
             out.append(Album(title, drawn, f"{n_left} more stand in the JSON file." if n_left else ""))
+        # A landscape is a row of maps: it stands by itself, like those of φ and ψ.
+        landscapes = [c for c in everything if isinstance(c, Landscape)]
+        out += [Album(c.title, draw_chart(c, temperature_k), "") for c in landscapes[:MAX_DRAWN]]
     return out
 
 

@@ -47,7 +47,8 @@ class Probes:
 
     `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
     (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
-    reference forms in more than half of its frames. `left_out` says what is not measured, and why.
+    reference forms in more than half of its frames. `classes` `(n_atoms,)`: equal for atoms that have no identity of
+    their own, such as the hydrogens of a methyl group. `left_out` says what is not measured, and why.
     """
 
     scene: Scene
@@ -62,6 +63,7 @@ class Probes:
     native: IntArray
     hydrogen_bonds: IntArray
     rings: tuple[tuple[int, ...], ...]
+    classes: IntArray
     left_out: tuple[tuple[str, str], ...] = ()
 
     def labels(self, family: Family) -> list[str]:
@@ -89,10 +91,17 @@ def find_probes(
     Where `scene` is what is left of a larger `parent`, its atoms `kept`, torsions and rings are found in the parent,
     and those whose atoms are all left are measured.
     """
+    from systems.chemistry import atom_classes
+
     whole = parent or scene
     place = {int(atom): k for k, atom in enumerate(range(scene.n_atoms) if kept is None else kept)}
     torsions = tuple(
-        t._replace(quad=_placed(t.quad, place)) for t in find_torsions(whole) if all(i in place for i in t.quad)
+        t._replace(
+            quad=_placed(t.quad, place),
+            equal=tuple(_placed(q, place) for q in t.equal if all(i in place for i in q)),
+        )
+        for t in find_torsions(whole)
+        if all(i in place for i in t.quad)
     )
     rings = tuple(_placed(r, place) for r in puckers.find_rings(whole) if all(i in place for i in r))
     left_out: list[tuple[str, str]] = []
@@ -118,6 +127,7 @@ def find_probes(
         native=np.flatnonzero(in_contact > 0.5),
         hydrogen_bonds=triplets[_foremost(bonded, "hydrogen bonds", left_out)],
         rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
+        classes=atom_classes(whole)[np.arange(scene.n_atoms) if kept is None else kept],
         left_out=tuple(left_out),
     )
 
@@ -136,8 +146,8 @@ def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Fa
         "hydrogen_bonds": np.zeros((n, len(probes.hydrogen_bonds)), dtype=bool),
         "puckers": np.empty((n, 2 * len(probes.rings)), dtype=np.float32),
     }
-    quads = np.array([t.quad for t in probes.torsions], dtype=np.int64).reshape(-1, 4)
-    folds = np.array([t.fold for t in probes.torsions], dtype=np.float32)[:, None]
+    quads = np.array([q for t in probes.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
+    of_torsion = np.repeat(np.arange(len(probes.torsions)), [len(t.equal) or 1 for t in probes.torsions])
     masses = probes.scene.masses_da / max(float(probes.scene.masses_da.sum()), 1e-9)
     widest = _widest(probes.all_contacts, probes.hydrogen_bonds, probes.angles)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -147,8 +157,9 @@ def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Fa
         out["shape"][:, 1] = np.sqrt(squared.mean(axis=1))
         for start, x in column_blocks(frames_nm, widest):
             part = slice(start, start + x.shape[2])
-            angle = folds * torsion_angle(x, quads)
-            out["torsions"][part] = (angle - 2 * np.pi * np.round(angle / (2 * np.pi))).T
+            angles = torsion_angle(x, quads)
+            for k, torsion in enumerate(probes.torsions):
+                out["torsions"][part, k] = _folded(angles[of_torsion == k], torsion.fold)
             out["angles"][part] = bond_angle(x, probes.angles).T
             out["hydrogen_bonds"][part] = hydrogen_bonds.is_formed(x, probes.hydrogen_bonds).T
             out["contacts"][part] = (squared_distance(x, probes.contacts) < probes.contact_nm**2).T
@@ -167,6 +178,14 @@ def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Fa
         for values in out.values():
             values[broken] = False if values.dtype == bool else np.nan
     return out
+
+
+def _folded(angles_rad: FloatArray, fold: int) -> FloatArray:
+    """Return `fold` times the torsion told from each of some equal atoms `(k, n)`, their mean direction `(n,)`."""
+    turned = fold * angles_rad
+    if len(turned) > 1:
+        return np.asarray(np.arctan2(np.sin(turned).sum(axis=0), np.cos(turned).sum(axis=0)))
+    return np.asarray(turned[0] - 2 * np.pi * np.round(turned[0] / (2 * np.pi)))
 
 
 def mean_structure(frames_nm: FloatArray) -> npt.NDArray[np.float64]:

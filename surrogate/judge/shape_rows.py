@@ -9,7 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import distributions
-from surrogate.judge.block_means import Means, block_means, bounds, column, family_of, shift_row
+from surrogate.judge.block_means import (
+    Means,
+    block_means,
+    bounds,
+    column,
+    equal_rows,
+    family_of,
+    group_labels,
+    over_groups,
+    shift_row,
+)
 from surrogate.judge.charts import BarChart, Chart
 from surrogate.judge.curves import histogram
 from surrogate.judge.distributions import Bins
@@ -99,14 +109,21 @@ def series_distance(trio: Trio, series: Series, bins: Bins, key: str, name: str,
 
 
 def mean_distance(
-    trio: Trio, segments: Sequence[Sequence[npt.NDArray[Any]]], bins: Sequence[Bins], key: str, name: str, group: Group
+    trio: Trio,
+    segments: Sequence[Sequence[npt.NDArray[Any]]],
+    bins: Sequence[Bins],
+    key: str,
+    name: str,
+    group: Group,
+    groups: Sequence[npt.NDArray[np.intp]] | None = None,
 ) -> Row:
-    """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each."""
+    """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each.
+
+    With `groups` of equal columns, one histogram and one `Bins` a group.
+    """
+    chosen = [np.array([k]) for k in range(len(bins))] if groups is None else groups
     counts = [
-        np.stack(
-            [distributions.block_counts(column(v, k), own, s.blocks) for k, own in enumerate(bins)],
-            axis=1,
-        )
+        np.stack([distributions.grouped_counts(v, g, own, s.blocks) for g, own in zip(chosen, bins, strict=True)], 1)
         for s, v in zip(trio.samples, segments, strict=True)
     ]
     what = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
@@ -176,11 +193,15 @@ def _angle_rows(trio: Trio) -> list[Row]:
     angles = [family_of(s, "angles") for s in trio.samples]
     limits = bounds(angles[0])
     means = [block_means(s, v, limits) for s, v in zip(trio.samples, angles, strict=True)]
-    in_degrees = [Means(np.degrees(m.values), np.degrees(m.draws), m.n_blocks) for m in means]
+    groups = equal_rows(probes.angles, probes.classes)
+    in_degrees = [
+        Means(np.degrees(over_groups(m.values, groups)), np.degrees(over_groups(m.draws, groups)), m.n_blocks)
+        for m in means
+    ]
     shift = shift_row(
         trio,
         in_degrees,
-        probes.labels("angles"),
+        group_labels(probes.labels("angles"), groups),
         key="angle_shift",
         group="structure",
         metric="Largest shift of a mean bond angle",
@@ -189,8 +210,8 @@ def _angle_rows(trio: Trio) -> list[Row]:
         resolution=_ANGLE_RESOLUTION_DEG,
         statement=lambda label, c, r: f"the angle {label} is {abs(c - r):.1f}° too {'wide' if c > r else 'narrow'}",
     )
-    bins = [distributions.normal_bins(column(angles[0], k), _ANGLE_BINS) for k in range(len(probes.angles))]
-    return [shift, mean_distance(trio, angles, bins, "angle_jsd", "Bond angles", "structure")]
+    bins = [distributions.normal_bins([x[:, g] for x in angles[0]], _ANGLE_BINS) for g in groups]
+    return [shift, mean_distance(trio, angles, bins, "angle_jsd", "Bond angles", "structure", groups)]
 
 
 def _pucker_rows(trio: Trio, charts: list[Chart]) -> list[Row]:

@@ -109,18 +109,28 @@ def _t_quantile(probability: float, n_blocks: int) -> float:
     return float(stdtrit(max(n_blocks - 1, 1), probability))
 
 
+def widening(n_blocks: int) -> float:
+    """Return the factor from the spread of bootstrap draws to the standard error.
+
+    sqrt(B / (B - 1)) for drawing from B blocks, and 1 / sqrt(1 - 1/10) for blocks of ten correlation times: the mean
+    over a block of length b has the variance (2 tau / b) (1 - tau / b), of which only the first factor falls off as one
+    over the length. Source: Flyvbjerg and Petersen, J. Chem. Phys. 91, 461 (1989).
+    """
+    return math.sqrt(n_blocks / (n_blocks - 1) / (1.0 - 1.0 / BLOCK_IN_CORRELATION_TIMES)) if n_blocks > 1 else math.nan
+
+
 def estimate(value: float, draws: npt.ArrayLike, n_blocks: int, *, log: bool = False) -> Estimate:
     """Return `value` with its 95 % interval from bootstrap `draws` `(n_draws,)`.
 
     The draws are centred on the value (resampling biases every histogram distance upward), and their spread is widened
-    by Student's t over the normal quantile and by sqrt(B / (B - 1)), because B blocks are few. With `log` the interval
-    is made for the logarithm, for quantities that are positive and skewed (times, ratios).
+    by Student's t over the normal quantile and by `widening`, because B blocks are few and remember each other. With
+    `log` the interval is made for the logarithm, for quantities that are positive and skewed (times, ratios).
     """
     array = np.asarray(draws, dtype=np.float64)
     array = array[np.isfinite(array)]
     if not math.isfinite(value) or len(array) < 2 or n_blocks < 2:
         return Estimate(value, n_blocks=n_blocks)
-    widen = math.sqrt(n_blocks / (n_blocks - 1))
+    widen = widening(n_blocks)
     t_over_normal = _t_quantile(0.975, n_blocks) / 1.959964
     log_error = math.nan
     if value > 0:
@@ -136,6 +146,11 @@ def estimate(value: float, draws: npt.ArrayLike, n_blocks: int, *, log: bool = F
         low, high = np.quantile(array, [0.025, 0.975]) - array.mean()
         bounds = value + widen * t_over_normal * low, value + widen * t_over_normal * high
     return Estimate(value, float(bounds[0]), float(bounds[1]), error, log_error, n_blocks)
+
+
+def mean_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
+    """Return `value` with its standard error alone: enough for a test, where there are too many for intervals."""
+    return Estimate(value, error=float(draws.std()) * widening(n_blocks), n_blocks=n_blocks)
 
 
 def difference_p(a: Estimate, b: Estimate, *, log: bool = False) -> float:

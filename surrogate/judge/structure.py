@@ -49,8 +49,8 @@ class Features:
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
-    frame is not finite. `chunk_idx` `(n,)` or None. `series` holds the further families `(n, k)` that `probes` names
-    (see `surrogate.judge.probes.Probes`), empty where nothing was asked for.
+    frame is not finite. `chunk_idx` and `changed` `(n,)` or None. `series` holds the further families `(n, k)` that
+    `probes` names (see `surrogate.judge.probes.Probes`), empty where nothing was asked for.
     """
 
     label: str
@@ -62,6 +62,7 @@ class Features:
     chunk_idx: Sequence[npt.NDArray[np.int32]] | None
     series: Mapping[Family, Sequence[npt.NDArray[Any]]] = field(default_factory=dict)
     probes: Probes | None = None
+    changed: Sequence[npt.NDArray[np.bool_]] | None = None
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -93,6 +94,7 @@ class Features:
             bonds_nm=cut(self.bonds_nm),
             flags=cut(self.flags),
             chunk_idx=None if self.chunk_idx is None else cut(self.chunk_idx),
+            changed=None if self.changed is None else cut(self.changed),
             series={family: cut(values) for family, values in self.series.items()},
         )
 
@@ -181,7 +183,16 @@ def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: 
                         series[family].append(np.empty((n, values.shape[1]), dtype=values.dtype))
                     series[family][-1][part] = values
     return Features(
-        ensemble.label, ensemble.lag_ps, phi, psi, lengths, flags, ensemble.chunk_idx, series=series, probes=probes
+        ensemble.label,
+        ensemble.lag_ps,
+        phi,
+        psi,
+        lengths,
+        flags,
+        ensemble.chunk_idx,
+        series=series,
+        probes=probes,
+        changed=ensemble.changed,
     )
 
 

@@ -21,12 +21,15 @@ class Torsion(NamedTuple):
 
     A `fold` of m means that turning by 2π/m gives the same molecule (3 for methyl, 2 for phenyl): what is measured is
     then m times the angle, which runs once round the circle while the torsion runs from one equal position to the next.
+    `equal` are the atoms from which it could as well be told, `quad` among them: the direction of the mean over them is
+    taken, so that it does not matter which of the hydrogens of a methyl group is called the first.
     """
 
     quad: tuple[int, int, int, int]
     label: str
     kind: Kind
     fold: int
+    equal: tuple[tuple[int, int, int, int], ...] = ()
 
 
 def find_torsions(scene: Scene) -> list[Torsion]:
@@ -47,7 +50,8 @@ def find_torsions(scene: Scene) -> list[Torsion]:
     for quad in rotatable_torsions(scene, rotors=True).tolist():
         if frozenset(quad[1:3]) in taken:
             continue
-        found.append(_named(scene, graph, classes, side, quad))
+        a, b, c, d = quad
+        found.append(_named(scene, graph, classes, side, (a, b, c, d)))
     return found
 
 
@@ -76,23 +80,33 @@ def _side_chains(graph: nx.Graph, phi: Sequence[Sequence[int]], psi: Sequence[Se
 
 
 def _named(
-    scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: Sequence[int]
+    scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: tuple[int, int, int, int]
 ) -> Torsion:
     a, b, c, d = quad
-    fold = math.lcm(_equal_positions(scene, graph, classes, b, c), _equal_positions(scene, graph, classes, c, b))
+    turns = [_equal_positions(scene, graph, classes, *bond) for bond in ((b, c), (c, b))]
+    fold = math.lcm(*turns)
+
+    def equal(a: int, b: int, c: int, d: int, turns: Sequence[int]) -> tuple[tuple[int, int, int, int], ...]:
+        starts, ends = (
+            [j for j in sorted(graph[i]) if j != other] if n > 1 else [alone]
+            for i, other, alone, n in ((b, c, a, turns[0]), (c, b, d, turns[1]))
+        )
+        return tuple((i, b, c, j) for i in starts for j in ends)
+
     heavy = [[j for j in graph[i] if j != k and scene.elements[j] != "H"] for i, k in ((b, c), (c, b))]
     in_side = b in side and c in side and abs(side[b].depth - side[c].depth) == 1
     if not (heavy[0] and heavy[1]):
-        return Torsion((a, b, c, d), f"rotor {_bond(scene, b, c)}", "rotor", fold)
+        return Torsion((a, b, c, d), f"rotor {_bond(scene, b, c)}", "rotor", fold, equal(*quad, turns))
     if not in_side:
-        return Torsion((a, b, c, d), f"torsion {_bond(scene, b, c)}", "rotatable", fold)
+        return Torsion((a, b, c, d), f"torsion {_bond(scene, b, c)}", "rotatable", fold, equal(*quad, turns))
     near, far = (b, c) if side[b].depth < side[c].depth else (c, b)
     outer = min(
         (j for j in graph[far] if j != near and scene.elements[j] != "H"), key=lambda j: _branch(scene, classes, j)
     )
     residue = int(scene.residue_of_atom[near])
     label = f"χ{side[near].depth + 1} {scene.residue_names[residue]} {scene.residue_ids[residue]}"
-    return Torsion((side[near].before, near, far, outer), label, "χ", fold)
+    chosen = (side[near].before, near, far, outer)
+    return Torsion(chosen, label, "χ", fold, equal(*chosen, turns if near == b else turns[::-1]))
 
 
 def _branch(scene: Scene, classes: Sequence[int], atom: int) -> tuple[int, int, int]:

@@ -39,9 +39,22 @@
     let clip = clips[0], frame = 0, timer = null, zoom = 1;
     let rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
-    let extent = 0.1;
-    const first = clips.flatMap((c) => c.frames).find((f) => f[0] !== NOT_FINITE);
-    if (first) for (let i = 0; i < nAtoms * 3; i++) extent = Math.max(extent, Math.abs(first[i]) * data.scale);
+    // How far the molecules reach from the middle, and how high, in all but the farthest frames.
+    const farthest = (measure) => {
+      const found = [];
+      for (const { frames } of clips) for (const source of frames) {
+        for (let i = 0; i < source.length; i += 3 * nAtoms) {
+          if (source[i] === NOT_FINITE) continue;
+          let most = 0;
+          for (let k = i; k < i + 3 * nAtoms; k += 3) most = Math.max(most, measure(source[k], source[k + 1], source[k + 2]));
+          found.push(most * data.scale);
+        }
+      }
+      found.sort((p, q) => p - q);
+      return Math.max(0.1, found[Math.floor(0.95 * (found.length - 1))] || 0);
+    };
+    const extent = farthest((x, y, z) => Math.hypot(x, y, z));
+    const reach = Math.max(farthest((x, y) => Math.abs(y)), 0.6 * extent);
 
     // Turn by angles about the screen's x and y axes, on the left of what there is.
     function turn(aboutX, aboutY) {
@@ -104,7 +117,7 @@
       context.clearRect(0, 0, width, height);
       const apart = layout.value === "beside";
       const across = apart ? width / 2 : width;
-      const pixels = (zoom * 0.5 * Math.min(across, 1.4 * height)) / extent;
+      const pixels = 0.42 * zoom * Math.min(across / extent, height / reach);
       const shapes = [], lost = [];
       const colours = [style("--reference"), style("--candidate")];
       ["reference", "candidate"].forEach((name, who) => {

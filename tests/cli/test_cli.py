@@ -252,7 +252,7 @@ def test_replicas_are_numbered_and_differ(here: Path) -> None:
     assert abs(a - b).max() > 1e-3
 
 
-def test_compare_writes_both_reports(here: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     made = tmp_path_factory.mktemp("compare")
     assert (
         run("reference", "alanine-dipeptide", "--time", "20ps", "--save-every", "40fs", "--replicas", "2",
@@ -260,7 +260,7 @@ def test_compare_writes_both_reports(here: Path, tmp_path_factory: pytest.TempPa
     )  # fmt: skip
     result = run("compare", str(made / "x_r0.h5"), str(made / "x_r1.h5"), "-o", "report.html")
     assert result.exit_code == 0, result.stderr
-    assert {p.name for p in here.iterdir()} == {"report.html", "report.json"}
+    assert {p.name for p in here.iterdir()} == {"report.html", "report.json", "report.md"}
     assert "report.html" in result.stdout
     json.loads((here / "report.json").read_text())
     page = (here / "report.html").read_text()

@@ -122,12 +122,39 @@ def test_chi_torsions_equal_mdtraj(peptide: Scene) -> None:
     in_ring = {q for q in theirs if peptide.residue_names[int(peptide.residue_of_atom[q[1]])] == "PRO"}
     assert set(ours) == set(theirs) - in_ring, [names(peptide, q) for q in set(ours) ^ (set(theirs) - in_ring)]
     for quad, (k, fold) in ours.items():
-        gap = measured[:, k] - fold * theirs[quad]
+        equal = probes.torsions[k].equal
+        assert quad in equal and len(equal) == fold
+        told = mdtraj.compute_dihedrals(trajectory, np.array(equal), periodic=False)
+        gap = measured[:, k] - (fold * theirs[quad] if fold == 1 else np.angle(np.exp(1j * fold * told).sum(axis=1)))
         assert np.cos(gap) == pytest.approx(np.ones(20), abs=1e-5), names(peptide, quad)
     labels = {t.label: t for t in probes.torsions}
     assert names(peptide, labels["χ1 VAL 2"].quad) == "N-CA-CB-CG1"
     assert names(peptide, labels["χ1 THR 6"].quad) == "N-CA-CB-OG1"
     assert labels["χ2 PHE 3"].fold == 2 and labels["χ4 LYS 5"].fold == 1
+
+
+def test_it_does_not_matter_which_of_equal_atoms_is_called_the_first(peptide: Scene) -> None:
+    """The edges of a phenyl ring and the hydrogens of a methyl group change places; two that are not equal do not."""
+    rng = np.random.default_rng(1)
+    frames = (peptide.positions_nm + 0.01 * rng.standard_normal((20, peptide.n_atoms, 3))).astype(np.float32)
+    probes = find_probes(peptide, frames)
+    before = measure_block(frames, probes)["torsions"]
+    atom = {
+        (peptide.residue_names[r], n): i
+        for i, (r, n) in enumerate(zip(peptide.residue_of_atom.tolist(), peptide.atom_names, strict=True))
+    }
+
+    def swapped(*pairs: tuple[str, str, str]) -> np.ndarray:
+        moved = frames.copy()
+        for residue, a, b in pairs:
+            i, j = atom[residue, a], atom[residue, b]
+            moved[:, [i, j]] = moved[:, [j, i]]
+        return np.cos(measure_block(moved, probes)["torsions"] - before).min(axis=0)
+
+    ring = [("PHE", f"{x}1", f"{x}2") for x in ("CD", "CE", "HD", "HE")]
+    assert swapped(*ring) == pytest.approx(np.ones(before.shape[1]), abs=1e-6)
+    assert swapped(("VAL", "HG11", "HG12")) == pytest.approx(np.ones(before.shape[1]), abs=1e-6)
+    assert swapped(("VAL", "CG1", "CG2")).min() < 0.5, "these two are not equal: the centre beside them is chiral"
 
 
 # ---- known answers -------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import pytest
 from surrogate.judge import distributions, worth_measures
 from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.rows import Options
 from surrogate.judge.worth import Measure, Worth, headline, worth_by
 
 N_BLOCKS, PER_BLOCK = 128, 20
@@ -96,7 +97,7 @@ def judged(trio: tuple[Ensemble, Ensemble, Ensemble]) -> Judgement:
     reference, candidate, replicate = trio
     reference = replace(reference, record=reference.record | {"cost": {"wall_s": 1000.0}})
     shorter = replace(candidate, segments=[candidate.segments[0][:1500]], record={"cost": {"wall_s": 1.0}})
-    return compare(reference, [shorter], replicate).judgements[0]
+    return compare(reference, [shorter], replicate, options=Options(peptide_recipe=False)).judgements[0]
 
 
 def test_the_verdict_says_what_the_trajectory_is_worth_and_costs(judged: Judgement) -> None:
@@ -117,7 +118,9 @@ def test_wrong_kinetics_are_worth_little_where_the_map_is_right(trio: tuple[Ense
     reference, candidate, replicate = trio
     frames = candidate.segments[0].copy()
     np.random.default_rng(0).shuffle(frames)
-    found = compare(reference, [replace(candidate, segments=[frames])], replicate).judgements[0]
+    found = compare(
+        reference, [replace(candidate, segments=[frames])], replicate, options=Options(peptide_recipe=False)
+    ).judgements[0]
     by = {w.key: w for w in found.worth}
     assert by["joint_jsd"].worth_ps > 4_000
     assert by["psi_correlation"].worth_ps < 400
@@ -133,5 +136,7 @@ def test_the_headline_without_costs_or_measures() -> None:
 
 
 def test_short_trajectories_have_no_worth(simulate: Callable[..., Ensemble]) -> None:
-    judgement = compare(simulate(31, 60), [simulate(32, 60)], simulate(33, 60)).judgements[0]
+    judgement = compare(
+        simulate(31, 60), [simulate(32, 60)], simulate(33, 60), options=Options(peptide_recipe=False)
+    ).judgements[0]
     assert judgement.worth == () and judgement.worth_words == ""
