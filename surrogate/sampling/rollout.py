@@ -62,7 +62,11 @@ def rollout(
     sampler = ChunkSampler(weights, solver_steps=config.solver_steps, solver=config.solver, precision=config.precision)
     plan = settle_plan(scene, weights, config, sampler, n_replicas=len(outs))
     state_path = checkpoint_path(outs[0])
+    if resume and not state_path.exists() and _just_begun(outs):
+        resume, overwrite = False, True
     resuming = resume and all(p.exists() for p in outs)
+    if resume and not resuming and not overwrite:
+        _refuse_missing(outs, state_path)
     if resuming and not state_path.exists():
         return _already_complete(outs, plan.n_frames)
     state = read_checkpoint(state_path, plan.settings) if resuming else _start(plan, sampler, len(outs))
@@ -80,8 +84,9 @@ def rollout(
         asked_to_stop = stack.enter_context(deferred_interrupt())
         writers = _open_writers(stack, plan, sampler, checks, outs, append=resuming, overwrite=overwrite)
         if resuming:
-            for writer in writers:
-                writer.truncate(min(state.steps, plan.n_steps) // plan.stride)
+            _cut_back(writers, outs, min(state.steps, plan.n_steps) // plan.stride)
+        else:
+            state_path.unlink(missing_ok=True)  # of an earlier rollout, which was just replaced
         buffers: list[list[_Block]] = [[] for _ in outs]
         started = time.monotonic() - state.wall_s
         last_flush = time.monotonic()
@@ -192,6 +197,38 @@ def _open_writers(stack: ExitStack, plan: Plan, sampler: ChunkSampler, checks: G
         writer = open_writer(path, scene, record, append=append, overwrite=overwrite)
         writers.append(stack.enter_context(writer))
     return writers
+
+
+def _refuse_missing(outs: Sequence[Path], state_path: Path) -> None:
+    """Raise InputError where a rollout was begun and one of its files has gone."""
+    missing = [path for path in outs if not path.exists()]
+    if state_path.exists() or len(missing) < len(outs):
+        raise InputError(
+            f"{missing[0]} is not there to go on from, though other files of its rollout are; restore it, or start "
+            "again with --overwrite."
+        )
+
+
+def _just_begun(outs: Sequence[Path]) -> bool:
+    """Whether a rollout was stopped after it made files and before it wrote frames into any."""
+    there = [path for path in outs if path.exists()]
+    for path in there:
+        with open_trajectory(path) as reader:
+            if reader.n_frames or reader.record.get("kind") != "rollout":
+                return False
+    return bool(there)
+
+
+def _cut_back(writers: Sequence[TrajectoryWriter], outs: Sequence[Path], n_frames: int) -> None:
+    """Cut files to what the checkpoint knows of. Raises InputError, before any is changed, where one holds less."""
+    for path, writer in zip(outs, writers, strict=True):
+        if writer.n_frames < n_frames:
+            raise InputError(
+                f"{path} holds {writer.n_frames} frames where its checkpoint has seen {n_frames}: it was cut short or "
+                "replaced; restore it, or start again with --overwrite."
+            )
+    for writer in writers:
+        writer.truncate(n_frames)
 
 
 def _already_complete(outs: Sequence[Path], n_frames: int) -> list[Path]:
