@@ -517,6 +517,7 @@ def windows(
     references: Trajectories,
     out: PathLike,
     *,
+    validation: Trajectories | None = None,
     canonical: bool = True,
     velocities: bool = False,
     overwrite: bool = False,
@@ -524,15 +525,22 @@ def windows(
 ) -> Path:
     """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
 
-    `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when scenes,
-    save intervals or conditions differ, TrajectoryError for damaged files.
+    They may be larger than memory. `validation`: trajectories held out whole; without any, the last twentieth of each
+    is. `velocities` keeps these as well, for PAINET, and leaves frames in their own pose. Raises InputError when
+    scenes, save intervals or conditions differ, TrajectoryError for damaged files.
     """
-    from surrogate.data.frames import collect_frames
+    from surrogate.data.frames import load_frames, write_windows
 
     out = Path(out)
     check_outputs([out], [".h5"], overwrite=overwrite)
     paths = find_trajectories(references, verify=True)
-    collect_frames(paths, canonical=canonical and not velocities, velocities=velocities).save(out)
+    held = [] if validation is None else find_trajectories(validation, verify=True)
+    write_windows(paths, out, canonical=canonical and not velocities, velocities=velocities, held=held)
+    try:
+        load_frames(out).refuse_leaks()
+    except InputError:
+        out.unlink()
+        raise
     return out
 
 
@@ -545,6 +553,7 @@ def train(
     budget_s: float | None = None,
     steps: int | None = None,
     start_from: PathLike | None = None,
+    validation: Trajectories | None = None,
     time_reversal: bool = False,
     rare_draws: float = 0.0,
     seed: int = 0,
@@ -559,7 +568,9 @@ def train(
     --save-velocities and natural hydrogen masses); or a baseline that is fitted in one go: frozen, constant-velocity,
     resampling, normal-modes, msm. The others end after `budget_s` seconds of training or `steps` optimiser steps over
     all stages, whichever is given. `config`: a TOML file of model settings. `start_from`: weights (name or file) whose
-    second stage is trained further, with their configuration. `time_reversal` shows every other window backwards,
+    second stage is trained further, with their configuration. `validation`: trajectories that the curves are measured
+    on; without any it is the last twentieth of each. A stretch of motion that would be both trained on and validated
+    on is refused. `time_reversal` shows every other window backwards,
     right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
     (surrogate.data.rarity). Beside `out`, a CSV holds the training curves and, until done, files the state that
     `resume` goes on from. Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
@@ -575,6 +586,7 @@ def train(
     request = TrainingRequest(
         arch=arch,
         paths=[],
+        held=[],
         out=out,
         config=None if config is None else Path(config),
         budget_s=budget_s,
@@ -594,7 +606,8 @@ def train(
     if resume and out.exists() and not states:
         return out
     paths = find_trajectories(references, verify=True)
-    prepared = prepare_training(replace(request, paths=paths, device=_device(device)))
+    held = [] if validation is None else find_trajectories(validation, verify=True)
+    prepared = prepare_training(replace(request, paths=paths, held=held, device=_device(device)))
     with progress_bar(f"training {prepared.scene}", quiet=quiet) as bar:
 
         def advance(stage: str, share: float) -> None:
@@ -615,4 +628,12 @@ def _device(device: str) -> str:
 
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        kind = ""
+    if kind not in ("cpu", "cuda"):
+        raise InputError(f"the device {device!r} is unknown; choose auto, cpu or cuda.")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise InputError("no CUDA device is to be had here; leave --device out.")
     return device

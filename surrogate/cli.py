@@ -15,6 +15,7 @@ from surrogate.cli_options import (
     ArchOpt,
     Atoms,
     AtomsOpt,
+    DeviceOpt,
     DropLigandOpt,
     DropWaterOpt,
     EnergyEveryOpt,
@@ -49,6 +50,7 @@ from surrogate.cli_options import (
     Solver,
     TemperatureOpt,
     TimestepOpt,
+    ValidationOpt,
     VelocitiesOpt,
     WantedTemperatureOpt,
     parse_hydrogen_mass_da,
@@ -315,6 +317,7 @@ def windows(
         list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
+    validation: ValidationOpt = None,
     velocities: VelocitiesOpt = False,
     overwrite: OverwriteOpt = False,
     quiet: QuietOpt = False,
@@ -323,7 +326,9 @@ def windows(
     """Turn reference trajectories into training data: one compact file."""
     from surrogate import api
 
-    written = api.windows(references, out, velocities=velocities, overwrite=overwrite, quiet=quiet)
+    written = api.windows(
+        references, out, validation=validation, velocities=velocities, overwrite=overwrite, quiet=quiet
+    )
     print_written([written], as_json, quiet)
 
 
@@ -340,12 +345,14 @@ def train(
     start_from: Annotated[
         str | None, typer.Option("--from", help="Weights whose second stage is trained further: a name or a file.")
     ] = None,
+    validation: ValidationOpt = None,
     time_reversal: Annotated[
         bool, typer.Option("--time-reversal", help="Show windows backwards too: right for MD in equilibrium.")
     ] = False,
     rare_draws: Annotated[
         float, typer.Option("--rare-draws", help="Share of windows drawn for a rare state, weighted down by as much.")
     ] = 0.0,
+    device: DeviceOpt = "auto",
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -363,9 +370,11 @@ def train(
         budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
         steps=steps,
         start_from=start_from,
+        validation=validation,
         time_reversal=time_reversal,
         rare_draws=rare_draws,
         seed=seed,
+        device=device,
         resume=resume,
         overwrite=overwrite,
         quiet=quiet,

@@ -79,6 +79,11 @@ ArchOpt = Annotated[
     ),
 ]
 VelocitiesOpt = Annotated[bool, typer.Option("--velocities", help="Keep velocities, which painet learns from.")]
+ValidationOpt = Annotated[
+    list[str] | None,
+    typer.Option("--validation", help="Trajectory held out whole; repeatable. Default: the last 5 % of each."),
+]
+DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 ReplicasOpt = Annotated[
     int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
 ]

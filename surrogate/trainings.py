@@ -26,6 +26,8 @@ class TrainingRequest:
 
     arch: str
     paths: list[Path]
+    # Trajectories that are held out whole, for validation.
+    held: list[Path]
     out: Path
     config: Path | None
     budget_s: float | None
@@ -153,7 +155,13 @@ def read_frames(request: TrainingRequest, *, canonical: bool, velocities: bool =
     from surrogate.describe import is_windows
 
     if not any(is_windows(path) for path in request.paths):
-        return collect_frames(request.paths, canonical=canonical, velocities=velocities)
+        frames = collect_frames(
+            request.paths, canonical=canonical, velocities=velocities, held=request.held, spool=request.out.parent
+        )
+        frames.refuse_leaks()
+        return frames
+    if request.held:
+        raise InputError("--validation needs trajectories to train on; a windows file keeps its own split.")
     if len(request.paths) > 1:
         raise InputError("give either trajectories or one windows file to train on.")
     frames = load_frames(request.paths[0])
@@ -162,4 +170,5 @@ def read_frames(request: TrainingRequest, *, canonical: bool, velocities: bool =
             f"{request.paths[0]} holds no velocities, which {request.arch} learns from; make it with "
             "`surromd windows --velocities`."
         )
+    frames.refuse_leaks()
     return frames

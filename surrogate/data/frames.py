@@ -1,27 +1,39 @@
-"""Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16."""
+"""Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16.
+
+In a windows file they lie uncompressed and are mapped, not read: a training takes from a file larger than memory what
+its windows need.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.data.splits import Split, refuse_leaks
 from systems.errors import InputError
 from systems.geometry import superpose
 from systems.scene import Scene
 from systems.whole_file import create_whole
 
 if TYPE_CHECKING:
+    import h5py
+
     from systems.trajectory_types import TrajectoryReader
 
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
 _BLOCK = 8192
+# Frames beyond this are kept in a file.
+MEMORY_BYTES = 2_000_000_000
+# What frames are written into: an array or a data set of HDF5.
+Target = Any
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
 
 
@@ -42,6 +54,7 @@ class TrainingFrames:
     conditions: dict[str, Any]
     sources: tuple[dict[str, Any], ...]
     velocities: npt.NDArray[np.float32] | None = None
+    split: Split = field(default_factory=Split)
 
     @property
     def n_frames(self) -> int:
@@ -55,51 +68,74 @@ class TrainingFrames:
         """Return frames `(*idx.shape, n_atoms, 3)` nm."""
         return self.coordinates[idx].astype(np.float32) * np.float32(QUANTUM_NM)
 
-    def window_starts(self, length: int, *, validation: bool, validation_share: float = 0.05) -> npt.NDArray[np.int64]:
-        """Return the first frames of all windows of `length` frames that cross no boundary.
+    def window_starts(self, length: int, *, validation: bool) -> npt.NDArray[np.int64]:
+        """Return the first frames of all windows of `length` frames that cross no boundary of trajectories or split.
 
-        The last `validation_share` of each trajectory is the validation block; no window reaches from one block into
-        the other, so nothing of the validation block is trained on.
+        No window reaches from one part into the other, so nothing that is held out is trained on.
         """
-        found = []
-        for begin, end in zip(self.starts[:-1], self.starts[1:], strict=True):
-            cut = int(end - round((end - begin) * validation_share))
-            lo, hi = (cut, int(end)) if validation else (int(begin), cut)
-            if hi - lo >= length:
-                found.append(np.arange(lo, hi - length + 1, dtype=np.int64))
+        found = [
+            np.arange(low, high - length + 1, dtype=np.int64)
+            for low, high in self.split.ranges(self.starts, validation=validation)
+            if high - low >= length
+        ]
         if not found:
             kind = "validation" if validation else "training"
             raise InputError(f"no {kind} window of {length} frames fits; give longer trajectories or shorter chunks.")
         return np.concatenate(found)
 
-    def save(self, path: str | Path) -> None:
-        """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
-        import h5py
+    def refuse_leaks(self) -> None:
+        """Raise InputError when held-out frames are trained on as well."""
+        names = [str(source["file"]) for source in self.sources]
+        refuse_leaks(self.coordinates, self.starts, self.split, lambda k: names[k] if names else f"trajectory {k}")
 
-        header = {
+    def header(self) -> dict[str, Any]:
+        """What a windows file says of its frames."""
+        return {
             "scene": self.scene.to_dict(),
             "lag_ps": self.lag_ps,
             "canonical": self.canonical,
             "conditions": self.conditions,
             "sources": list(self.sources),
             "quantum_nm": QUANTUM_NM,
+            "split": self.split.to_dict(),
         }
 
+    def save(self, path: str | Path) -> None:
+        """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
+
         def fill(temporary: Path) -> None:
-            with h5py.File(temporary, "w") as handle:
-                handle.attrs["surromd_windows"] = json.dumps(header)
-                chunks = (min(2048, self.n_frames), *self.coordinates.shape[1:])
-                handle.create_dataset("coordinates", data=self.coordinates, compression="gzip", shuffle=True,
-                                      compression_opts=1, chunks=chunks)  # fmt: skip
-                handle.create_dataset("starts", data=self.starts)
-                if self.velocities is not None:
-                    handle.create_dataset("velocities", data=self.velocities, chunks=chunks)
+            with _new_file(temporary, self.n_frames, self.scene.n_atoms, moving=self.velocities is not None) as handle:
+                for start in range(0, self.n_frames, _BLOCK):
+                    part = slice(start, min(start + _BLOCK, self.n_frames))
+                    handle["coordinates"][part] = self.coordinates[part]
+                    if self.velocities is not None:
+                        handle["velocities"][part] = self.velocities[part]
+                _close_with(handle, self)
 
         create_whole(Path(path), fill)
 
 
+def _new_file(path: Path, n_frames: int, n_atoms: int, *, moving: bool) -> h5py.File:
+    import h5py
+
+    handle = h5py.File(path, "w")
+    # Neither chunked nor compressed: only so can they be mapped.
+    handle.create_dataset("coordinates", (n_frames, n_atoms, 3), dtype=np.int16)
+    if moving:
+        handle.create_dataset("velocities", (n_frames, n_atoms, 3), dtype=np.float32)
+    return handle
+
+
+def _close_with(handle: h5py.File, frames: TrainingFrames) -> None:
+    handle.attrs["surromd_windows"] = json.dumps(frames.header())
+    handle.create_dataset("starts", data=frames.starts)
+
+
 def load_frames(path: str | Path) -> TrainingFrames:
-    """Read what `TrainingFrames.save` wrote. Raises InputError for any other file."""
+    """Map what `TrainingFrames.save` wrote; files of earlier versions, compressed, are read whole.
+
+    Raises InputError for any other file.
+    """
     import h5py
 
     try:
@@ -107,16 +143,24 @@ def load_frames(path: str | Path) -> TrainingFrames:
             header = json.loads(handle.attrs["surromd_windows"])
             return TrainingFrames(
                 scene=Scene.from_dict(header["scene"]),
-                coordinates=handle["coordinates"][:],
+                coordinates=_mapped(path, handle["coordinates"]),
                 starts=handle["starts"][:],
                 lag_ps=header["lag_ps"],
                 canonical=header["canonical"],
                 conditions=header["conditions"],
                 sources=tuple(header["sources"]),
-                velocities=handle["velocities"][:] if "velocities" in handle else None,
+                velocities=_mapped(path, handle["velocities"]) if "velocities" in handle else None,
+                split=Split.from_dict(header["split"]) if "split" in header else Split(),
             )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a windows file of `surromd windows` ({error}).") from error
+
+
+def _mapped(path: str | Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
+    offset = dataset.id.get_offset() if dataset.chunks is None else None
+    if offset is None:
+        return dataset[:]
+    return np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
 
 
 def is_windows_file(path: str | Path) -> bool:
@@ -129,21 +173,64 @@ def is_windows_file(path: str | Path) -> bool:
         return "surromd_windows" in handle.attrs
 
 
-def collect_frames(paths: list[Path], *, canonical: bool = True, velocities: bool = False) -> TrainingFrames:
+def collect_frames(
+    paths: list[Path],
+    *,
+    canonical: bool = True,
+    velocities: bool = False,
+    held: list[Path] | None = None,
+    memory_bytes: int = MEMORY_BYTES,
+    spool: Path | None = None,
+) -> TrainingFrames:
     """Read reference trajectories of one scene. Raises InputError when scenes, save intervals or conditions differ.
 
     With `velocities`, which excludes `canonical`, frames keep their pose and must carry velocities, natural masses'.
+    `held`: trajectories that are held out whole; without any, the end of each is. More than `memory_bytes` of frames
+    are kept in a nameless file in the folder `spool`, mapped, which goes when the process does.
     """
+    found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
+    n_frames, n_atoms = int(found.starts[-1]), found.scene.n_atoms
+    if n_frames * n_atoms * (18 if velocities else 6) <= memory_bytes:
+        coordinates = np.empty((n_frames, n_atoms, 3), dtype=np.int16)
+        moving = np.empty((n_frames, n_atoms, 3), dtype=np.float32) if velocities else None
+        return replace(_fill(found, [*paths, *(held or [])], coordinates, moving), coordinates=coordinates,
+                       velocities=moving)  # fmt: skip
+    with tempfile.TemporaryDirectory(dir=spool, prefix=".surromd-windows-") as folder:
+        file = Path(folder) / "windows.h5"
+        write_windows(paths, file, canonical=canonical, velocities=velocities, held=held)
+        return load_frames(file)
+
+
+def write_windows(
+    paths: list[Path],
+    out: Path,
+    *,
+    canonical: bool = True,
+    velocities: bool = False,
+    held: list[Path] | None = None,
+) -> None:
+    """Write what `collect_frames` returns to a windows file, block by block: trajectories may be larger than memory."""
+    found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
+
+    def fill(temporary: Path) -> None:
+        with _new_file(temporary, int(found.starts[-1]), found.scene.n_atoms, moving=velocities) as handle:
+            moving = handle["velocities"] if velocities else None
+            _close_with(handle, _fill(found, [*paths, *(held or [])], handle["coordinates"], moving))
+
+    create_whole(out, fill)
+
+
+def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> TrainingFrames:
+    """Return what the files say of themselves, no frame read yet."""
     from systems.trajectory import open_trajectory
 
     if not paths:
         raise InputError("no trajectory given to train on.")
     if velocities and canonical:
         raise InputError("frames with velocities keep their own pose; they cannot be canonical as well.")
-    blocks, sources, lengths, motions = [], [], [], []
     scene: Scene | None = None
-    lag_ps, conditions = 0.0, {}
-    for path in paths:
+    lag_ps, conditions, lengths = 0.0, {}, []
+    for path in [*paths, *held]:
         with open_trajectory(path) as reader:
             if reader.scene is None:
                 raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
@@ -159,32 +246,37 @@ def collect_frames(paths: list[Path], *, canonical: bool = True, velocities: boo
                 raise InputError(f"{path} is saved every {steps[0]:g} ps, {paths[0]} every {lag_ps:g} ps.")
             if found != conditions:
                 raise InputError(f"{path} was made under {found}, {paths[0]} under {conditions}.")
-            digest = hashlib.sha256()
-            for k, frames in enumerate(reader.iter_blocks(_BLOCK)):
-                if not np.isfinite(frames).all():
-                    raise InputError(f"{path} holds frames that are not finite; it cannot be trained on.")
-                if velocities:
-                    moving = _velocities(reader, k * _BLOCK, len(frames))
-                    motions.append(at_rest(moving, scene.masses_da).astype(np.float32))
-                    blocks.append(quantise(at_rest(frames, scene.masses_da)))
-                else:
-                    blocks.append(quantise(canonicalise(frames, scene) if canonical else centre(frames)))
-                digest.update(blocks[-1].tobytes())
-            sources.append({"file": Path(path).name, "n_frames": reader.n_frames, "seed": reader.record.get("seed"),
-                            "sha256": digest.hexdigest()[:16]})  # fmt: skip
             lengths.append(reader.n_frames)
     assert scene is not None
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    return TrainingFrames(
-        scene,
-        np.concatenate(blocks),
-        starts,
-        lag_ps,
-        canonical,
-        conditions,
-        tuple(sources),
-        np.concatenate(motions) if velocities else None,
-    )
+    split = Split(held=tuple(range(len(paths), len(lengths))))
+    return TrainingFrames(scene, np.empty((0, scene.n_atoms, 3), np.int16), starts, lag_ps, canonical, conditions, (),
+                          split=split)  # fmt: skip
+
+
+def _fill(found: TrainingFrames, paths: list[Path], coordinates: Target, moving: Target | None) -> TrainingFrames:
+    """Read all frames into `coordinates` and `moving` (arrays or data sets); return `found` with its sources."""
+    from systems.trajectory import open_trajectory
+
+    scene, sources = found.scene, []
+    for path, begin in zip(paths, found.starts[:-1].tolist(), strict=True):
+        with open_trajectory(path) as reader:
+            digest, at = hashlib.sha256(), begin
+            for frames in reader.iter_blocks(_BLOCK):
+                if not np.isfinite(frames).all():
+                    raise InputError(f"{path} holds frames that are not finite; it cannot be trained on.")
+                if moving is not None:
+                    given = _velocities(reader, at - begin, len(frames))
+                    moving[at : at + len(frames)] = at_rest(given, scene.masses_da).astype(np.float32)
+                    block = quantise(at_rest(frames, scene.masses_da))
+                else:
+                    block = quantise(canonicalise(frames, scene) if found.canonical else centre(frames))
+                coordinates[at : at + len(frames)] = block
+                digest.update(block.tobytes())
+                at += len(frames)
+            sources.append({"file": Path(path).name, "n_frames": reader.n_frames, "seed": reader.record.get("seed"),
+                            "sha256": digest.hexdigest()[:16]})  # fmt: skip
+    return replace(found, sources=tuple(sources))
 
 
 def _velocities(reader: TrajectoryReader, start: int, n_frames: int) -> npt.NDArray[np.float32]:

@@ -22,6 +22,8 @@ from surrogate.training.provenance import provenance_of, training_domain
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
 
+# Latents beyond this are not kept: windows are encoded when they are drawn.
+LATENT_CACHE_BYTES = 2_000_000_000
 # Share of the whole budget that stage one gets.
 STAGE_ONE_SHARE = 0.2
 
@@ -188,14 +190,17 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
     if config.compile:
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
-    cache = encode_all(model, frames, elements).to(device) if model.canonical else None
+    ae = model.config.autoencoder
+    fits = 4 * frames.n_frames * ae.n_latents * ae.latent_dim <= LATENT_CACHE_BYTES
+    cache = encode_all(model, frames, elements).to(device) if model.canonical and fits else None
 
     def windows(first: Tensor, generator: torch.Generator, *, time_reversal: bool = False) -> Tensor:
         idx = window_frames(first, length, generator, time_reversal=time_reversal)
         if cache is not None:
             return cache[idx.to(device)]
         x = torch.from_numpy(frames.positions_nm(idx.numpy()))
-        x = torch.einsum("bij,btnj->btni", random_rotations(len(x), generator), x)
+        if not model.canonical:
+            x = torch.einsum("bij,btnj->btni", random_rotations(len(x), generator), x)
         with torch.no_grad():
             return model.encode(x.to(device), elements)
 

@@ -171,14 +171,29 @@ def run_stage(
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
-    """Append a row to a CSV whose columns are those of its first row."""
-    new = not path.exists()
-    columns = list(row) if new else next(csv.reader(path.open()))
-    with path.open("a", newline="") as handle:
-        writer = csv.DictWriter(handle, columns, extrasaction="ignore", restval="")
-        if new:
+    """Append a row to a CSV; columns that it does not have yet are added, empty in the rows before."""
+    written = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+    columns: list[str] = []
+    if path.exists():
+        with path.open(newline="") as handle:
+            columns = next(csv.reader(handle), [])
+    if set(row) <= set(columns):
+        with path.open("a", newline="") as handle:
+            csv.DictWriter(handle, columns, restval="").writerow(written)
+        return
+    rows: list[dict[str, Any]] = []
+    if columns:
+        with path.open(newline="") as handle:
+            rows = list(csv.DictReader(handle))
+    columns += [k for k in row if k not in columns]
+
+    def fill(temporary: Path) -> None:
+        with temporary.open("w", newline="") as handle:
+            writer = csv.DictWriter(handle, columns, restval="")
             writer.writeheader()
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+            writer.writerows([*rows, written])
+
+    create_whole(path, fill)
 
 
 def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
