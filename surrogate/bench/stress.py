@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ import numpy as np
 from surrogate.bench import stress_inputs, stress_settings
 from surrogate.bench.stress_measures import Frames, measure_drift, measure_validity
 from surrogate.bench.stress_report import write_stress
-from systems.errors import InputError, StorageError, SurromdError, nearest
+from systems.errors import InputError, SimulationError, StorageError, SurromdError, nearest
 from systems.trajectory import open_trajectory
 from systems.validity import INVALID, Geometry, check_frames
 
@@ -80,7 +81,8 @@ def stress_weights(
 ) -> dict[str, Any]:
     """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
 
-    Raises SurromdError for weights that cannot be loaded and a folder that cannot be written.
+    Raises SurromdError for weights that cannot be loaded and a folder that cannot be written; KeyboardInterrupt says
+    what is kept.
     """
     from surrogate.data.shipped import weights_path
     from surrogate.data.weights import load_weights
@@ -90,14 +92,18 @@ def stress_weights(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with --out.") from error
-    return run_stress(loaded, folder, config, report=report)
+    try:
+        return run_stress(loaded, folder, config, report=report)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{folder} keeps what was done; the same command goes on") from None
 
 
 def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: ReportFn) -> dict[str, Any]:
     """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
 
-    Tables, plot and JSON are written anew after each section, so that what is done survives an interruption. `report`
-    is told of each section as it begins. Raises SurromdError where a rollout cannot be written.
+    Tables, plot and JSON are written anew after each section, so that what is done survives an interruption; sections
+    that an earlier run of the same weights left in `folder` stay where this one does not run them. `report` is told of
+    each section as it begins. Raises SurromdError where a rollout cannot be written.
     """
     result: dict[str, Any] = {
         "weights": weights.path.name,
@@ -107,14 +113,32 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": platform.processor() or platform.machine(),
         "seed": config.seed,
-        "sections": {},
     }
-    sections = result["sections"]
+    sections = _earlier_sections(folder, weights)
     for name in (s for s in SECTIONS if s in config.sections):
         report(name)
-        sections[name] = _RUN[name](weights, folder, config)
+        rows = _RUN[name](weights, folder, config)
+        if name == "length":
+            rows = _with_other_lengths(sections.get(name, []), rows)
+        sections[name] = rows
+        result["sections"] = {s: sections[s] for s in SECTIONS if s in sections}
         write_stress(result, folder)
     return result
+
+
+def _earlier_sections(folder: Path, weights: Weights) -> dict[str, list[dict[str, Any]]]:
+    try:
+        found = json.loads((folder / "stress.json").read_text(encoding="utf-8"))
+        return dict(found["sections"]) if found["weights_hash"] == weights.hash else {}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {}
+
+
+def _with_other_lengths(earlier: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the new rows among the earlier ones of another guard or length."""
+    done = {(row["guard"], row.get("asked")) for row in new}
+    rows = [row for row in earlier if (row["guard"], row.get("asked")) not in done] + new
+    return sorted(rows, key=lambda row: (row["guard"], row.get("asked", 0)))
 
 
 def _length(weights: Weights, folder: Path, config: StressConfig) -> list[dict[str, Any]]:
@@ -130,17 +154,19 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
     scene, lag_ps = weights.domain.scene, weights.domain.lag_ps
     each = -(-n_frames // config.replicas)
     outs = [folder / f"{guard}_{n_frames}_r{k}.h5" for k in range(config.replicas)]
-    row: dict[str, Any] = {"guard": guard, "replicas": config.replicas}
+    row: dict[str, Any] = {"guard": guard, "asked": n_frames, "replicas": config.replicas}
     try:
         rollout(scene, weights, outs, RolloutConfig(time_ps=each * lag_ps, seed=config.seed, guard=guard), resume=True)
-    except SurromdError as error:
+    except SimulationError as error:  # stopped by the guards: what came before is judged
         row["outcome"] = str(error)
         if not all(path.exists() for path in outs):
             return row
+    except SurromdError as error:
+        return row | {"outcome": str(error)}
     geometry = Geometry.from_dict(weights.domain.geometry)
     replicas: list[Frames] = []
     unmarked = chunks = caught = 0
-    draw_s = help_s = 0.0
+    draw_s = check_s = help_s = 0.0
     for path in outs:
         with open_trajectory(path) as reader:
             frames = reader.read()
@@ -151,7 +177,8 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
         unmarked += int(np.count_nonzero(bad & ((flags & np.uint16(INVALID)) == 0))) if flags is not None else len(bad)
         chunks, caught = chunks + account["chunks"], caught + account["chunks_caught"]
         seconds = account["seconds"]
-        draw_s, help_s = seconds.get("draw", 0.0), sum(v for k, v in seconds.items() if k != "draw")
+        draw_s, check_s = seconds.get("draw", 0.0), seconds.get("check", 0.0)
+        help_s = sum(seconds.values()) - draw_s - check_s
         row["wall_s"] = cost.get("batch_wall_s")
     if min(map(len, replicas)) == 0:
         return row
@@ -159,7 +186,8 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
     row |= {
         "invalid_unmarked": unmarked,
         "chunks_helped_%": 100.0 * caught / max(chunks, 1),
-        "overhead_%": 100.0 * help_s / max(draw_s, 1e-9),
+        "checks_%": 100.0 * check_s / max(draw_s, 1e-9),
+        "help_%": 100.0 * help_s / max(draw_s, 1e-9),
     }
     return row | {"drift": measure_drift(replicas, scene, geometry) | _energy_drift(weights, replicas)}
 

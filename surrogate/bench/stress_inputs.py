@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +15,8 @@ from surrogate.bench.stress_measures import measure_validity
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import find_deviations, match_domain
 from systems.errors import OutOfDomainError, SurromdError
+from systems.pdb_text import pdb_text
+from systems.prepare import prepare
 from systems.scene import Scene
 from systems.selection import part_of
 from systems.validity import Geometry
@@ -80,11 +84,30 @@ def measure_invariance(weights: Weights, *, precision: str, seed: int = 0) -> li
         chunk = first_chunk(moved, weights, sampler)
         error = float(np.abs(chunk - (plain @ rotation.T + shift)).max())
         rows.append({"input": name, "precision": precision, "deviation_nm": error, "of_size": error / size})
+    for name, error in _moved_in_files(scene, weights, sampler):
+        rows.append({"input": name, "precision": precision, "deviation_nm": error, "of_size": error / size})
     order = np.random.default_rng(seed).permutation(scene.n_atoms)
     chunk = first_chunk(permuted(scene, order), weights, sampler)
     error = float(np.abs(chunk - plain[:, :, order]).max())
     rows.append({"input": "atoms permuted", "precision": precision, "deviation_nm": error, "of_size": error / size})
     return rows
+
+
+def _moved_in_files(scene: Scene, weights: Weights, sampler: ChunkSampler) -> Iterator[tuple[str, float]]:
+    """Yield how far the first chunk of a molecule that a PDB file puts 1 and 10 nm away is from where it should be."""
+    still = first_chunk(_through_pdb(scene), weights, sampler)
+    for far in (1.0, 10.0):
+        shift = np.array([far, -far, 0.0])
+        chunk = first_chunk(_through_pdb(scene.with_positions(scene.positions_nm + shift)), weights, sampler)
+        yield f"translated by {far:g} nm along x and y in a PDB file", float(np.abs(chunk - (still + shift)).max())
+
+
+def _through_pdb(scene: Scene) -> Scene:
+    """Return what our own PDB file of a scene is read as."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.pdb"
+        path.write_text(pdb_text(scene), encoding="ascii", errors="replace")
+        return prepare(str(path))
 
 
 def odd_scenes(weights: Weights, seed: int) -> Iterator[tuple[str, Scene]]:

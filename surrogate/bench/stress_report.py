@@ -17,7 +17,7 @@ TITLES = {
     "solvers": "Solver steps, and chunks kept in part",
     "openmm": "OpenMM itself, by the same criteria",
 }
-_LEFT_TO_JSON = ("survival", "drift")
+_LEFT_TO_JSON = ("asked", "survival", "drift")
 _DRIFT = {
     "bond_shift_pm": "mean bonds off, pm, first and last tenth",
     "bond_variance_%": "bond variance, % of the reference's",
@@ -48,8 +48,9 @@ def markdown(result: dict[str, Any]) -> str:
         lines += [f"## {TITLES[name]}", "", *table([_flat(row) for row in rows]), ""]
     lines += [
         "valid_half_angstrom: finite, and each bond within 0.5 Å of the reference's mean; valid_all: every rule of "
-        "systems.validity. A surrogate has no velocities that are its own: in place of a temperature stands the "
-        "variance of bonds in per cent of the reference's.",
+        "systems.validity. chunks helped: those in which the guard caught a frame (under flag, only marked); checks "
+        "and help: their time in per cent of the time that drawing took. A surrogate has no velocities that are its "
+        "own: in place of a temperature stands the variance of bonds in per cent of the reference's.",
         "",
     ]
     return "\n".join(lines)

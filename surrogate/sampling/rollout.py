@@ -68,7 +68,7 @@ def rollout(
     if resume and not resuming and not overwrite:
         _refuse_missing(outs, state_path)
     if resuming and not state_path.exists():
-        return _already_complete(outs, plan.n_frames)
+        return _already_complete(outs, plan)
     state = read_checkpoint(state_path, plan.settings) if resuming else _start(plan, sampler, len(outs))
     sampler.batch = state.batch
     clock = Clock(state.seconds)
@@ -231,12 +231,19 @@ def _cut_back(writers: Sequence[TrajectoryWriter], outs: Sequence[Path], n_frame
         writer.truncate(n_frames)
 
 
-def _already_complete(outs: Sequence[Path], n_frames: int) -> list[Path]:
+def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:
+    wanted = {"weights_hash": plan.weights.hash, "seed": plan.config.seed, "save_every_ps": plan.save_every_ps}
     for path in outs:
         with open_trajectory(path) as reader:
-            if not reader.record.get("completed") or reader.n_frames != n_frames:
+            if not reader.record.get("completed") or reader.n_frames != plan.n_frames:
                 raise InputError(
-                    f"{path} holds {reader.n_frames} of {n_frames} frames but its checkpoint is gone; start again with "
-                    "--overwrite, or keep it under another name."
+                    f"{path} holds {reader.n_frames} of {plan.n_frames} frames but its checkpoint is gone; start again "
+                    "with --overwrite, or keep it under another name."
                 )
+            for key, value in wanted.items():
+                if reader.record.get(key) != value:
+                    raise InputError(
+                        f"{path} is complete, but of {key} = {reader.record.get(key)!r}, not {value!r}; take another "
+                        "name, or --overwrite."
+                    )
     return list(outs)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +73,7 @@ def test_drift_between_first_and_last_tenth(
 
 def test_moved_and_permuted_input_gives_the_moved_chunk(small_weights: Weights) -> None:
     rows = {row["input"]: row for row in measure_invariance(small_weights, precision="fp32")}
-    assert len(rows) == 5
+    assert len(rows) == 7 and rows["translated by 10 nm along x and y in a PDB file"]["deviation_nm"] > 0.0
     for name, row in rows.items():
         assert row["deviation_nm"] < (5e-6 if "1e+06" in name else 1e-6), name
     scene = small_weights.domain.scene
@@ -112,6 +114,20 @@ def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: We
     text = (tmp_path / "stress.md").read_text()
     assert "## Long rollouts" in text and "invalid unmarked" in text and text == markdown(result)
     assert (tmp_path / "stress.svg").read_text().rstrip().endswith("</svg>")
+
+
+def test_a_stress_test_is_added_to(tmp_path: Path, small_weights: Weights) -> None:
+    def run(weights: Weights, frames: int, *sections: str) -> dict[str, Any]:
+        config = StressConfig(frames=(frames,), replicas=2, guards=("flag",), sections=sections, compiled=False)
+        return run_stress(weights, tmp_path, config, report=lambda name: None)["sections"]
+
+    run(small_weights, 40, "batches")
+    run(small_weights, 80, "length")
+    found = run(small_weights, 40, "length")
+    assert list(found) == ["length", "batches"] and [row["frames"] for row in found["length"]] == [40, 80]
+    other = replace(small_weights, hash="another")
+    (row,) = run(other, 40, "length")["length"]
+    assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
 
 
 def test_settings_are_checked() -> None:
