@@ -22,7 +22,7 @@ Float32Array = npt.NDArray[np.float32]
 
 _FORMAT = 2
 # What zipfile and NumPy raise on files that are damaged, or made to harm; nothing in them is ever run.
-_UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
                OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def read_checkpoint(path: Path, settings: dict[str, Any]) -> Progress:
         of_this_version = header.get("format") == _FORMAT
         tallies = [Tally(**tally) for tally in plain.pop("tallies", [])]
         progress = Progress(**arrays, **plain, tallies=tallies) if of_this_version else None
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"checkpoint {path} cannot be read ({reason}); start again with --overwrite.") from error
     if progress is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.sampling.checkpoint import UNREADABLE
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import match_domain
 from surrogate.sampling.openmm_state import SurrogateState
@@ -135,7 +135,7 @@ class Simulation:
             header = json.loads(str(arrays.pop("header")))
             settings, counts = header["settings"], [int(header[k]) for k in ("current_step", "chunks", "frames")]
             last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(f"{name} cannot be read as a checkpoint ({reason}); take another.") from error
         for key, value in self._settings().items():

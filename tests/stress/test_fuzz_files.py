@@ -17,6 +17,7 @@ import pytest
 from surrogate.data.weights import Weights, load_weights
 from surrogate.sampling.account import Tally
 from surrogate.sampling.checkpoint import Progress, read_checkpoint, write_checkpoint
+from surrogate.sampling.simulation import Simulation
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
@@ -159,6 +160,17 @@ def read_reference_checkpoint(path: Path) -> tuple[Any, ...]:
     return read(path)
 
 
+def simulation_reader(scene: Scene, small_weights: Weights) -> Callable[[Path], Any]:
+    simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
+
+    def read(path: Path) -> dict[str, Any]:
+        simulation.loadCheckpoint(path)
+        state = {key: value for key, value in vars(simulation).items() if isinstance(value, np.ndarray | int)}
+        return {key: value.tobytes() if isinstance(value, np.ndarray) else value for key, value in state.items()}
+
+    return read
+
+
 def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tuple[Path, Callable[[Path], Any]]:
     """Make the files of a kind in a folder; return the one to mutate and what reads them."""
     if kind in ("a.h5", "a.dcd"):
@@ -175,11 +187,17 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
 
         write(folder / "b.h5.checkpoint", {"config": {"seed": 1}, "n_frames": 5}, b"state" * 300, sync=False)
         return folder / "b.h5.checkpoint", read_reference_checkpoint
+    if kind == "simulation checkpoint":
+        simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
+        simulation.step(9)
+        simulation.saveCheckpoint(folder / "s.npz")
+        return folder / "s.npz", simulation_reader(scene, small_weights)
     (folder / "w.safetensors").write_bytes(small_weights.path.read_bytes())
     return folder / "w.safetensors", read_weights
 
 
-KINDS = ("a.h5", "a.dcd", "a.meta.h5", "a.pdb", "weights", "rollout checkpoint", "reference checkpoint")
+KINDS = ("a.h5", "a.dcd", "a.meta.h5", "a.pdb", "weights", "rollout checkpoint", "reference checkpoint",
+         "simulation checkpoint")  # fmt: skip
 
 
 def outcome(path: Path, read: Callable[[Path], Any], truth: Any) -> str:
