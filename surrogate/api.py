@@ -7,8 +7,9 @@ raises a `systems.errors.SurromdError` whose message is one line.
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,6 +20,9 @@ from surrogate.progress import progress_bar
 from systems.errors import InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from md_reference.simulate import MDConfig
     from surrogate.judge.comparison import Comparison
     from systems.scene import Scene
@@ -435,12 +439,14 @@ def compare(
     top: PathLike | None = None,
     lag_ps: float | None = None,
     labels: Sequence[str] | None = None,
+    energies: bool = False,
 ) -> Comparison:
     """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
     The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other. `top`: topology for
-    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly.
+    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. `energies`:
+    judge the potential energy of every k-th frame too, by the force field that the reference's file names.
     Raises InputError, TrajectoryError, OutOfDomainError.
     """
     from surrogate.judge.comparison import compare as judge
@@ -466,12 +472,34 @@ def compare(
     floor = None
     if replicate is not None:
         floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=top, lag_ps=lag_ps)
-    result = judge(truth, others, floor, truth.scene)
+    energy_fn = _relaxed_energy(truth.scene, truth.record) if energies else None
+    result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
     if out_html is not None:
         from surrogate.judge.report import write_report
 
         write_report(result, Path(out_html))
     return result
+
+
+def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
+    """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
+    from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+    from md_reference.relaxation import Relaxer
+    from systems.errors import SimulationError
+
+    name, solvent = record.get("force_field"), record.get("solvent")
+    if name is None or solvent is None:
+        raise InputError("--energies: the reference's file does not say with which force field it was made.")
+    spec = resolve(scene, ForceFieldSpec(name, solvent, record.get("hydrogen_mass_da")))
+    relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
+
+    def energy(positions_nm: npt.NDArray[np.float64]) -> float:
+        try:
+            return relaxer.relax(positions_nm).potential_kj_mol
+        except SimulationError:
+            return math.inf
+
+    return energy
 
 
 def campaign(
@@ -573,7 +601,9 @@ def train(
     on is refused. `time_reversal` shows every other window backwards,
     right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
     (surrogate.data.rarity). Beside `out`, a CSV holds the training curves and, until done, files the state that
-    `resume` goes on from. Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
+    `resume` goes on from; at the end the curves are drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by
+    torchrun (surrogate.training.devices).
+    Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
     from surrogate.trainings import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
 
@@ -607,7 +637,10 @@ def train(
         return out
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
-    prepared = prepare_training(replace(request, paths=paths, held=held, device=_device(device)))
+    from surrogate.training.devices import choose_device, is_first_process
+
+    prepared = prepare_training(replace(request, paths=paths, held=held, device=choose_device(device)))
+    quiet = quiet or not is_first_process()
     with progress_bar(f"training {prepared.scene}", quiet=quiet) as bar:
 
         def advance(stage: str, share: float) -> None:
@@ -615,25 +648,15 @@ def train(
                 bar(round(1000 * share), 1000, stage)
 
         try:
-            return prepared.start(advance)
+            written = prepared.start(advance)
         except KeyboardInterrupt:
             kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
             if not kept:
                 raise KeyboardInterrupt("no training state had been saved yet") from None
             raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
+    curves = out.with_suffix(".csv")
+    if curves.exists() and is_first_process():
+        from surrogate.training.curves import plot_curves
 
-
-def _device(device: str) -> str:
-    import torch
-
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        kind = torch.device(device).type
-    except RuntimeError:
-        kind = ""
-    if kind not in ("cpu", "cuda"):
-        raise InputError(f"the device {device!r} is unknown; choose auto, cpu or cuda.")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise InputError("no CUDA device is to be had here; leave --device out.")
-    return device
+        plot_curves(curves)
+    return written

@@ -456,6 +456,9 @@ def compare(
     replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
     top: Annotated[Path | None, typer.Option("--top", help="Topology of files that carry none.")] = None,
     lag: Annotated[str | None, typer.Option("--lag", help="Time between frames, where a file does not say.")] = None,
+    energies: Annotated[
+        bool, typer.Option("--energies", help="Energies of every k-th frame too, by the reference's force field.")
+    ] = False,
     quiet: QuietOpt = False,
     as_json: JsonOpt = False,
 ) -> None:
@@ -469,6 +472,7 @@ def compare(
         replicate=replicate,
         top=top,
         lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
+        energies=energies,
     )
     print_comparison(result, out, as_json=as_json, quiet=quiet)
 

@@ -15,6 +15,7 @@ from surrogate.judge.charts import Chart
 from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
 from surrogate.judge.couplings import coupling_rows
 from surrogate.judge.curves import Curves
+from surrogate.judge.energy_rows import EnergyFn, energy_rows, measure_energies
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.interventions import intervention_rows
 from surrogate.judge.movie import Movie, make_movie
@@ -46,6 +47,7 @@ ROOMS: tuple[Room, ...] = (
     peptide_charts,
     intervention_rows,
     survival_charts,
+    energy_rows,
 )
 
 _MIN_FRAMES = 20
@@ -136,6 +138,7 @@ def compare(
     scene: Scene | None = None,
     *,
     options: Options | None = None,
+    energy_fn: EnergyFn | None = None,
 ) -> Comparison:
     """Judge each candidate against the reference, beside a replicate of equal length.
 
@@ -143,7 +146,9 @@ def compare(
     `Ensemble.kept`: then all are compared on the atoms that they share. Without a replicate the
     reference is cut in two halves, the second serving as the replicate of the first. Each candidate is judged by
     itself, at the longest length that it shares with reference and replicate: adding a candidate changes no other's
-    numbers. Raises InputError when there is no candidate, atoms differ, or too few frames are left.
+    numbers. `energy_fn(positions_nm)` gives the potential energy in kJ/mol of one frame of the reference's atoms; every
+    k-th frame is then judged by it, where no atoms are missing. Raises InputError when there is no candidate, atoms
+    differ, or too few frames are left.
     """
     if not candidates:
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
@@ -160,6 +165,10 @@ def compare(
     geometry = reference_geometry(thinned[0])
     probes = reference_probes(thinned[0], parent=whole, kept=kept)
     measured = [measure(e, torsions, geometry, probes) for e in thinned]
+    if energy_fn is not None and kept is None:
+        measured = [
+            replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
+        ]
     notes = [note for e in thinned for note in e.notes]
     truth = measured[0]
     if replicate is None:

@@ -62,6 +62,12 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Pérez-Hernández et al., J. Chem. Phys. 139, 015102 (2013); deeptime (Hoffmann et al., 2022)",
     ),
     Definition(
+        "Potential energy",
+        "Of every k-th frame (about 400), by the reference's force field, after its stiff bonds were brought to rest "
+        "with all atoms held near where they were. A frame that cannot be relaxed counts as a whole range above.",
+        "",
+    ),
+    Definition(
         "Size and shape",
         "Radius of gyration: mass-weighted, all atoms. End to end: the two heavy atoms furthest apart in bonds. "
         "RMSD and RMSF: heavy atoms (alpha carbons of large molecules) superposed on the mean structure of the "

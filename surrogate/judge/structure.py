@@ -49,7 +49,8 @@ class Features:
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
-    frame is not finite. `chunk_idx` and `changed` `(n,)` or None. `series` holds the further families `(n, k)` that
+    frame is not finite. `chunk_idx` and `changed` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was
+    computed, or None. `series` holds the further families `(n, k)` that
     `probes` names (see `surrogate.judge.probes.Probes`), empty where nothing was asked for.
     """
 
@@ -63,6 +64,7 @@ class Features:
     series: Mapping[Family, Sequence[npt.NDArray[Any]]] = field(default_factory=dict)
     probes: Probes | None = None
     changed: Sequence[npt.NDArray[np.bool_]] | None = None
+    energy_kj: Sequence[npt.NDArray[np.float64]] | None = None
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -95,6 +97,7 @@ class Features:
             flags=cut(self.flags),
             chunk_idx=None if self.chunk_idx is None else cut(self.chunk_idx),
             changed=None if self.changed is None else cut(self.changed),
+            energy_kj=None if self.energy_kj is None else cut(self.energy_kj),
             series={family: cut(values) for family, values in self.series.items()},
         )
 
