@@ -3,39 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from surrogate.cli_options import JsonOpt, QuietOpt, ResumeOpt, SeedOpt
 from surrogate.cli_printing import print_json
-from systems.units import parse_wall_s
+from systems.units import parse_time_ps, parse_wall_s
 
-if TYPE_CHECKING:
-    from surrogate.bench.reproduce import Row
-
-_SIZE = {"min": 2, "help": "Trajectories, instead of the published number."}
+_SIZE = {"min": 2, "help": "Trajectories (md17: windows of each molecule), instead of the published number."}
 
 
 def reproduce(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="n-body-charged, n-body-spring or n-body-gravity.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="n-body-charged, n-body-spring, n-body-gravity or md17.")],
     budget: Annotated[str, typer.Option("--budget", help="Wall time of each method's training.")] = "10min",
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help="Only this; may be repeated. Baselines, egnn, lam-slide, pair-forces."),
+        typer.Option("--method", help="Only this; may be repeated. Baselines, egnn, lam-slide, pair-forces (n-body)."),
     ] = None,
-    train: Annotated[int, typer.Option("--train", **_SIZE)] = 3000,
-    test: Annotated[int, typer.Option("--test", **_SIZE)] = 2000,
+    train: Annotated[int | None, typer.Option("--train", **_SIZE)] = None,
+    test: Annotated[int | None, typer.Option("--test", **_SIZE)] = None,
     validation: Annotated[
-        int | None, typer.Option("--validation", min=2, help="Trajectories. [default: a tenth of --test]")
+        int | None, typer.Option("--validation", min=2, help="The same. [default: a tenth of --test; md17: as --test]")
     ] = None,
     plain: Annotated[
-        bool, typer.Option("--plain", help="Leave out what goes beyond the papers: extrapolation, other starts.")
+        bool, typer.Option("--plain", help="Leave out what goes beyond the papers; the same as every --without.")
     ] = False,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", help="Leave out: extrapolate, any-start, from-velocity, canonical. Repeatable."),
+    ] = None,
+    molecule: Annotated[
+        list[str] | None, typer.Option("--molecule", help="md17: only this; may be repeated. [default: all eight]")
+    ] = None,
+    simulated: Annotated[str, typer.Option("--time", help="md17: trajectory of each molecule.")] = "200ps",
+    md17_ethanol: Annotated[
+        Path | None, typer.Option("--md17-ethanol", help="md17: an .npz of MD17's own ethanol to forecast as well.")
+    ] = None,
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Processes that simulate; one a core.")
+        int | None, typer.Option("--workers", min=1, help="n-body: processes that simulate; one a core.")
     ] = None,
+    device: Annotated[str, typer.Option("--device", help="Where to train: auto, cpu or cuda.")] = "auto",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder of data and results. [default: surromd-NAME]")
     ] = None,
@@ -45,13 +54,20 @@ def reproduce(
     as_json: JsonOpt = False,
 ) -> None:
     """Repeat a published forecasting task: make its data, train, and put our errors under the published ones."""
-    from surrogate.bench.reproduce import check_names, row_line, table_lines
-    from surrogate.bench.reproduce import reproduce as run
-    from surrogate.bench.reproduce_methods import METHODS, Settings
+    from surrogate.bench import reproduce as bodies
+    from surrogate.bench import reproduce_molecules as molecules
+    from surrogate.bench.molecule_methods import METHODS as MOLECULE_METHODS
+    from surrogate.bench.reproduce_methods import METHODS, SWITCHES, Settings, pick_device, without_switches
+    from surrogate.bench.reproduce_molecules_data import MD17_MOLECULES
     from surrogate.progress import progress_bar
 
-    chosen = method or list(METHODS)
-    check_names(name, chosen)
+    of_molecules = name == molecules.NAME
+    chosen = method or list(MOLECULE_METHODS if of_molecules else METHODS)
+    chosen_molecules = molecule or list(MD17_MOLECULES)
+    if of_molecules:
+        molecules.check_names(chosen_molecules, chosen)
+    else:
+        bodies.check_names(name, chosen)
     folder = out or Path(f"surromd-{name}")
     settings = Settings(
         folder=folder,
@@ -59,30 +75,45 @@ def reproduce(
         steps=steps,
         seed=seed,
         resume=resume,
-        extrapolate=not plain,
-        any_start=not plain,
-        from_velocity=not plain,
+        device=pick_device(device),
     )
+    settings = without_switches(settings, SWITCHES if plain else without or [])
     shown = not (quiet or as_json)
 
-    def report(row: Row) -> None:
+    def say(line: str) -> None:
         if shown:
-            typer.echo(row_line(row), err=True)
+            typer.echo(line, err=True)
 
     with progress_bar(f"data of {name}", quiet=not shown) as advance:
-        result = run(
-            name,
-            folder,
-            methods=chosen,
-            settings=settings,
-            n_train=train,
-            n_validation=validation,
-            n_test=test,
-            workers=workers,
-            progress=advance,
-            report=report,
-        )
+        if of_molecules:
+            asked = {"train": train, "validation": validation or test, "test": test}
+            found = molecules.reproduce_molecules(
+                folder,
+                settings=settings,
+                molecules=chosen_molecules,
+                methods=chosen,
+                time_ps=parse_time_ps(simulated, "--time"),
+                windows={split: asked[split] or n for split, n in molecules.WINDOWS.items()},
+                md17_ethanol=md17_ethanol,
+                progress=advance,
+                report=lambda account: say(molecules.account_line(account)),
+            )
+            lines, record = molecules.table_lines(found), found.to_dict()
+        else:
+            result = bodies.reproduce(
+                name,
+                folder,
+                methods=chosen,
+                settings=settings,
+                n_train=train or bodies.N_TRAIN,
+                n_validation=validation,
+                n_test=test or bodies.N_TEST,
+                workers=workers,
+                progress=advance,
+                report=lambda row: say(bodies.row_line(row)),
+            )
+            lines, record = bodies.table_lines(result), result.to_dict()
     if as_json:
-        print_json(result.to_dict())
+        print_json(record)
     else:
-        typer.echo("\n".join(table_lines(result)))
+        typer.echo("\n".join(lines))

@@ -50,6 +50,12 @@ def estimate(errors: Floats, seed: int = 0) -> Estimate:
     return Estimate(float(errors.mean()), float(low), float(high))
 
 
+def block_means(errors: Floats, blocks: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Return the mean of `errors` (n,) over each block of windows that overlap, in units that count as independent."""
+    _, place = np.unique(blocks, return_inverse=True)
+    return np.bincount(place, weights=errors) / np.bincount(place)
+
+
 def ratio(errors: Floats, reference: Floats, seed: int = 0) -> Estimate:
     """Return mean(errors) / mean(reference) over the same trajectories, drawn again together."""
     rng = np.random.default_rng(seed)

@@ -3,8 +3,8 @@ protocol is a field of `Settings` and said in a method's note."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.reproduce_errors import forecast_errors
+from systems.errors import InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
     import torch
 
     from surrogate.data.particle_sets import ParticleSet
+    from surrogate.models.lam_slide.model import LamSlide
     from surrogate.training.loop import ProgressFn
     from surrogate.training.particles import Training
 
@@ -35,6 +37,8 @@ class Settings:
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames
     misses, each predicted frame in units of its own size, instead of absolute positions; `any_start`: EGNN learns from
     every frame of a trajectory, not from the tenth alone; `from_velocity`: EGNN adds the motion at constant velocity.
+    Of molecules alone, `canonical`: LaM-SLidE sees windows in the body frame instead of turned at random; there
+    `extrapolate` is the best linear forecast, and `any_start` takes every training window, not the protocol's 5,000.
     """
 
     folder: Path
@@ -45,6 +49,8 @@ class Settings:
     extrapolate: bool = True
     any_start: bool = True
     from_velocity: bool = True
+    canonical: bool = True
+    device: str = "cpu"
     solver_steps: int = 10
     progress: ProgressFn | None = None
 
@@ -57,11 +63,41 @@ class Settings:
         torch.set_num_threads(1)
         torch.manual_seed(self.seed)
         self.folder.mkdir(parents=True, exist_ok=True)
-        made = Training(name, self.folder, self.budget_s, self.steps, self.seed, self.resume, progress=self.progress)
+        made = Training(name, self.folder, self.budget_s, self.steps, self.seed, self.resume,
+                        progress=self.progress, device=self.device)  # fmt: skip
         if not self.resume:
             for path in (made.log, *self.folder.glob(f"{name}.*.train.safetensors")):
                 path.unlink(missing_ok=True)
         return made
+
+
+SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical")
+
+
+def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
+    """Return the settings with these switches off. Raises UnknownNameError."""
+    for one in without:
+        if one not in SWITCHES:
+            known = ", ".join(SWITCHES)
+            raise UnknownNameError(f"unknown switch {one!r}; known: {known}.{nearest(one, list(SWITCHES))}")
+    return replace(
+        settings,
+        extrapolate=settings.extrapolate and "extrapolate" not in without,
+        any_start=settings.any_start and "any-start" not in without,
+        from_velocity=settings.from_velocity and "from-velocity" not in without,
+        canonical=settings.canonical and "canonical" not in without,
+    )
+
+
+def pick_device(device: str) -> str:
+    """Return `device` or, for 'auto', cuda where there is one. Raises InputError for one that is not there."""
+    import torch
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise UnknownNameError(f"unknown device {device!r}; known: auto, cpu, cuda.")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("no CUDA device here; use --device auto or cpu.")
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)
@@ -132,22 +168,23 @@ def egnn(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fit
     import torch
 
     from surrogate.models.particles import EgnnJump, EgnnJumpConfig
-    from surrogate.training.particles import Tensors, train_egnn
+    from surrogate.training.particles import Tensors, held_jumps, jumps_of, train_egnn
 
     training = settings.training("egnn")
     config = EgnnJumpConfig(n_new=N_NEW, lag_ps=train.lag_ps, from_velocity=settings.from_velocity)
     model = EgnnJump(config)
-    seconds = train_egnn(model, train, validation, N_GIVEN, training, any_start=settings.any_start)
+    draw = jumps_of(train, N_GIVEN, any_start=settings.any_start)
+    seconds = train_egnn(model, draw, [held_jumps(validation, N_GIVEN)], training)
+    model.cpu()
     last = N_GIVEN - 1
 
     @torch.no_grad()
     def forecast(data: ParticleSet, n_samples: int) -> Array:
         t = Tensors.of(data)
-        found = [model(t.x[:, last], t.v[:, last], t.types, t.pairs, k) for k in range(N_NEW)]
-        return torch.stack(found, 1).double().numpy()[None]
+        return model.all_frames(t.x[:, last], t.v[:, last], t.types, t.pairs).double().numpy()[None]
 
-    beyond = _beyond({"any start": settings.any_start, "moved on at its velocity": settings.from_velocity})
-    return Fitted(forecast, f"last frame and velocity, pair kinds{beyond}", seconds, _size(model))
+    more = beyond({"any start": settings.any_start, "moved on at its velocity": settings.from_velocity})
+    return Fitted(forecast, f"last frame and velocity, pair kinds{more}", seconds, n_parameters(model))
 
 
 def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
@@ -170,17 +207,16 @@ def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings)
     note = (
         f"last {model.config.velocity_frames} positions, pair kinds; beyond the papers: integrates learned pair forces"
     )
-    return Fitted(forecast, note, seconds, _size(model))
+    return Fitted(forecast, note, seconds, n_parameters(model))
 
 
 def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
     """LaM-SLidE: ten given frames, random identifiers and rotations, loss on predicted frames; told of charges."""
     import torch
 
-    from surrogate.models.lam_slide import flow
     from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
     from surrogate.models.lam_slide.model import LamSlide
-    from surrogate.training.particles import encode_windows, train_lam_slide_on_windows
+    from surrogate.training.particles import encode_windows, train_lam_slide_on_windows, turned_windows
 
     training = settings.training("lam-slide")
     degree, _, weights = best_polynomial(validation) if settings.extrapolate else (0, 0, None)
@@ -204,10 +240,9 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
         )
     )
     held = validation.first(min(100, len(validation)))
-    seen = [torch.from_numpy(view.to_model(s.positions_nm)).float() for s in (train, held)]
-    kinds = [torch.from_numpy(s.types) for s in (train, held)]
-    seconds = train_lam_slide_on_windows(model, seen[0], kinds[0], seen[1], kinds[1], training)
-    model.eval()
+    seen = [(torch.from_numpy(view.to_model(s.positions_nm)).float(), torch.from_numpy(s.types)) for s in (train, held)]
+    seconds = train_lam_slide_on_windows(model, turned_windows(*seen[0]), [seen[1]], training)
+    model.cpu().eval()
 
     @torch.no_grad()
     def forecast(data: ParticleSet, n_samples: int) -> Array:
@@ -215,19 +250,32 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
         given = data.positions_nm[:, :N_GIVEN]
         known = encode_windows(model, torch.from_numpy(view.given(given)).float(), types)
         generator = torch.Generator().manual_seed(settings.seed)
+        seen_ahead = sampled(model, known, n, n_samples, settings, generator)
+        return np.stack([view.from_model(given, sample) for sample in seen_ahead])
 
-        def predict(o: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
+    more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate})
+    return Fitted(forecast, f"positions, charges{more}", seconds, n_parameters(model))
+
+
+def sampled(
+    model: LamSlide, known: torch.Tensor, n: int, n_samples: int, settings: Settings, generator: torch.Generator
+) -> Array:
+    """Draw frames to come after the latents `known` (b, n_given, n_latents, latent_dim) of systems of `n` entities, as
+    the model sees them: `(n_samples, b, n_new, n, 3)`. What is given is encoded once for all samples."""
+    import torch
+
+    from surrogate.models.lam_slide import flow
+
+    def predict(o: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
+        with torch.autocast(known.device.type, dtype=torch.bfloat16):  # as it was trained
             return model.approximator(o, tau, known)
 
-        samples = []
-        for _ in range(n_samples):
-            noise = torch.randn((len(data), *model.noise_shape(n)), generator=generator)
-            latents = flow.multistep(predict, noise, settings.solver_steps, "linear")
-            samples.append(view.from_model(given, model.decode(latents[:, N_GIVEN:], n).double().numpy()))
-        return np.stack(samples)
-
-    beyond = f"; beyond the paper: corrects a polynomial of degree {degree}" if settings.extrapolate else ""
-    return Fitted(forecast, f"positions, charges{beyond}", seconds, _size(model))
+    samples = []
+    for _ in range(n_samples):
+        noise = torch.randn((len(known), *model.noise_shape(n)), generator=generator).to(known.device)
+        latents = flow.multistep(predict, noise, settings.solver_steps, "linear")
+        samples.append(model.decode(latents[:, N_GIVEN:], n).double().cpu().numpy())
+    return np.stack(samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +319,13 @@ def _centre(given: Array) -> Array:
     return given[:, -1:].mean(axis=2, keepdims=True)
 
 
-def _size(model: torch.nn.Module) -> int:
+def n_parameters(model: torch.nn.Module) -> int:
+    """Return how many numbers of a model are learned."""
     return sum(p.numel() for p in model.parameters())
 
 
-def _beyond(switches: dict[str, bool]) -> str:
+def beyond(switches: dict[str, bool]) -> str:
+    """Return the end of a method's note: the switches that are on and in no paper."""
     on = [name for name, value in switches.items() if value]
     return f"; beyond the paper: {', '.join(on)}" if on else ""
 

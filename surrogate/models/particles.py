@@ -15,17 +15,18 @@ from torch import Tensor, nn
 from surrogate.models.egnn import Egnn
 from surrogate.models.graphs import NOT_BONDED, Graph
 
-# Types of particles and kinds of pairs that embeddings know.
-N_TYPES, N_PAIR_KINDS = 3, 2
+# Kinds of pairs that pair forces know.
+N_PAIR_KINDS = 2
 # The distance below which a pair's features stop changing, nm.
 _NEAR_NM = 0.01
 
 
 @dataclass(frozen=True)
 class EgnnJumpConfig:
-    """`from_velocity` adds the last frame moved on at its velocity, so that only the change is learned; without it
-    the network starts from the last frame, as Satorras (2021) does."""
+    """`n_types` of particles. `from_velocity` adds the last frame moved on at its velocity, so that only the change is
+    learned; without it the network starts from the last frame, as Satorras (2021) does."""
 
+    n_types: int = 3
     width: int = 64
     n_layers: int = 4
     n_new: int = 20
@@ -41,7 +42,7 @@ class EgnnJump(nn.Module):
     def __init__(self, config: EgnnJumpConfig) -> None:
         super().__init__()
         self.config = c = config
-        self.embed_type = nn.Embedding(N_TYPES, c.width)
+        self.embed_type = nn.Embedding(c.n_types, c.width)
         self.embed_pairs = nn.Linear(1, c.width)
         self.embed_speed = nn.Linear(1, c.width)
         self.embed_frame = nn.Embedding(c.n_new, c.width)
@@ -59,9 +60,14 @@ class EgnnJump(nn.Module):
         moved, _ = self.network(h, x, time_ps * v, all_pairs(x.shape[-2], pairs), scale)
         return moved + time_ps * v if self.config.from_velocity else moved
 
+    def all_frames(self, x: Tensor, v: Tensor, types: Tensor, pairs: Tensor) -> Tensor:
+        """The same for all frames: `(b, n_new, n, 3)`."""
+        return torch.stack([self(x, v, types, pairs, frame) for frame in range(self.config.n_new)], dim=1)
+
 
 def all_pairs(n: int, pairs: Tensor) -> Graph:
-    """Every ordered pair of n particles as edges, with the kind `(b, n_edges)` of each system's own pairs."""
+    """Every ordered pair of n particles as edges, with the kind `(b, n_edges)` of each system's own `pairs`: 0 none in
+    particular, 1 related (a spring, like charges, second neighbours), 2 a bond."""
     index = torch.arange(n, device=pairs.device)
     edges = torch.cartesian_prod(index, index)
     edges = edges[edges[:, 0] != edges[:, 1]]

@@ -67,17 +67,28 @@ def fit_normal_modes(frames: TrainingFrames, n_new: int, rng: np.random.Generato
     """Principal components of the training frames; each mode's correlations after one and two frames."""
     starts = frames.window_starts(3, validation=False)
     starts = np.sort(rng.permutation(starts)[:50_000])
-    x = frames.positions_nm(starts[:, None] + np.arange(3)).astype(np.float64).reshape(len(starts), 3, -1)
+    triples = frames.positions_nm(starts[:, None] + np.arange(3)).astype(np.float64)
+    try:
+        return normal_modes_of(triples, n_new)
+    except InputError as error:
+        raise InputError(f"{frames.scene.name}: {error}") from error
+
+
+def normal_modes_of(triples: FloatArray, n_new: int) -> NormalModes:
+    """Fit `NormalModes` to successive canonical frames `(n, 3, n_atoms, 3)` nm. Raises InputError where nothing
+    moves."""
+    n_atoms = triples.shape[2]
+    x = triples.reshape(len(triples), 3, -1)
     mean = x.mean((0, 1))
-    x -= mean
-    covariance = np.einsum("bti,btj->ij", x, x) / (3 * len(starts))
+    x = x - mean
+    covariance = np.einsum("bti,btj->ij", x, x) / (3 * len(x))
     variance, vectors = np.linalg.eigh(covariance)
     kept = variance > SMALLEST_DEVIATION_NM**2
     if not kept.any():
-        raise InputError(f"{frames.scene.name}: no atom moves in these frames; there are no modes to fit.")
+        raise InputError("no atom moves in these frames; there are no modes to fit.")
     modes = vectors[:, kept].T
     coefficients = autoregression(np.einsum("bti,ki->btk", x, modes))
-    model = NormalModes(BaselineConfig(n_new, frames.scene.n_atoms, n_modes=len(modes)))
+    model = NormalModes(BaselineConfig(n_new, n_atoms, n_modes=len(modes)))
     model.mean_nm.copy_(torch.from_numpy(mean.reshape(-1, 3)))
     model.modes.copy_(torch.from_numpy(modes))
     model.coefficients.copy_(torch.from_numpy(coefficients))

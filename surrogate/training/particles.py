@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,7 @@ class Training:
     resume: bool = False
     validate_every_s: float = 60.0
     progress: ProgressFn | None = None
+    device: str = "cpu"
 
     def stage(self, part: str, share: float, *, batch: int, rate: float, bf16: bool) -> StageConfig:
         """Return the loop's settings for a part of the training that gets this share of it."""
@@ -62,6 +63,26 @@ class Training:
 
 
 @dataclass(frozen=True, eq=False)
+class Jump:
+    """States `x`, `v` (b, n, 3) of systems of one size, `types` (b, n), `pairs` (b, n, n), and positions `truth` of a
+    later frame, or of all `(b, n_new, n, 3)`."""
+
+    x: Tensor
+    v: Tensor
+    types: Tensor
+    pairs: Tensor
+    truth: Tensor
+
+    def to(self, device: torch.device) -> Jump:
+        return Jump(*(t.to(device) for t in (self.x, self.v, self.types, self.pairs, self.truth)))
+
+
+# Batch, frame to come -> states; batch -> windows (b, n_frames, n, 3) and types (b, n).
+DrawJump = Callable[[int, int, torch.Generator], Jump]
+DrawWindows = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
 class Tensors:
     """A set as float32 tensors."""
 
@@ -80,41 +101,56 @@ class Tensors:
         )
 
 
-def train_egnn(
-    model: EgnnJump, train: ParticleSet, validation: ParticleSet, n_given: int, training: Training, *, any_start: bool
-) -> float:
+def train_egnn(model: EgnnJump, draw: DrawJump, held: Sequence[Jump], training: Training) -> float:
     """Train on the mean distance of one frame to come, another in each step; return the seconds spent.
 
-    With `any_start` (beyond the paper) any frame of a trajectory may be the last given one, as far as its future lasts;
-    else it is frame `n_given - 1` always.
+    `draw(batch, frame, generator)` gives states and what became of them after `frame + 1` frames; `held` states with
+    all their frames to come. Sets the model's `reach` from what `draw` gives.
     """
-    data, held = Tensors.of(train), Tensors.of(validation.first(min(_VALIDATION, len(validation))))
+    device = torch.device(training.device)
     stage = training.stage("egnn", 1.0, batch=64, rate=2e-3, bf16=False)
-    n_frames, last = data.x.shape[1], n_given - 1
+    generator = torch.Generator().manual_seed(training.seed)
     for frame in range(model.config.n_new):
-        time_ps = (frame + 1) * train.lag_ps
-        change = data.x[:, last + frame + 1] - data.x[:, last]
-        if model.config.from_velocity:
-            change = change - time_ps * data.v[:, last]
+        jump, time_ps = draw(512, frame, generator), (frame + 1) * model.config.lag_ps
+        change = jump.truth - jump.x - (time_ps * jump.v if model.config.from_velocity else 0.0)
         model.reach[frame] = change.square().sum(-1).mean().sqrt()
+    model.to(device)
+    held = [jump.to(device) for jump in held]
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         frame = int(torch.randint(model.config.n_new, (1,), generator=generator))
-        rows = torch.randint(len(train), (stage.batch,), generator=generator)
-        at = torch.full((stage.batch,), last)
-        if any_start:
-            at = torch.randint(n_frames - frame - 1, (stage.batch,), generator=generator)
-        moved = model(data.x[rows, at], data.v[rows, at], data.types[rows], data.pairs[rows], frame)
-        error = mean_distance(moved, data.x[rows, at + frame + 1])
+        jump = draw(stage.batch, frame, generator).to(device)
+        error = mean_distance(model(jump.x, jump.v, jump.types, jump.pairs, frame), jump.truth)
         return error / model.reach[frame], {"distance": error.detach()}
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
-        state = (held.x[:, last], held.v[:, last], held.types, held.pairs)
-        frames = [model(*state, frame) for frame in range(model.config.n_new)]
-        return {"validation_ade": float(mean_distance(torch.stack(frames, 1), held.x[:, n_given:]))}
+        errors = [mean_distance(model.all_frames(j.x, j.v, j.types, j.pairs), j.truth) for j in held]
+        return {"validation_ade": float(torch.stack(errors).mean())}
 
     return _run(model, stage, loss_fn, validate, training)
+
+
+def jumps_of(data: ParticleSet, n_given: int, *, any_start: bool) -> DrawJump:
+    """Return a `draw` from a set. With `any_start` (beyond the paper) any frame of a trajectory may be the last given
+    one, as far as its future lasts; else it is frame `n_given - 1` always."""
+    t = Tensors.of(data)
+    n_frames = t.x.shape[1]
+
+    def draw(batch: int, frame: int, generator: torch.Generator) -> Jump:
+        rows = torch.randint(len(t.x), (batch,), generator=generator)
+        at = torch.full((batch,), n_given - 1)
+        if any_start:
+            at = torch.randint(n_frames - frame - 1, (batch,), generator=generator)
+        return Jump(t.x[rows, at], t.v[rows, at], t.types[rows], t.pairs[rows], t.x[rows, at + frame + 1])
+
+    return draw
+
+
+def held_jumps(data: ParticleSet, n_given: int) -> Jump:
+    """Return the last given states of a set's first trajectories, with all frames to come."""
+    t = Tensors.of(data.first(min(_VALIDATION, len(data))))
+    return Jump(t.x[:, n_given - 1], t.v[:, n_given - 1], t.types, t.pairs, t.x[:, n_given:])
 
 
 def train_pair_forces(model: PairForces, train: ParticleSet, validation: ParticleSet, training: Training) -> float:
@@ -157,17 +193,62 @@ def train_pair_forces(model: PairForces, train: ParticleSet, validation: Particl
 
 
 def train_lam_slide_on_windows(
-    model: LamSlide, windows: Tensor, types: Tensor, held: Tensor, held_types: Tensor, training: Training
+    model: LamSlide, draw: DrawWindows, held: Sequence[tuple[Tensor, Tensor]], training: Training
 ) -> float:
-    """Train both stages on windows `(n, n_frames, n_particles, 3)` in the model's units times its scale, types
-    `(n, n_particles)`; return the seconds spent.
+    """Train both stages on windows in the model's units times its scale; return the seconds spent.
+
+    `draw(batch, generator)` gives windows `(b, n_frames, n, 3)` and types `(b, n)`, of systems of one size, another
+    one each time if need be; `held` such pairs.
+    """
+    device = torch.device(training.device)
+    model.to(device)
+    held = [(x.to(device), kinds.to(device)) for x, kinds in held]
+    one = training.stage("autoencoder", STAGE_ONE_SHARE, batch=256, rate=2e-3, bf16=False)
+    two = training.stage("flow", 1.0 - STAGE_ONE_SHARE, batch=64, rate=1e-3, bf16=True)
+
+    def drawn(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        x, kinds = draw(batch, generator)
+        return x.to(device), kinds.to(device)
+
+    def stage_one(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        x, kinds = drawn(one.batch, generator)
+        at = torch.randint(x.shape[1], (one.batch,), generator=generator)
+        return autoencoder_loss(model, x[torch.arange(one.batch), at], kinds, generator)
+
+    @torch.no_grad()
+    def reconstruction() -> dict[str, float]:
+        errors = [mean_distance(model.decode(encode_windows(model, *pair), pair[0].shape[2]), pair[0]) for pair in held]
+        return {"validation_distance": float(torch.stack(errors).mean())}
+
+    spent = _run(model.autoencoder, one, stage_one, reconstruction, training)
+    _normalise(model, drawn)
+    model.autoencoder.requires_grad_(False)
+
+    def stage_two(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        x, kinds = drawn(two.batch, generator)
+        with torch.no_grad(), torch.autocast(device.type, enabled=False):
+            latents = encode_windows(model, x, kinds)
+        tau = draw_flow_times(model, two.batch, generator).to(device)
+        return flow_loss(model, latents, x.shape[2], tau, generator)
+
+    @torch.no_grad()
+    def flow() -> dict[str, float]:
+        generator, losses = torch.Generator().manual_seed(0), []
+        for x, kinds in held:
+            tau = draw_flow_times(model, len(x), generator).to(device)
+            losses.append(flow_loss(model, encode_windows(model, x, kinds), x.shape[2], tau, generator)[1]["flow"])
+        return {"validation_flow": float(torch.stack(losses).mean())}
+
+    return spent + _run(model.approximator, two, stage_two, flow, training)
+
+
+def turned_windows(windows: Tensor, types: Tensor) -> DrawWindows:
+    """Return a `draw` from windows `(n, n_frames, n_particles, 3)`, types `(n, n_particles)`.
 
     Identifiers are drawn at random (Algorithm 1 with a pool of as many as there are particles) by permuting the
     particles of each window, in all its frames alike; every window is rotated at random (appendix E.3).
     """
     n_frames, n = windows.shape[1:3]
-    one = training.stage("autoencoder", STAGE_ONE_SHARE, batch=256, rate=2e-3, bf16=False)
-    two = training.stage("flow", 1.0 - STAGE_ONE_SHARE, batch=64, rate=1e-3, bf16=True)
 
     def draw(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rows = torch.randint(len(windows), (batch,), generator=generator)
@@ -175,34 +256,7 @@ def train_lam_slide_on_windows(
         x = windows[rows].gather(2, order[:, None, :, None].expand(-1, n_frames, -1, 3))
         return x @ random_rotations(batch, generator)[:, None].mT, types[rows].gather(1, order)
 
-    def stage_one(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        x, kinds = draw(one.batch, generator)
-        at = torch.randint(n_frames, (one.batch,), generator=generator)
-        return autoencoder_loss(model, x[torch.arange(one.batch), at], kinds, generator)
-
-    @torch.no_grad()
-    def reconstruction() -> dict[str, float]:
-        back = model.decode(encode_windows(model, held, held_types), n)
-        return {"validation_distance": float(mean_distance(back, held))}
-
-    spent = _run(model.autoencoder, one, stage_one, reconstruction, training)
-    _normalise(model, windows, types)
-    model.autoencoder.requires_grad_(False)
-
-    def stage_two(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        x, kinds = draw(two.batch, generator)
-        with torch.no_grad(), torch.autocast("cpu", enabled=False):
-            latents = encode_windows(model, x, kinds)
-        return flow_loss(model, latents, n, draw_flow_times(model, two.batch, generator), generator)
-
-    @torch.no_grad()
-    def flow() -> dict[str, float]:
-        generator = torch.Generator().manual_seed(0)
-        tau = draw_flow_times(model, len(held), generator)
-        _, terms = flow_loss(model, encode_windows(model, held, held_types), n, tau, generator)
-        return {"validation_flow": float(terms["flow"])}
-
-    return spent + _run(model.approximator, two, stage_two, flow, training)
+    return draw
 
 
 def encode_windows(model: LamSlide, windows: Tensor, types: Tensor) -> Tensor:
@@ -217,13 +271,12 @@ def mean_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _normalise(model: LamSlide, windows: Tensor, types: Tensor, at_most: int = 500) -> None:
-    """Measure the latents' means and common scale, particles in the order of the set and permuted."""
+def _normalise(model: LamSlide, draw: DrawWindows, n_draws: int = 16, batch: int = 32) -> None:
+    """Measure the latents' means and common scale."""
     model.latent_mean.zero_()
     model.latent_scale.fill_(1.0)
     generator = torch.Generator().manual_seed(0)
-    turned = windows[:at_most] @ random_rotations(min(at_most, len(windows)), generator)[:, None].mT
-    z = encode_windows(model, turned, types[:at_most]).flatten(0, 1)
+    z = torch.cat([encode_windows(model, *draw(batch, generator)).flatten(0, 1) for _ in range(n_draws)])
     model.latent_mean.copy_(z.mean(0))
     model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
 
@@ -243,6 +296,6 @@ def _run(
         state_path=training.state(stage.name),
         log_path=training.log,
         resume=training.resume,
-        device=torch.device("cpu"),
+        device=torch.device(training.device),
         progress=training.progress,
     )
