@@ -16,6 +16,7 @@ from surrogate.data.rarity import window_sampler
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.training.devices import is_first_process
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from surrogate.training.provenance import provenance_of, training_domain
@@ -94,7 +95,7 @@ def train_lam_slide(
     elements = torch.tensor([ATOMIC_NUMBERS[e] for e in frames.scene.elements], device=device)
     log_path = out.with_suffix(".csv")
     states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
-    if not resume:
+    if not resume and is_first_process():
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
     if start is None:
@@ -113,9 +114,10 @@ def train_lam_slide(
         save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s, start))
 
     spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config)
-    write(spent_two)
-    for path in states:
-        path.unlink(missing_ok=True)
+    if is_first_process():
+        write(spent_two)
+        for path in states:
+            path.unlink(missing_ok=True)
     return out
 
 

@@ -5,18 +5,27 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from surrogate.training.devices import average_gradients, open_fabric
+from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
 from systems.whole_file import create_whole
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+# Seeds of one training's processes lie further apart than those of its stages.
+SEEDS_APART = 1_000_003
 
 # (stage, share of the budget done, latest metrics) -> None
 ProgressFn = Callable[[str, float, dict[str, float]], None]
@@ -102,13 +111,18 @@ def run_stage(
     device: torch.device,
     progress: ProgressFn | None = None,
     on_save: Callable[[float], None] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> float:
     """Train `module` in place and leave it holding its EMA weights; return the seconds of training spent.
 
     `loss_fn(generator)` draws its own batch from the generator, so that a resumed run draws what an uninterrupted one
     would have. Each validation logs a CSV row, saves the resume state and calls `on_save(spent_s)` with EMA weights in.
-    Raises SimulationError when the loss stops being finite; the last saved state stays.
+    Of several processes (training.devices) each draws its own batches, and the first alone validates and writes.
+    `warn` hears of a gradient that has outgrown all others (stderr if None). Raises SimulationError when the loss stops
+    being finite; the last saved state stays.
     """
+    fabric = open_fabric(device.type, config.bf16)
+    watch = Watch()
     decay: list[nn.Parameter] = []
     plain: list[nn.Parameter] = []
     for p in (p for p in module.parameters() if p.requires_grad):
@@ -119,10 +133,12 @@ def run_stage(
         betas=(0.9, 0.99),
     )
     ema = Ema(module, config.ema_decay)
-    generator = torch.Generator().manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed + SEEDS_APART * fabric.global_rank)
     step, spent_s = 0, 0.0
     if resume and state_path.exists():
-        step, spent_s = load_state(state_path, module, ema, optimiser, generator, config)
+        step, spent_s = load_state(
+            state_path, module, ema, optimiser, generator, config, process=(fabric.global_rank, fabric.world_size)
+        )
     last = time.monotonic()
     next_validation = spent_s + config.validate_every_s
     sums: dict[str, Tensor] = {}
@@ -131,43 +147,67 @@ def run_stage(
         factor = learning_rate_factor(step, share, config.warmup_steps)
         for group in optimiser.param_groups:
             group["lr"] = config.learning_rate * factor
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=config.bf16):
+        with fabric.autocast():
             loss, terms = loss_fn(generator)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        now = time.monotonic()
+        # The first process's clock decides for all when to validate and to end.
+        spent_s, last = average_gradients(fabric, module, spent_s + now - last), now
         norm = nn.utils.clip_grad_norm_(module.parameters(), config.clip_norm)
         if not torch.isfinite(norm):
+            where = first_not_finite(module)
             raise SimulationError(
-                f"training stage {config.name!r}: loss or gradient is not finite at step {step}; lower the learning "
-                f"rate (now {config.learning_rate:g}). The last good state is {state_path}."
+                f"training stage {config.name!r}: loss or gradient is not finite at step {step}"
+                f"{f', first in {where}' if where else ''}; lower the learning rate (now {config.learning_rate:g}). "
+                f"The last good state is {state_path}."
             )
+        if (warning := watch.see(step, float(norm))) and fabric.is_global_zero:
+            (warn or _to_stderr)(f"training stage {config.name!r}: {warning}")
         optimiser.step()
         ema.update(module, step)
         for key, value in {**terms, "gradient_norm": norm.detach()}.items():
             sums[key] = sums.get(key, torch.zeros(())) + value.float().cpu()
         n_summed += 1
         step += 1
-        now = time.monotonic()
-        spent_s, last = spent_s + now - last, now
         ended = config.share_done(step, spent_s) >= 1.0
         if spent_s >= next_validation or ended:
+            generators = _all_generators(fabric, generator, device)
+            next_validation = spent_s + config.validate_every_s
+            if not fabric.is_global_zero:
+                sums, n_summed = {}, 0
+                continue
             with ema.swapped(module):
                 metrics = {f"train_{k}": float(v) / n_summed for k, v in sums.items()} | validate_fn()
                 if on_save is not None:
                     on_save(spent_s)
             sums, n_summed = {}, 0
             append_row(log_path, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
-                                  "learning_rate": config.learning_rate * factor, **metrics})  # fmt: skip
-            save_state(state_path, module, ema, optimiser, generator, step, spent_s, config)
+                                  "learning_rate": config.learning_rate * factor, **metrics,
+                                  "warnings": watch.n_warnings})  # fmt: skip
+            save_state(state_path, module, ema, optimiser, generators, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
             # Validation is not training: it is left out of the budget.
             last = time.monotonic()
-            next_validation = spent_s + config.validate_every_s
         elif progress is not None and step % 10 == 0:
             progress(config.name, config.share_done(step, spent_s), {})
     ema.copy_to(module)
     return spent_s
+
+
+def _to_stderr(line: str) -> None:
+    sys.stderr.write(f"warning: {line}\n")
+
+
+def _all_generators(fabric: Fabric, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Return the states of all processes' generators: `(n,)` of a single one, else `(processes, n)`."""
+    state = generator.get_state()
+    if fabric.world_size == 1:
+        return state
+    gathered = fabric.all_gather(state.to(device))
+    assert isinstance(gathered, Tensor)
+    return gathered.cpu()
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
@@ -196,7 +236,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     create_whole(path, fill)
 
 
-def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
+def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generators: Tensor,
                step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state (safetensors, JSON in its metadata) whole or not at all."""
     from safetensors.torch import save_file
@@ -205,15 +245,18 @@ def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
     tensors |= {f"ema.{k}": v.cpu().contiguous() for k, v in ema.shadow.items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
-    tensors["generator"] = generator.get_state()
+    tensors["generator"] = generators.contiguous()
     header = {"step": step, "spent_s": spent_s, "stage": config.name, "seed": config.seed, "batch": config.batch}
     metadata = {"surromd_training": json.dumps(header)}
     create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
 def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
-               config: StageConfig) -> tuple[int, float]:  # fmt: skip
-    """Put a saved state back; return (step, spent_s). Raises InputError when it is of another run."""
+               config: StageConfig, *, process: tuple[int, int] = (0, 1)) -> tuple[int, float]:  # fmt: skip
+    """Put a saved state back; return (step, spent_s). `process`: this one's number and that of all.
+
+    Raises InputError when the state is of another run or of another number of processes.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -237,5 +280,9 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = tensor
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    generator.set_state(tensors["generator"])
+    states = tensors["generator"]
+    states = states[None] if states.ndim == 1 else states
+    if len(states) != process[1]:
+        raise InputError(f"training state {path} is of {len(states)} processes, this run has {process[1]}.")
+    generator.set_state(states[process[0]])
     return int(header["step"]), float(header["spent_s"])

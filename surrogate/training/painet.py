@@ -14,6 +14,7 @@ from surrogate.data.weights import save_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
+from surrogate.training.devices import is_first_process
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from systems.errors import InputError
@@ -81,7 +82,7 @@ def train_painet(
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
     log_path, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.forecast.train.safetensors")
-    if not resume:
+    if not resume and is_first_process():
         for path in (log_path, state):
             path.unlink(missing_ok=True)
     stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
@@ -101,8 +102,9 @@ def train_painet(
 
     spent = run_stage(model, stage, loss_fn, validate, state_path=state, log_path=log_path, resume=resume,
                       device=device, progress=progress, on_save=write)  # fmt: skip
-    write(spent)
-    state.unlink(missing_ok=True)
+    if is_first_process():
+        write(spent)
+        state.unlink(missing_ok=True)
     return out
 
 
