@@ -379,7 +379,10 @@ def train(
         overwrite=overwrite,
         quiet=quiet,
     )
-    print_written([written], as_json, quiet)
+    from surrogate.training.devices import is_first_process
+
+    if is_first_process():
+        print_written([written], as_json, quiet)
 
 
 @app.command()

@@ -42,13 +42,19 @@ def is_first_process() -> bool:
     return os.environ.get("RANK", "0") == "0"
 
 
+def wait_for_all() -> None:
+    """Return when every process has come here: what the first one wrote before is then there for all."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.barrier()
+
+
 @lru_cache(maxsize=4)
 def open_fabric(device_type: str, bf16: bool) -> Fabric:
     """Return a launched Fabric of this process, joined with torchrun's others where there are any."""
-    # It tells of its precision at level INFO, through a handler of its own.
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     from lightning_fabric import Fabric
 
+    # On import it sets itself to tell of its precision and processes, through a handler of its own.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     n_processes = int(os.environ.get("WORLD_SIZE", "1"))
     here = int(os.environ.get("LOCAL_WORLD_SIZE", str(n_processes)))
     fabric = Fabric(

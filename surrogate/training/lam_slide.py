@@ -16,7 +16,7 @@ from surrogate.data.rarity import window_sampler
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.training.devices import is_first_process
+from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from surrogate.training.provenance import provenance_of, training_domain
@@ -118,6 +118,7 @@ def train_lam_slide(
         write(spent_two)
         for path in states:
             path.unlink(missing_ok=True)
+    wait_for_all()
     return out
 
 

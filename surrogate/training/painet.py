@@ -14,7 +14,7 @@ from surrogate.data.weights import save_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
-from surrogate.training.devices import is_first_process
+from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from systems.errors import InputError
@@ -105,6 +105,7 @@ def train_painet(
     if is_first_process():
         write(spent)
         state.unlink(missing_ok=True)
+    wait_for_all()
     return out
 
 
