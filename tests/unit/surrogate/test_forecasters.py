@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from surrogate.bench.forecasters import Cost, _working_parameters, a_mse, cut, exponent, matched_width, measure_cost
+from surrogate.bench import forecasters
+from surrogate.bench.forecasters import (
+    Cost,
+    _working_parameters,
+    compare_errors,
+    cut,
+    exponent,
+    matched_width,
+    measure_cost,
+    window_errors,
+)
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
+from surrogate.training.painet import PainetTraining
 from systems.scene import Scene
 
 SMALL = PainetConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=1, lag_ps=0.01)
@@ -19,14 +31,18 @@ SMALL = PainetConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=
 
 @pytest.fixture(scope="module")
 def drifting(alanine_dipeptide: Scene) -> TrainingFrames:
-    """Atoms that move on straight lines from where they stand, 100 frames."""
+    return _drifting(alanine_dipeptide, 100)
+
+
+def _drifting(alanine_dipeptide: Scene, n_frames: int) -> TrainingFrames:
+    """Atoms that move on straight lines from where they stand."""
     rng = np.random.default_rng(0)
     v = rng.normal(size=(1, 22, 3)) * 0.1
     v -= (alanine_dipeptide.masses_da / alanine_dipeptide.masses_da.sum()) @ v
-    x = alanine_dipeptide.positions_nm + v * 0.01 * np.arange(100)[:, None, None]
+    x = alanine_dipeptide.positions_nm + v * 0.01 * np.arange(n_frames)[:, None, None]
     x = x - np.einsum("a,nad->nd", alanine_dipeptide.masses_da / alanine_dipeptide.masses_da.sum(), x)[:, None]
     velocities = np.broadcast_to(v, x.shape).astype(np.float32)
-    starts = np.array([0, 100])
+    starts = np.array([0, n_frames])
     return TrainingFrames(alanine_dipeptide, quantise(x), starts, 0.01, False, {}, (), velocities)
 
 
@@ -64,4 +80,23 @@ def test_the_error_is_per_coordinate_in_square_angstrom(drifting: TrainingFrames
             if "factor.2" in name:
                 p.zero_()
     expected = 100.0 * np.mean([np.square(drifting.velocities[0] * 0.01 * (t + 1)).mean() for t in range(2)])
-    assert a_mse(model, drifting) == pytest.approx(expected, rel=0.05)
+    assert window_errors(model, drifting).mean() == pytest.approx(expected, rel=0.05)
+    assert len(window_errors(model, drifting, 7)) == 7
+
+
+def test_a_comparison_goes_on_from_what_is_there_and_says_how_sure_it_is(
+    alanine_dipeptide: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = _drifting(alanine_dipeptide, 500)
+    monkeypatch.setattr(forecasters, "collect_frames", lambda *args, **kwargs: longer)
+    training = PainetTraining(steps=3, batch=4, noise=0.0, pushforward=0.0, velocity_weight=0.0)
+    first = compare_errors(Path("drifting.h5"), SMALL, training, tmp_path)
+    assert first.constant_velocity < 1e-4 < first.frozen
+    assert first.spans == 50
+    assert first.ratio.low <= first.ratio.value <= first.ratio.high
+    assert first.ratio.value == pytest.approx(first.painet / first.egnn, rel=0.1)
+    made = {path: path.stat().st_mtime_ns for path in tmp_path.glob("drifting.*.safetensors")}
+    assert len(made) == 2
+    again = compare_errors(Path("drifting.h5"), SMALL, training, tmp_path)
+    assert again == first
+    assert {path: path.stat().st_mtime_ns for path in made} == made
