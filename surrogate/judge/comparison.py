@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogate.judge import curves, metrics, relaxation, verdict
+from surrogate.judge import curves, metrics, relaxation, remarks, verdict
 from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.charts import Chart
 from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
@@ -17,6 +17,7 @@ from surrogate.judge.couplings import coupling_rows
 from surrogate.judge.curves import Curves
 from surrogate.judge.energy_rows import EnergyFn, energy_rows, measure_energies
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
+from surrogate.judge.forecast import forecast_charts
 from surrogate.judge.interventions import intervention_rows
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
@@ -29,7 +30,6 @@ from surrogate.judge.survival import survival_charts
 from surrogate.judge.torsion_rows import other_torsion_rows
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
-from systems import validity
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import format_time_ps
@@ -53,7 +53,6 @@ ROOMS: tuple[Room, ...] = (
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
 _ROWS_FORESEEN = 60
-_SHORT_IN_CORRELATION_TIMES = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +185,13 @@ def compare(
         temperature = 300.0
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     accounts = [account_of(e) for e in everyone]
+    floor = None if replicate is None else thinned[-1]
     judgements = tuple(
-        _judge(stage, torsions, geometry, truth, features, other, chosen, float(temperature), accounts[0], account)
-        for features, account in zip(measured[1 : 1 + len(candidates)], accounts[1 : 1 + len(candidates)], strict=True)
+        _with_forecast(
+            _judge(stage, torsions, geometry, truth, features, other, chosen, float(temperature), accounts[0], account),
+            *forecast_charts(thinned[0], rolled, floor),
+        )
+        for features, account, rolled in zip(measured[1:], accounts[1:], thinned[1 : 1 + len(candidates)], strict=False)
     )
     notes += [f"Validity check left out: {x}." for x in geometry.excluded]
     return Comparison(
@@ -253,8 +256,16 @@ def _judge(
         effective_samples=effective_samples(truth.features.n_frames, correlation),
         speed_ratio=speed_ratio(account, reference_account),
         faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
-        skipped=(*_skipped(trio), *skipped, *without_tica, *without_seams, *(x for _, _, why in rooms for x in why)),
-        notes=tuple(_trimming(trio, reference, candidate, replicate, correlation) + _unlike(judged, options)),
+        skipped=(
+            *remarks.skipped(trio),
+            *skipped,
+            *without_tica,
+            *without_seams,
+            *(x for _, _, why in rooms for x in why),
+        ),
+        notes=tuple(
+            remarks.trimming(trio, reference, candidate, replicate, correlation) + remarks.unlike(judged, options)
+        ),
         curves=Curves(
             ramachandran=curves.ramachandran_maps(trio),
             histograms=(*curves.torsion_histograms(trio), *projected),
@@ -295,52 +306,9 @@ def _equal_terms(
     return Trio(scene, torsions, geometry, truth, rolled, other, options), times[0]
 
 
-def _trimming(
-    trio: Trio, reference: Features, candidate: Features, replicate: Features, correlation: float
-) -> list[str]:
-    notes = []
-    compared = trio.reference.features
-    for features in (reference, candidate, replicate):
-        if features.n_frames > compared.n_frames:
-            notes.append(
-                f"{features.label}: the first {format_time_ps(compared.total_ps)} of "
-                f"{format_time_ps(features.total_ps)} are used, for equal length."
-            )
-    if compared.n_frames < _SHORT_IN_CORRELATION_TIMES * 2 * correlation:
-        notes.append(
-            f"The compared length is only {compared.n_frames / (2 * correlation):.0f} correlation times of the slowest "
-            "torsion: too short to judge by; error bars are themselves uncertain."
-        )
-    return notes
-
-
-def _unlike(rows: Sequence[Row], options: Options) -> list[str]:
-    metrics_off = verdict.replicate_differs(rows, options)
-    if not metrics_off:
-        return []
-    return [
-        f"The replicate itself differs from the reference ({'; '.join(metrics_off)}): the two are not samples of one "
-        "simulation, or too short; trust no verdict on these metrics."
-    ]
-
-
-def _skipped(trio: Trio) -> list[tuple[str, str]]:
-    skipped = []
-    done = {check.mask for check in metrics.applicable_checks(trio.geometry)}
-    for flag, what, why in (
-        (validity.BOND_HALF_ANGSTROM, "Bond lengths", "the scene has no bonds"),
-        (validity.CLASH, "Clashes", "no two atoms are more than three bonds apart"),
-        (validity.CHIRALITY, "Stereocentres", "the scene has none"),
-        (validity.OMEGA, "Peptide and double bonds", "the scene has none"),
-        (validity.RING, "Planar rings", "the scene has none"),
-    ):
-        if flag not in done:
-            skipped.append((what, why))
-    if not len(trio.torsions.phi) and not len(trio.torsions.psi):
-        skipped.append(("Torsion distributions, basins, autocorrelation", "the scene has no φ or ψ torsion"))
-    elif not trio.torsions.residues:
-        skipped.append(("Joint φ/ψ maps", "no residue has both torsions"))
-    return skipped
+def _with_forecast(judgement: Judgement, charts: Sequence[Chart], skipped: Sequence[tuple[str, str]]) -> Judgement:
+    drawn = replace(judgement.curves, charts=(*judgement.curves.charts, *charts))
+    return replace(judgement, curves=drawn, skipped=(*judgement.skipped, *skipped))
 
 
 def _versions() -> dict[str, str]:

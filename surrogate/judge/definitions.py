@@ -62,6 +62,13 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Pérez-Hernández et al., J. Chem. Phys. 139, 015102 (2013); deeptime (Hoffmann et al., 2022)",
     ),
     Definition(
+        "Forecast error",
+        "Only of segments that start from the same frame. FDE: mean distance of all atoms from the reference's at a time "
+        "after the shared frames; ADE: its mean up to that time. Frozen: the last shared frame for ever; constant "
+        "velocity: the last shared step repeated.",
+        "Xu et al., EGNO (2024); LaM-SLidE (2025)",
+    ),
+    Definition(
         "Potential energy",
         "Of every k-th frame (about 400), by the reference's force field, after its stiff bonds were brought to rest "
         "with all atoms held near where they were. A frame that cannot be relaxed counts as a whole range above.",
