@@ -11,6 +11,7 @@ import numpy as np
 
 from surrogate.judge import curves, metrics, relaxation, remarks, verdict
 from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
+from surrogate.judge.bond_rows import bond_rows
 from surrogate.judge.charts import Chart
 from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
 from surrogate.judge.couplings import coupling_rows
@@ -228,8 +229,8 @@ def _judge(
     trio, correlation = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
     trio = replace(trio, temperature_k=temperature_k)
     rows = metrics.validity_rows(trio)
-    bond_rows, bonds = metrics.bond_rows(trio)
-    rows += bond_rows + metrics.population_rows(trio) + metrics.torsion_rows(trio)
+    lengths, bonds = bond_rows(trio)
+    rows += lengths + metrics.population_rows(trio) + metrics.torsion_rows(trio)
     kinetic, correlations, skipped = relaxation.correlation_rows(trio)
     slowest, projected, without_tica = relaxation.tica_rows(trio)
     seams, without_seams = relaxation.boundary_row(trio)

@@ -63,8 +63,8 @@ DEFINITIONS: tuple[Definition, ...] = (
     ),
     Definition(
         "Forecast error",
-        "Only of segments that start from the same frame. FDE: mean distance of all atoms from the reference's at a time "
-        "after the shared frames; ADE: its mean up to that time. Frozen: the last shared frame for ever; constant "
+        "Only of segments that start from the same frame. FDE: mean distance of all atoms from the reference's at a "
+        "time after the shared frames; ADE: its mean up to that time. Frozen: the last shared frame for ever; constant "
         "velocity: the last shared step repeated.",
         "Xu et al., EGNO (2024); LaM-SLidE (2025)",
     ),

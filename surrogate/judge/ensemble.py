@@ -117,8 +117,8 @@ def load_ensemble(
     where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
     those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
     periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
-    the files. `top` is the topology for formats that hold none. A file with more than `in_memory_bytes` of coordinates
-    is left where it is and read block by block.
+    the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
+    coordinates together are left where they are and read block by block.
     Raises InputError (no files, nothing known of the topology, no times without `lag_ps`, replicas with different lags
     or atoms), OutOfDomainError (another molecule) and TrajectoryError (a damaged file, uneven time).
     """
@@ -141,7 +141,9 @@ def load_ensemble(
         notes += note
         lags.append(lag)
         frames = opened.frames
-        if 12 * len(frames) * reader.n_atoms <= in_memory_bytes:
+        size = 12 * len(frames) * reader.n_atoms
+        if size <= in_memory_bytes:
+            in_memory_bytes -= size
             segments += np.split(frames[:], cuts)
             reader.close()
         else:

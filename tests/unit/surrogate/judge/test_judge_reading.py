@@ -213,6 +213,9 @@ def test_frames_left_on_disk_measure_the_same(tmp_path: Path, simulate: Callable
     held, left = (load_ensemble([path], in_memory_bytes=n) for n in (10**9, 0))
     assert isinstance(left.segments[0], StoredFrames) and not isinstance(held.segments[0], StoredFrames)
     assert left.segment_lengths == held.segment_lengths == [1000, 2000]
+    both = load_ensemble([path, path], in_memory_bytes=frames.nbytes + 10)
+    kinds = [isinstance(x, StoredFrames) for x in both.segments]
+    assert kinds == [False, False, True, True], "the limit is that of all files together"
     for one, other in zip(left.segments, held.segments, strict=True):
         assert np.array_equal(one[:], other)
         assert np.array_equal(one[7:900:13], other[7:900:13])
@@ -251,7 +254,7 @@ def test_a_heavy_atom_candidate_is_judged_on_what_it_has(tmp_path: Path, simulat
     assert part.kept is not None and np.array_equal(part.kept, heavy)
     everyone, kept = on_common_atoms([reference, part, replicate])
     assert kept is not None and {e.scene.n_atoms for e in everyone} == {10}
-    quick = Options(n_bootstrap=50, n_permutations=50)
+    quick = Options(n_bootstrap=50, n_permutations=50, peptide_recipe=False)
     comparison = compare(reference, [part], replicate, options=quick)
     assert comparison.n_atoms == 10 and any("10 atoms that all trajectories hold" in n for n in comparison.notes)
     found = comparison.judgements[0]
