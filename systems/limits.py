@@ -1,6 +1,7 @@
-"""What frames of a reference never do beyond `validity`: angles, flat centres, jumps and drift. For guards.
+"""What frames of a reference never do beyond `validity`: angles, flat centres, jumps, stillness and drift. For guards.
 
-Every limit is measured on the reference: the farthest that its frames go from their mean, and half as far again.
+Every limit is measured on the reference: the farthest that its frames go from their mean, and half as far again; the
+least that they change from one to the next, and a third of it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from systems.errors import InputError
 from systems.frame_columns import column_blocks, cross, signed_volume, squared_distance
 from systems.scene import Scene
-from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY
+from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
 
 FloatArray = npt.NDArray[np.floating[Any]]
 IntArray = npt.NDArray[np.int64]
@@ -24,6 +25,9 @@ IntArray = npt.NDArray[np.int64]
 # How much farther than in the reference counts as too far: a sample's extremes lie inside those of a longer one. For
 # Gaussian motion and 20,000 frames the limit stands at six standard deviations.
 WIDENING = 1.5
+# A model that does not simulate moves least of all: random weights of PAINET leave distances as they are to a hundredth
+# of what the quietest of 20,000 frames of MD changes.
+_STILLER = 3.0
 # A centre with three neighbours is flat where the reference keeps it, root mean square, this near to their plane: sp2
 # centres stay within 0.01 nm, pyramidal ones stand 0.03 nm or more above it.
 _FLAT_NM = 0.02
@@ -37,8 +41,8 @@ class Limits:
     Angles: `angle_idx (k, 3)` rows (end, middle, end) within `angle_min_rad` and `angle_max_rad (k,)`. Flat centres:
     `flat_idx (k, 4)` rows (centre, a, b, c) no farther than `flat_max_nm (k,)` from the plane of a, b, c. Jumps:
     `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next, `lag_ps` later, by no more than
-    `jump_max_nm`, root mean square. The middle of those atoms moves no farther than that either: frames stand in one
-    pose, so what it does beyond is drift.
+    `jump_max_nm`, root mean square, and no less than `jump_min_nm` (0 in files of older versions). The middle of those
+    atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift.
     """
 
     angle_idx: IntArray
@@ -48,6 +52,7 @@ class Limits:
     flat_max_nm: FloatArray
     jump_idx: IntArray
     jump_max_nm: float
+    jump_min_nm: float = 0.0
 
     @cached_property
     def angle_cosines(self) -> tuple[FloatArray, FloatArray]:
@@ -65,17 +70,18 @@ class Limits:
     def from_dict(record: dict[str, Any]) -> Limits:
         """Rebuild limits. Raises InputError when an entry is missing, unknown or malformed."""
         names = [f.name for f in fields(Limits)]
-        if set(record) != set(names):
+        if set(record) | {"jump_min_nm"} != set(names):
             raise InputError(f"Limits record has entries {sorted(record)}, not {sorted(names)}.")
         try:
             values: dict[str, Any] = {}
-            for name in names[:-1]:
+            for name in names[:-2]:
                 if name.endswith("_idx"):
                     width = {"angle_idx": 3, "flat_idx": 4, "jump_idx": 2}[name]
                     values[name] = np.array(record[name], dtype=np.int64).reshape(-1, width)
                 else:
                     values[name] = np.array(record[name], dtype=np.float64)
-            return Limits(**values, jump_max_nm=float(record["jump_max_nm"]))
+            least = float(record.get("jump_min_nm", 0.0))
+            return Limits(**values, jump_max_nm=float(record["jump_max_nm"]), jump_min_nm=least)
         except (TypeError, ValueError) as error:
             raise InputError(f"Limits record is malformed: {error}.") from error
 
@@ -101,7 +107,7 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
     flat = np.sqrt((heights**2).mean(axis=1)) < _FLAT_NM
     mean = angles.mean(axis=1)
     pairs = _jump_pairs(scene)
-    jumps = [float(_jump(a, b, pairs).max()) for _, a, b in _both(first, second, len(pairs))]
+    jumps = np.concatenate([_jump(a, b, pairs) for _, a, b in _both(first, second, len(pairs))])
     return Limits(
         angle_idx=angle_idx,
         angle_min_rad=mean - WIDENING * (mean - angles.min(axis=1)),
@@ -109,7 +115,8 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
         flat_idx=centres[flat],
         flat_max_nm=WIDENING * heights[flat].max(axis=1, initial=0.0),
         jump_idx=pairs,
-        jump_max_nm=WIDENING * max(jumps) if len(pairs) else float("inf"),
+        jump_max_nm=WIDENING * float(jumps.max()) if len(pairs) else float("inf"),
+        jump_min_nm=float(jumps.min()) / _STILLER if len(pairs) else 0.0,
     )
 
 
@@ -117,8 +124,8 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
     """Return bits of `systems.validity` `(n_frames,)` for frames `(n_frames, n_atoms, 3)` nm; 0 is within the limits.
 
     ANGLE and PLANARITY: an angle, or a centre's height above the plane of its neighbours, beyond the limits. JUMP and
-    DRIFT: too far from the frame before, `previous_nm (n_frames, n_atoms, 3)`; a frame without one is its own. A frame
-    that is not finite is beyond every limit, and so is the step away from it.
+    DRIFT: too far from the frame before, `previous_nm (n_frames, n_atoms, 3)`; STILL: too near to it, but not equal; a
+    frame without one before is its own. A frame that is not finite is beyond every limit, and so is the step away.
     """
     positions, previous = np.asarray(positions_nm), np.asarray(previous_nm)
     flags = np.zeros(len(positions), dtype=np.uint16)
@@ -133,7 +140,9 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
             height = np.abs(_height(columns, limits.flat_idx))
             part |= np.uint16(PLANARITY) * ~(height <= limits.flat_max_nm[:, None]).all(axis=0)
             if len(atoms):
-                part |= np.uint16(JUMP) * ~(_jump(before, columns, limits.jump_idx) <= limits.jump_max_nm)
+                jump = _jump(before, columns, limits.jump_idx)
+                part |= np.uint16(JUMP) * ~(jump <= limits.jump_max_nm)
+                part |= np.uint16(STILL) * ((jump < limits.jump_min_nm) & (jump > 0.0))
                 moved = columns[:, atoms].mean(axis=1) - before[:, atoms].mean(axis=1)
                 part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= limits.jump_max_nm)
     return flags

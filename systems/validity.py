@@ -30,6 +30,7 @@ PLANARITY = 256
 JUMP = 512
 DRIFT = 1024
 ENERGY = 2048
+STILL = 4096
 INVALID = NOT_FINITE | BOND_HALF_ANGSTROM | CLASH | CHIRALITY | OMEGA | RING
 
 _NAMES = {
@@ -45,6 +46,7 @@ _NAMES = {
     JUMP: "jump between frames",
     DRIFT: "drift of the whole",
     ENERGY: "energy above the reference",
+    STILL: "hardly a change from the frame before",
 }
 _FLOAT_FIELDS = ("bond_mean_nm", "bond_std_nm", "clash_min_nm")
 

@@ -8,7 +8,18 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.limits import Limits, check_limits
-from systems.validity import ANGLE, DRIFT, ENERGY, INVALID, JUMP, NOT_FINITE, PLANARITY, Geometry, check_frames
+from systems.validity import (
+    ANGLE,
+    DRIFT,
+    ENERGY,
+    INVALID,
+    JUMP,
+    NOT_FINITE,
+    PLANARITY,
+    STILL,
+    Geometry,
+    check_frames,
+)
 
 if TYPE_CHECKING:
     from surrogate.data.weights import TrainingDomain
@@ -17,7 +28,7 @@ FloatArray = npt.NDArray[np.floating[Any]]
 Flags = npt.NDArray[np.uint16]
 
 # Any of these bits, and a frame does not pass.
-CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY
+CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY | STILL
 
 
 class Guard:
@@ -30,7 +41,11 @@ class Guard:
     @property
     def unchecked(self) -> tuple[str, ...]:
         """What is not checked, because the reference changes it or the weights are older than the check."""
-        missing = ("angles, flat centres, jumps and drift: the weights carry no limits",) if not self._limits else ()
+        missing: tuple[str, ...] = ()
+        if self._limits is None:
+            missing = ("angles, flat centres, jumps, stillness and drift: the weights carry no limits",)
+        elif self._limits.jump_min_nm == 0.0:
+            missing = ("stillness: the weights carry no limit of it",)
         return (*self._geometry.excluded, *missing)
 
     def check(self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False) -> Flags:
@@ -43,9 +58,11 @@ class Guard:
         flat = frames_nm.reshape(-1, *frames_nm.shape[2:])
         flags = check_frames(flat, self._geometry)
         if self._limits is not None:
-            first = frames_nm[:, :1] if from_start else before_nm[:, None]
-            previous = np.concatenate([first, frames_nm[:, :-1]], axis=1).reshape(flat.shape)
-            flags |= check_limits(flat, self._limits, previous)
+            previous = np.concatenate([before_nm[:, None], frames_nm[:, :-1]], axis=1).reshape(flat.shape)
+            found = check_limits(flat, self._limits, previous).reshape(n_rows, n_frames)
+            if from_start:
+                found[:, 0] &= ~np.uint16(JUMP | DRIFT)
+            flags |= found.reshape(-1)
         return flags.reshape(n_rows, n_frames)
 
 

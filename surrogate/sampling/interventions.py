@@ -6,7 +6,8 @@ relaxes caught frames under restraints; what is not valid then is drawn again. f
 valid frame to the end of the chunk, and the surrogate takes over again.
 
 A model that gives a chunk without one frame that passes, and another in a second draw, is not unlucky but wrong: the
-rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken (validity.INVALID).
+rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken (validity.INVALID) or
+stands still.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import Flags, Guard, caught, finite
 from systems.errors import SimulationError
-from systems.validity import ENERGY, INVALID, flag_names
+from systems.validity import ENERGY, INVALID, STILL, flag_names
 
 FloatArray = npt.NDArray[np.floating[Any]]
 
@@ -143,7 +144,7 @@ class _Advance:
         for row in range(len(self.last)):
             if not finite(self.chunk.flags[row, -1]) or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
                 self.chunk.failure = (row, "the model's frames are no longer finite")
-            elif self.plan.guard == "flag" and (self.chunk.flags[row] & np.uint16(INVALID)).all():
+            elif self.plan.guard == "flag" and (self.chunk.flags[row] & np.uint16(INVALID | STILL)).all():
                 self.chunk.failure = (row, f"a chunk without one valid frame ({self._reasons(row)})")
 
     def add_md(self) -> None:

@@ -12,7 +12,7 @@ from systems.errors import InputError
 from systems.limits import Limits, check_limits, limits_from_frames
 from systems.scene import Scene
 from systems.trajectory import open_trajectory
-from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY
+from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
 
 HA, CH3, C, O_, N, CA, HB = 2, 1, 4, 5, 6, 8, 11  # atoms of the library's ACE-ALA-NME
 
@@ -102,8 +102,8 @@ def test_jumps_are_measured_free_of_the_pose_and_drift_is_told_apart(limits: Lim
     spun = turned(x, list(range(22)), x.mean(axis=0), np.array([1.0, 2.0, 3.0]), 70.0)
     assert not check(np.stack([x, spun]), limits)[0] & JUMP, "turning as a whole is no jump"
     far = check(np.stack([x, x + 0.2]), limits)
-    assert far.tolist() == [DRIFT]
-    assert check(np.stack([x, x + 1e-4]), limits).tolist() == [0]
+    assert far.tolist() == [DRIFT | STILL], "of the whole: nothing in it has moved"
+    assert check(np.stack([x, x + 1e-4]), limits).tolist() == [STILL]
     assert check_limits(flipped[None], limits, flipped[None]).tolist() == [0], "a frame without one before is its own"
 
 
@@ -154,3 +154,16 @@ def test_other_peoples_md_passes_the_limits_of_its_own_replicas(shared_data: Pat
     flags = np.concatenate([check(x, limits) for x in centred])
     assert len(flags) > 29_000
     assert np.count_nonzero(flags) <= 2
+
+
+def test_a_molecule_that_stands_still_is_caught(alanine_dipeptide: Scene, limits: Limits) -> None:
+    frames = vibrate(alanine_dipeptide, 500, seed=7)
+    assert 0.0 < limits.jump_min_nm < limits.jump_max_nm / 3.0
+    centre = frames[:1]
+    trembling = centre + 1e-3 * (frames - frames.mean(axis=0))
+    assert (check_limits(trembling[1:], limits, trembling[:-1]) & STILL).all()
+    assert not (check_limits(frames[1:], limits, frames[:-1]) & STILL).any()
+    drifting = centre + np.linspace(0.0, 1e-4, len(frames))[:, None, None]
+    assert (check_limits(drifting[1:], limits, drifting[:-1]) & STILL).all(), "as a whole is not enough"
+    older = Limits.from_dict({k: v for k, v in limits.to_dict().items() if k != "jump_min_nm"})
+    assert older.jump_min_nm == 0.0 and not check_limits(trembling[1:], older, trembling[:-1]).any()
