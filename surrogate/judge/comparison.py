@@ -20,6 +20,7 @@ from surrogate.judge.energy_rows import EnergyFn, energy_rows, measure_energies
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.forecast import forecast_charts
 from surrogate.judge.interventions import intervention_rows
+from surrogate.judge.lifetimes import lifetime_rows
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.peptide_protocol import peptide_charts
@@ -43,6 +44,7 @@ ROOMS: tuple[Room, ...] = (
     other_torsion_rows,
     contact_rows,
     hydrogen_bond_rows,
+    lifetime_rows,
     coupling_rows,
     msm_rows,
     peptide_charts,

@@ -216,7 +216,8 @@ def histogram(data: Histogram) -> str:
         axes.set_ylim(bottom=0)
         if data.unit == "rad":
             _degrees(axes, both=False)
-        axes.set_xlabel(f"{data.label} / °" if data.unit == "rad" else data.label)
+        unit = "°" if data.unit == "rad" else data.unit
+        axes.set_xlabel(f"{data.label} / {unit}" if unit else data.label)
         axes.set_ylabel("density")
         axes.set_yticks([])
 

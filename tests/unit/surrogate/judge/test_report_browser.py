@@ -30,6 +30,12 @@ class Browser:
     """Headless Chromium, spoken to over a pipe in its own protocol; `events` is what a page reported since `open`."""
 
     def __init__(self, binary: str, profile: Path) -> None:
+        for number in (3, 4):
+            try:
+                os.fstat(number)
+            except OSError:
+                # What is passed on must be open on this side too, if only to nothing.
+                os.dup2(os.open(os.devnull, os.O_RDONLY), number)
         their_in, our_out = os.pipe()
         our_in, their_out = os.pipe()
         switches = ["--headless=new", "--remote-debugging-pipe", "--disable-gpu", "--no-first-run", "--disable-sync",
