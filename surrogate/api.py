@@ -337,8 +337,8 @@ def rollout(
 
     `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
     the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
-    run in one batch and are named as by `reference`. `solver`: 'multistep' or 'euler', None for the one that suits the
-    weights. `precision`: 'fp32', 'bf16' or 'auto'.
+    run in one batch and are named as by `reference`. `solver`: 'multistep', 'euler' or the adaptive 'dopri5', None for
+    the one that suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real

@@ -13,6 +13,7 @@ from systems.units import parse_mass_da
 class Solver(StrEnum):
     multistep = "multistep"
     euler = "euler"
+    dopri5 = "dopri5"
 
 
 class Precision(StrEnum):

@@ -52,10 +52,11 @@ class Molecule:
 @dataclass(frozen=True)
 class Chunk:
     """Frames `(b, n_new, n_atoms, 3)` nm and, of a model that carries them, the velocities `(b, n_atoms, 3)` nm/ps at
-    the last of them; None of the others."""
+    the last of them; None of the others. `evaluations`: of the network, a row's mean; None where it is always one."""
 
     frames_nm: Tensor
     velocities_nm_ps: Tensor | None = None
+    evaluations: float | None = None
 
 
 class Config(Protocol):

@@ -56,6 +56,7 @@ class ChunkSampler:
         self.solver_steps = solver_steps
         self.bf16 = precision == "bf16" or (precision == "auto" and model.bf16_by_default and bf16_in_hardware())
         self.batch: int | None = None
+        self._evaluations: float | None = None
         self._model = with_bf16_weights(model) if self.bf16 else model
         self._molecule = Molecule.of(template)
         self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
@@ -72,9 +73,9 @@ class ChunkSampler:
         return self._model.n_new
 
     @property
-    def evaluations_per_chunk(self) -> int:
-        """Network evaluations for a chunk of one replica."""
-        return self.solver_steps if self._model.solvers else 1
+    def evaluations_per_chunk(self) -> float:
+        """Network evaluations for a chunk of one replica; of an adaptive solver, what the last one took."""
+        return self._evaluations or (self.solver_steps if self._model.solvers else 1)
 
     def draw(
         self, last_frames_nm: FloatArray, seeds: Sequence[int], velocities_nm_ps: FloatArray | None = None
@@ -135,6 +136,7 @@ class ChunkSampler:
                 solver=self.solver,
                 last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),
             )
+        self._evaluations = chunk.evaluations
         moved = chunk.frames_nm.double().numpy() - translation[:, None, None, :]
         ends = None
         if chunk.velocities_nm_ps is not None:

@@ -80,7 +80,7 @@ def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_re
     return {
         "wall_s": wall_s,
         "batch_wall_s": state.wall_s,
-        "network_evaluations": (state.chunks + tally.draws) * sampler.evaluations_per_chunk,
+        "network_evaluations": round((state.chunks + tally.draws) * sampler.evaluations_per_chunk),
         "ns_per_day": plan.n_frames * plan.save_every_ps * 1e-3 / wall_s * 86400.0,
         "guard_share": sum(v for k, v in state.seconds.items() if k != "draw") / max(state.wall_s, 1e-9),
         "batch": sampler.batch or n_replicas,

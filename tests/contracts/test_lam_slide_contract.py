@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surrogate.data.weights import Weights, load_weights, save_weights
-from surrogate.models.conformance import SurrogateContract
-from surrogate.models.interface import Surrogate
+from surrogate.models.conformance import SurrogateContract, branched_chain, random_state
+from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.rollout import RolloutConfig, rollout
@@ -61,6 +62,30 @@ class TestLamSlideGvp(SurrogateContract):
 class TestLamSlideCleanConditioning(SurrogateContract):
     def make(self, n_atoms: int) -> Surrogate:
         return small_model(3, n_conditioning=3, clean=True)
+
+
+class TestLamSlideAdaptive(SurrogateContract):
+    """With dopri5: rows do not depend on each other's steps."""
+
+    # Steps are chosen anew in bf16: held to the error of the whole chain, not of one evaluation.
+    bf16_error = 0.1
+    sizes = (1, 2)
+
+    def make(self, n_atoms: int) -> Surrogate:
+        return small_model(3)
+
+    def call(self, model: Surrogate, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
+        with torch.no_grad():
+            return model.next_chunk(frames, molecule, noise, solver_steps=1, solver="dopri5")
+
+
+def test_adaptive_evaluations_are_counted() -> None:
+    model = small_model(3)
+    frames, molecule = random_state(5, 2, 1)[0], branched_chain(5)
+    noise = torch.randn(2, *model.noise_shape(5), generator=torch.Generator().manual_seed(0))
+    counts = [model.next_chunk(frames, molecule, noise, solver=s, solver_steps=9).evaluations for s in model.solvers]
+    assert counts[:2] == [9.0, 9.0]
+    assert (counts[2] or 0.0) > 9.0
 
 
 def test_permuting_atoms_with_their_identifiers_permutes_the_frames() -> None:

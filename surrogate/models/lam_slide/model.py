@@ -76,14 +76,22 @@ class LamSlide(Surrogate):
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 20,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Surrogate.next_chunk`. Velocities play no part."""
-        interpolant = self.config.approximator.interpolant
+        solver = solver or self.solvers[0]
+        if solver in flow.ADAPTIVE and len(noise) > 1:
+            pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
+            rows = [self.next_chunk(x, molecule, n, solver_steps=solver_steps, solver=solver) for x, n in pairs]
+            mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
+            return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
+        c = self.config.approximator
         known = self.encode(last_frames_nm, molecule.elements)
-
-        memory = self.approximator.remember(known) if self.config.approximator.clean_conditioning else None
+        memory = self.approximator.remember(known) if c.clean_conditioning else None
+        evaluations = 0
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
+            nonlocal evaluations
+            evaluations += 1
             return self.approximator(o, tau, known, memory)
 
-        integrate = flow.SOLVERS[solver or self.solvers[0]]
-        latents = integrate(predict, noise, solver_steps, interpolant)
-        return Chunk(self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2]))
+        latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
+        frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
+        return Chunk(frames, evaluations=float(evaluations))

@@ -129,3 +129,29 @@ def test_one_multistep_lands_on_the_prediction_as_eulers_does() -> None:
     torch.testing.assert_close(flow.multistep(predict, noise, 1, "linear"), flow.euler(predict, noise, 1, "linear"))
     with pytest.raises(ValueError, match="gvp"):
         flow.multistep(predict, noise, 4, "gvp")
+
+
+@pytest.mark.parametrize("interpolant", ["linear", "gvp"])
+def test_adaptive_steps_carry_noise_to_the_data_distribution(interpolant: str) -> None:
+    """Linear in the noise: the ratio of the widths is exact but for the tolerance."""
+    noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    exact = gaussian_posterior(interpolant, 0.2)
+    calls = 0
+
+    def predict(o: Tensor, tau: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        return exact(o, tau)
+
+    def error(sample: Tensor) -> float:
+        return abs(float(sample.std() / noise.std()) / 0.2 - 1.0)
+
+    errors, counts = [], []
+    for n_steps in (20, 2000):
+        calls = 0
+        errors.append(error(flow.dopri5(predict, noise, n_steps, interpolant)))
+        counts.append(calls)
+    assert errors[0] < 0.01 and errors[1] < 1e-4, errors
+    assert 10 < counts[0] < counts[1] < 300, counts
+    # Negative control: as many even Euler steps as the finer took are further off.
+    assert error(flow.euler(exact, noise, counts[1], interpolant)) > 10 * errors[1]
