@@ -41,6 +41,10 @@ def reproduce(
         Path | None, typer.Option("--md17-ethanol", help="md17: an .npz of MD17's own ethanol to forecast as well.")
     ] = None,
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
+    solver_steps: Annotated[
+        int,
+        typer.Option("--solver-steps", min=1, help="LaM-SLidE's; 1 gives its mean forecast instead of samples."),
+    ] = 10,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="n-body: processes that simulate; one a core.")
     ] = None,
@@ -57,9 +61,10 @@ def reproduce(
     from surrogate.bench import reproduce as bodies
     from surrogate.bench import reproduce_molecules as molecules
     from surrogate.bench.molecule_methods import METHODS as MOLECULE_METHODS
-    from surrogate.bench.reproduce_methods import METHODS, SWITCHES, Settings, pick_device, without_switches
+    from surrogate.bench.reproduce_methods import METHODS, SWITCHES, Settings, without_switches
     from surrogate.bench.reproduce_molecules_data import MD17_MOLECULES
     from surrogate.progress import progress_bar
+    from surrogate.training.devices import choose_device
 
     of_molecules = name == molecules.NAME
     chosen = method or list(MOLECULE_METHODS if of_molecules else METHODS)
@@ -75,7 +80,8 @@ def reproduce(
         steps=steps,
         seed=seed,
         resume=resume,
-        device=pick_device(device),
+        device=choose_device(device),
+        solver_steps=solver_steps,
     )
     settings = without_switches(settings, SWITCHES if plain else without or [])
     shown = not (quiet or as_json)

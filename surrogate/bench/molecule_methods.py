@@ -174,7 +174,12 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
 
     switches = {"body frame": settings.canonical, "corrects the linear forecast": settings.extrapolate,
                 "any start": settings.any_start}  # fmt: skip
-    return FittedToMolecules(forecast, "ten frames, elements" + beyond(switches), seconds, n_parameters(model))
+    return FittedToMolecules(
+        forecast,
+        f"ten frames, elements, {settings.solver_steps} solver steps{beyond(switches)}",
+        seconds,
+        n_parameters(model),
+    )
 
 
 def lam_slide_model(*, large: bool) -> LamSlide:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.reproduce_errors import forecast_errors
-from systems.errors import InputError, UnknownNameError, nearest
+from systems.errors import UnknownNameError, nearest
 
 if TYPE_CHECKING:
     import torch
@@ -32,7 +32,8 @@ _BLOCK = 100
 
 @dataclass(frozen=True)
 class Settings:
-    """`budget_s` of wall time or `steps` for each method that is trained.
+    """`budget_s` of wall time or `steps` for each method that is trained. `solver_steps` of LaM-SLidE: a single one,
+    from noise straight to the predicted data, is the mean of what may come, nearer to what does come than a sample.
 
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames
     misses, each predicted frame in units of its own size, instead of absolute positions; `any_start`: EGNN learns from
@@ -87,17 +88,6 @@ def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
         from_velocity=settings.from_velocity and "from-velocity" not in without,
         canonical=settings.canonical and "canonical" not in without,
     )
-
-
-def pick_device(device: str) -> str:
-    """Return `device` or, for 'auto', cuda where there is one. Raises InputError for one that is not there."""
-    import torch
-
-    if device not in ("auto", "cpu", "cuda"):
-        raise UnknownNameError(f"unknown device {device!r}; known: auto, cpu, cuda.")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("no CUDA device here; use --device auto or cpu.")
-    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)
@@ -254,7 +244,9 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
         return np.stack([view.from_model(given, sample) for sample in seen_ahead])
 
     more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate})
-    return Fitted(forecast, f"positions, charges{more}", seconds, n_parameters(model))
+    return Fitted(
+        forecast, f"positions, charges, {settings.solver_steps} solver steps{more}", seconds, n_parameters(model)
+    )
 
 
 def sampled(

@@ -79,8 +79,9 @@ def all_pairs(n: int, pairs: Tensor) -> Graph:
 @dataclass(frozen=True)
 class PairForcesConfig:
     """`substeps` of the integrator between two frames: coarse ones for the first part of a training, whose losses they
-    keep smooth, finer ones for the second, which resolve close encounters; what is learned is a force, so forecasts may
-    be finer still. `velocity_frames`: given frames that the last one's velocity is found from."""
+    keep smooth; finer ones for the second part and for finding velocities, which resolve close encounters; what is
+    learned is a force, so forecasts may be finer still. `velocity_frames`: given frames that the last one's velocity is
+    found from."""
 
     width: int = 32
     lag_ps: float = 0.1
@@ -164,7 +165,7 @@ class PairForces(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """From velocities `start` at `before`: velocities there and at `last` of a motion that joins the two, and the
         distance by which it misses, `(b,)`."""
-        lag, n_substeps = self.config.lag_ps, self.config.forecast_substeps
+        lag, n_substeps = self.config.lag_ps, self.config.fine_substeps
         missed = torch.full(last.shape[:1], float("inf"), dtype=last.dtype, device=last.device)
         departure = arrival = start
         for _ in range(rounds):

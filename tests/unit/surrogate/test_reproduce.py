@@ -212,7 +212,7 @@ def test_pair_forces_are_the_true_law_when_given_it_and_keep_momentum(charges: P
 
 
 def test_the_velocity_of_a_pair_that_turns_between_two_frames_needs_more_than_two() -> None:
-    model = PairForces(PairForcesConfig(forecast_substeps=100)).double()
+    model = PairForces(PairForcesConfig(fine_substeps=100)).double()
     pairs = torch.zeros(1, 2, 2, dtype=torch.int64)
     x = torch.tensor([[[0.15, 0.0, 0.0], [-0.15, 0.0, 0.0]]]).double()
     v = torch.tensor([[[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]]).double()
