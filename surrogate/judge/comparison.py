@@ -30,6 +30,7 @@ from surrogate.judge.statistics import block_length, effective_samples, make_blo
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
 from surrogate.judge.survival import survival_charts
 from surrogate.judge.torsion_rows import other_torsion_rows
+from surrogate.judge.wasserstein_rows import wasserstein_rows
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
 from systems.errors import InputError
@@ -40,6 +41,7 @@ from systems.validity import Geometry
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
 ROOMS: tuple[Room, ...] = (
+    wasserstein_rows,
     shape_rows,
     other_torsion_rows,
     contact_rows,
