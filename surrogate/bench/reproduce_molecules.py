@@ -161,7 +161,7 @@ def table_lines(result: MoleculeReproduction) -> list[str]:
     ]
     for molecule in dict.fromkeys(row.molecule for row in result.rows):
         ours = [row for row in result.rows if row.molecule == molecule]
-        lines.append(f"{molecule}: {ours[0].n_windows:,} test windows, {ours[0].n_independent} of them independent")
+        lines.append(f"{molecule}: {ours[0].n_windows:,} test windows, {ours[0].n_independent} independent at best")
         published = PUBLISHED_MD17.get(molecule.removesuffix(" (MD17)"), {})
         lines += [f"  {method + ', published':<30}{ade:>9.3f} {fde:>28.3f}" for method, (ade, fde) in published.items()]
         lines += [f"  {row.method:<30}{row.ade!s:>27} {row.fde!s:>27}" for row in ours]
