@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import logging
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -109,11 +111,16 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     Each of its jobs holds `cores` worker processes of one thread. Raises InputError where dask-jobqueue is
     not installed or refuses an entry.
     """
+    on_ctrl_c = signal.getsignal(signal.SIGINT)
     try:
         # LocalCluster stands in its own module only.
         classes = importlib.import_module(f"dask_jobqueue.{spec.kind}")
     except ImportError:
         raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
+    finally:
+        # Importing dask-jobqueue makes Ctrl-C a silent success of the whole program.
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, on_ctrl_c)
     one_thread = [f"{name}={value}" for name, value in _ONE_THREAD.items()]
     python, prologue = spec.python, [*(f"export {entry}" for entry in one_thread), *spec.prologue]
     if spec.kind == "local":

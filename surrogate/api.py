@@ -202,8 +202,8 @@ def reference(
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
     `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
     (`systems(name)`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs,
-    3 Da, 100 ps of equilibration that is not written, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see
-    `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
+    3 Da, 100 ps of equilibration that is not written, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural
+    masses. `ph` to `drop_water`: see `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.replicas import replica_paths, simulate_replicas

@@ -73,6 +73,7 @@ def fork(work: Callable[[], object], note: Path) -> int:
     if child:
         return child
     status = FAILED
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
     try:
         work()
         status = 0

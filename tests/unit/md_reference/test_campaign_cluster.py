@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,17 @@ def test_one_worker_in_a_job_without_a_queue(tmp_path: Path) -> None:
     assert "#PBS -l walltime=01:00:00" in script
     assert "#PBS -q" not in script
     assert "--nthreads 1" in script
+
+
+def test_ctrl_c_stays_what_it_was(tmp_path: Path) -> None:
+    for name in [name for name in sys.modules if name.startswith("dask_jobqueue")]:
+        del sys.modules[name]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with job_cluster(ClusterSpec(kind="slurm"), tmp_path):
+            assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_local_jobs_start_without_a_shell(tmp_path: Path) -> None:
