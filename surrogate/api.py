@@ -584,6 +584,7 @@ def train(
     validation: Trajectories | None = None,
     time_reversal: bool = False,
     rare_draws: float = 0.0,
+    rare_kinds: bool = False,
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
@@ -600,9 +601,9 @@ def train(
     on; without any it is the last twentieth of each. A stretch of motion that would be both trained on and validated
     on is refused. `time_reversal` shows every other window backwards,
     right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
-    (surrogate.data.rarity). Beside `out`, a CSV holds the training curves and, until done, files the state that
-    `resume` goes on from; at the end the curves are drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by
-    torchrun (surrogate.training.devices).
+    (surrogate.data.rarity), `rare_kinds` also tells the network which, and learns how often each comes. Beside `out`, a
+    CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
+    drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
     from surrogate.trainings import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
@@ -624,6 +625,7 @@ def train(
         start_from=None if start_from is None else weights_path(start_from),
         time_reversal=time_reversal,
         rare_draws=rare_draws,
+        rare_kinds=rare_kinds,
         seed=seed,
         device=device,
         resume=resume,

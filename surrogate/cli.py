@@ -352,6 +352,9 @@ def train(
     rare_draws: Annotated[
         float, typer.Option("--rare-draws", help="Share of windows drawn for a rare state, weighted down by as much.")
     ] = 0.0,
+    rare_kinds: Annotated[
+        bool, typer.Option("--rare-kinds", help="Tell the network the rare state, and learn how often each comes.")
+    ] = False,
     device: DeviceOpt = "auto",
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
@@ -373,6 +376,7 @@ def train(
         validation=validation,
         time_reversal=time_reversal,
         rare_draws=rare_draws,
+        rare_kinds=rare_kinds,
         seed=seed,
         device=device,
         resume=resume,

@@ -35,6 +35,7 @@ class TrainingRequest:
     start_from: Path | None
     time_reversal: bool
     rare_draws: float
+    rare_kinds: bool
     seed: int
     device: str
     resume: bool
@@ -52,7 +53,8 @@ class TrainingRequest:
             if self.start_from is not None and self.config is not None:
                 raise InputError("--from takes the configuration of its weights; leave --config out.")
         else:
-            others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws}
+            others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws,
+                      "--rare-kinds": self.rare_kinds}  # fmt: skip
             self._refuse([k for k, v in others.items() if v], "does not know it")
 
     def _refuse(self, options: list[str], why: str) -> None:
@@ -101,6 +103,7 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         device=request.device,
         time_reversal=request.time_reversal,
         rare_draws=request.rare_draws,
+        rare_kinds=request.rare_kinds,
     )
     share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.rarity import window_sampler
+from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
@@ -52,6 +53,9 @@ class TrainingConfig:
     time_reversal: bool = False
     # Share of stage two's windows drawn for a rare state they show, weighted down by as much (data.rarity); 0 is plain.
     rare_draws: float = 0.0
+    # Tell the network which rare state a window visits, and learn the odds of each kind by themselves: rare windows
+    # then count as much as others and yet come as often as they should.
+    rare_kinds: bool = False
 
     def stages(self) -> tuple[StageConfig, StageConfig]:
         share = STAGE_ONE_SHARE
@@ -89,6 +93,12 @@ def train_lam_slide(
             f"{n_atoms} atoms need autoencoder.identifier_pool >= {n_atoms}, not "
             f"{model_config.autoencoder.identifier_pool}."
         )
+    length = model_config.approximator.chunk_frames
+    if config.rare_kinds and not model_config.approximator.rare_kinds:
+        told = replace(model_config.approximator, rare_kinds=rare_kinds(frames, length))
+        model_config = replace(model_config, approximator=told)
+    told_of = model_config.approximator.rare_kinds
+    kinds = window_kinds(frames, told_of, length) if told_of else None
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
@@ -106,14 +116,17 @@ def train_lam_slide(
         _check_start(start, frames, model_config)
         two = replace(config.stages()[1], budget_s=config.budget_s)
         spent_one = 0.0
-        model.load_state_dict(start.model.state_dict())
+        _take_over(model, start)
+    if kinds is not None and (start is None or not start.model.config.approximator.rare_kinds):
+        own = frames.window_starts(length, validation=False)
+        model.approximator.set_odds(np.bincount(kinds[own], minlength=len(told_of) + 1) / len(own))
 
     domain = training_domain(frames)
 
     def write(spent_s: float) -> None:
         save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s, start))
 
-    spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config)
+    spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config, kinds)
     if is_first_process():
         write(spent_two)
         for path in states:
@@ -183,12 +196,14 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
 
 
 def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
-               resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig) -> float:  # fmt: skip
+               resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig,
+               kinds: npt.NDArray[np.int64] | None) -> float:  # fmt: skip
     length = model.config.approximator.chunk_frames
     n_atoms, device = frames.scene.n_atoms, elements.device
-    sampler = window_sampler(frames, length, config.rare_draws)
+    sampler = window_sampler(frames, length, config.rare_draws, kinds)
     held = torch.from_numpy(frames.window_starts(length, validation=True))
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
+    held_kinds = None if kinds is None else torch.from_numpy(kinds)[held].to(device)
     model.autoencoder.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
@@ -208,10 +223,11 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
             return model.encode(x.to(device), elements)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        first, importance = sampler.draw(stage.batch, generator)
+        first, importance, kind = sampler.draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         batch = windows(first, generator, time_reversal=config.time_reversal)
-        return flow_loss(model, batch, n_atoms, tau, generator, importance=importance.to(device))
+        kind = None if kind is None else kind.to(device)
+        return flow_loss(model, batch, n_atoms, tau, generator, importance=importance.to(device), kind=kind)
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
@@ -219,7 +235,7 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
         generator = torch.Generator().manual_seed(0)
         tau = draw_flow_times(model, len(held), generator).to(device)
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
-            _, terms = flow_loss(model, windows(held, generator), n_atoms, tau, generator)
+            _, terms = flow_loss(model, windows(held, generator), n_atoms, tau, generator, kind=held_kinds)
         return {f"validation_{k}": float(v) for k, v in terms.items()}
 
     next_snapshot = [config.snapshot_every_s or float("inf")]
@@ -238,12 +254,21 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
     """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
     name, of = start.path.name, start.domain
-    if start.model.config != model_config:
+    # Weights that know no kinds may learn them.
+    told = start.model.config.approximator.rare_kinds or model_config.approximator.rare_kinds
+    same = replace(start.model.config, approximator=replace(start.model.config.approximator, rare_kinds=told))
+    if same != model_config:
         raise InputError(f"{name} has another configuration; a training goes on with the one it began with.")
     if of.scene.topology_hash != frames.scene.topology_hash:
         raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
     if not np.isclose(of.lag_ps, frames.lag_ps, rtol=1e-4):
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
+
+
+def _take_over(model: LamSlide, start: Weights) -> None:
+    """Load the tensors of `start`; what tells rare kinds may be new."""
+    missing, surplus = model.load_state_dict(start.model.state_dict(), strict=False)
+    assert not surplus and all(name.startswith(("approximator.embed_kind", "approximator.odds")) for name in missing)
 
 
 def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float,
@@ -252,6 +277,7 @@ def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float
         "seed": config.seed,
         "time_reversal": config.time_reversal,
         "rare_draws": config.rare_draws,
+        "rare_kinds": config.rare_kinds,
         "stage_one_s": round(spent_one, 1),
         "stage_two_s": round(spent_two, 1),
     }

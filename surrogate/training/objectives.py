@@ -65,10 +65,12 @@ def flow_loss(
     generator: torch.Generator,
     *,
     importance: Tensor | None = None,
+    kind: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames, plus decoded position and distance.
 
-    `importance` (b,): what each window counts (data.rarity); None is one each.
+    `importance` (b,): what each window counts (data.rarity); None is one each. With the `kind` (b,) of each window it
+    counts in the cross entropy of the kinds alone: the network is told the kind, and within a kind draws are plain.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
@@ -78,15 +80,19 @@ def flow_loss(
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
-    prediction = model.approximator(alpha * latents + sigma * noise, tau, known)[:, c.n_conditioning :]
+    prediction = model.approximator(alpha * latents + sigma * noise, tau, known, kind=kind)[:, c.n_conditioning :]
     target = latents[:, c.n_conditioning :]
     weight = torch.ones_like(tau)
     if c.precondition:
         weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
-    if importance is not None:
+    if importance is not None and kind is None:
         weight = weight * importance
     loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
     terms = {"flow": loss.detach()}
+    if kind is not None:
+        each = F.cross_entropy(model.approximator.kind_logits(known), kind, reduction="none")
+        odds = each.mean() if importance is None else (each * importance).mean()
+        loss, terms["kind"] = loss + odds, odds.detach()
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm

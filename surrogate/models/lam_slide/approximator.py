@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -59,6 +61,13 @@ class Approximator(nn.Module):
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
         self.final = nn.Linear(c.width, latent_dim)
+        if c.n_kinds:
+            if c.n_conditioning < 1:
+                raise InputError("rare_kinds need a conditioning frame, from which the odds of each kind follow.")
+            self.embed_kind = nn.Embedding(c.n_kinds + 1, c.width)
+            nn.init.zeros_(self.embed_kind.weight)
+            n_in = c.n_conditioning * n_latents * latent_dim
+            self.odds = nn.Sequential(nn.Linear(n_in, c.width), nn.SiLU(), nn.Linear(c.width, c.n_kinds + 1))
         for module in (self.modulation, self.final_modulation, self.final):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
@@ -68,21 +77,49 @@ class Approximator(nn.Module):
             self.register_buffer(f"cos_{name}", angles.cos(), persistent=False)
             self.register_buffer(f"sin_{name}", angles.sin(), persistent=False)
 
-    def forward(self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None) -> Tensor:
+    @torch.no_grad()
+    def set_odds(self, shares: Sequence[float] | npt.NDArray[np.float64]) -> None:
+        """Begin with the same odds `shares` (n_kinds + 1,) after every frame."""
+        last = self.odds[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        last.bias.copy_(torch.tensor(shares).clamp(min=1e-9).log())
+
+    def kind_logits(self, conditioning: Tensor) -> Tensor:
+        """Return the log-odds `(b, n_kinds + 1)` of the kinds of window that may follow; 0 is the ordinary one."""
+        with torch.autocast(conditioning.device.type, enabled=False):
+            logits: Tensor = self.odds(conditioning.flatten(1).float())
+        return logits
+
+    def draw_kinds(self, conditioning: Tensor, noise: Tensor) -> Tensor | None:
+        """Return the kind `(b,)` of each window, drawn from its odds by a number of `noise` that nothing else uses.
+
+        The noise `(b, T, L, dim)` of the conditioning frames is replaced by their clean latents. None without kinds.
+        """
+        if not self.config.n_kinds:
+            return None
+        uniform = torch.special.ndtr(noise[:, 0, 0, 0].double())
+        upper = self.kind_logits(conditioning).double().softmax(-1).cumsum(-1)
+        return (uniform[:, None] >= upper).sum(-1).clamp(max=self.config.n_kinds)
+
+    def forward(
+        self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, kind: Tensor | None = None
+    ) -> Tensor:
         """Return the predicted data `(b, T, L, dim)`.
 
         `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
         first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
         `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once.
+        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds.
         """
         c = self.config
+        told = None if kind is None else self.embed_kind(kind)[:, None, None, :]
         if c.clean_conditioning:
             known = self.remember(conditioning) if memory is None else memory
             n_known = conditioning.shape[1]
-            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, tau, known, n_known))
+            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, tau, known, n_known, told))
             return torch.cat([conditioning.to(found.dtype), found], dim=1)
-        return self._denoise(o, tau, lambda x: self._network(x, tau, conditioning))
+        return self._denoise(o, tau, lambda x: self._network(x, tau, conditioning, told))
 
     def remember(self, conditioning: Tensor) -> Memory:
         """Return keys and values of clean frames `(b, n_conditioning, L, dim)`, which see each other alone and no flow
@@ -103,7 +140,7 @@ class Approximator(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
         return skip * o + out * network(o * scale_in)
 
-    def _network(self, o: Tensor, tau: Tensor, conditioning: Tensor) -> Tensor:
+    def _network(self, o: Tensor, tau: Tensor, conditioning: Tensor, told: Tensor | None) -> Tensor:
         shape = o.shape
         o, conditioning = self._tokens(o), self._tokens(conditioning)
         n_known, n_frames = conditioning.shape[1], o.shape[1]
@@ -113,10 +150,12 @@ class Approximator(nn.Module):
         noisy = torch.where(known[None, :, None, None] == 1, 0.0, o)
         h = self.embed_noisy(noisy) + self.embed_conditioning(padded)
         h = h + self.embed_mask(known)[None, :, None, :] + self.embed_latent
+        h = h if told is None else h + told
         return self._transform(h, tau, 0, [None] * len(self.layers)).reshape(shape)
 
-    def _network_after(self, o: Tensor, tau: Tensor, memory: Memory, n_known: int) -> Tensor:
+    def _network_after(self, o: Tensor, tau: Tensor, memory: Memory, n_known: int, told: Tensor | None) -> Tensor:
         h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
+        h = h if told is None else h + told
         return self._transform(h, tau, n_known, memory).reshape(o.shape)
 
     def _transform(self, h: Tensor, tau: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surrogate.models.lam_slide.kinds import Kind
 from surrogate.models.settings import build, read_toml
 
 
@@ -56,6 +57,12 @@ class ApproximatorConfig:
     position_weight: float = 0.25
     distance_weight: float = 0.25
     auxiliary_frames: int = 4
+    # Kinds of rare windows that the network is told of and a head gives the odds of (data.rarity).
+    rare_kinds: tuple[Kind, ...] = ()
+
+    @property
+    def n_kinds(self) -> int:
+        return len(self.rare_kinds)
 
 
 @dataclass(frozen=True)
@@ -75,9 +82,11 @@ class LamSlideConfig:
     def from_dict(record: dict[str, Any]) -> LamSlideConfig:
         """Raises InputError for an unknown key, naming the nearest."""
         record = dict(record)
+        approximator = dict(record.pop("approximator", {}))
+        approximator["rare_kinds"] = tuple(Kind.of(k) for k in approximator.pop("rare_kinds", ()))
         sub = {
             "autoencoder": build(AutoencoderConfig, record.pop("autoencoder", {}), "autoencoder."),
-            "approximator": build(ApproximatorConfig, record.pop("approximator", {}), "approximator."),
+            "approximator": build(ApproximatorConfig, approximator, "approximator."),
         }
         return build(LamSlideConfig, {**record, **sub}, "")
 

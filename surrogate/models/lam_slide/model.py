@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch
@@ -12,6 +13,10 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.approximator import Approximator
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.kinds import kinds_of_windows
+
+# Of a chunk that is not of the kind that was drawn.
+MAX_REDRAWS = 40
 
 
 class LamSlide(Surrogate):
@@ -22,7 +27,7 @@ class LamSlide(Surrogate):
     """
 
     arch: ClassVar[str] = "lam-slide"
-    float32_layers: ClassVar[tuple[str, ...]] = ("autoencoder.to_position",)
+    float32_layers: ClassVar[tuple[str, ...]] = ("autoencoder.to_position", "approximator.odds")
     config: LamSlideConfig
     latent_mean: Tensor
     latent_scale: Tensor
@@ -84,14 +89,51 @@ class LamSlide(Surrogate):
             return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
         c = self.config.approximator
         known = self.encode(last_frames_nm, molecule.elements)
-        memory = self.approximator.remember(known) if c.clean_conditioning else None
-        evaluations = 0
+        kind = self.approximator.draw_kinds(known, noise)
+        evaluations = 0.0
 
-        def predict(o: Tensor, tau: Tensor) -> Tensor:
-            nonlocal evaluations
-            evaluations += 1
-            return self.approximator(o, tau, known, memory)
+        def solve(rows: Tensor, noise: Tensor) -> Tensor:
+            told = None if kind is None else kind[rows]
+            before = known[rows]
+            memory = self.approximator.remember(before) if c.clean_conditioning else None
 
-        latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
-        frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
-        return Chunk(frames, evaluations=float(evaluations))
+            def predict(o: Tensor, tau: Tensor) -> Tensor:
+                nonlocal evaluations
+                evaluations += len(rows) / len(known)
+                return self.approximator(o, tau, before, memory, told)
+
+            latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
+            return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
+
+        frames = solve(torch.arange(len(noise), device=noise.device), noise)
+        if kind is not None:
+            self._hold_to_kinds(frames, last_frames_nm, kind, noise, solve)
+        return Chunk(frames, evaluations=evaluations)
+
+    def _hold_to_kinds(self, frames: Tensor, last_frames_nm: Tensor, kind: Tensor, noise: Tensor,
+                       solve: Callable[[Tensor, Tensor], Tensor]) -> None:  # fmt: skip
+        """Draw the rows of `frames` (b, n_new, n_atoms, 3) that are not of their `kind` again, up to MAX_REDRAWS times.
+
+        What remains of each kind is a plain draw given that kind (rejection sampling), so that rare states are entered
+        and left as often as the odds say, however loosely the network follows what it was told.
+        """
+        kinds = self.config.approximator.rare_kinds
+        rows = torch.arange(len(frames), device=frames.device)
+        for attempt in range(MAX_REDRAWS + 1):
+            windows = torch.cat([last_frames_nm[rows].to(frames.dtype), frames[rows]], dim=1).float().cpu().numpy()
+            wrong = torch.from_numpy(kinds_of_windows(windows, kinds)).to(kind.device) != kind[rows]
+            rows = rows[wrong]
+            if attempt == MAX_REDRAWS or not len(rows):
+                return
+            frames[rows] = solve(rows, _further_noise(noise[rows], attempt)).to(frames.dtype)
+
+
+def _further_noise(noise: Tensor, attempt: int) -> Tensor:
+    """Return other noise of the shape of `noise` (b, T, L, dim), each row's from numbers of its own that nothing else
+    uses, so that a row does not depend on those beside it."""
+    fresh = []
+    for row in noise:
+        low, high = row[0].flatten()[1:3].float().cpu().view(torch.int32).tolist()
+        seed = ((low & 0xFFFFFFFF) << 31) ^ ((high & 0xFFFFFFFF) << 8) ^ attempt
+        fresh.append(torch.randn(row.shape, generator=torch.Generator().manual_seed(seed)))
+    return torch.stack(fresh).to(noise)
