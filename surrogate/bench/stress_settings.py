@@ -74,8 +74,11 @@ def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> lis
             torch.set_num_threads(threads)
     if compiled:
         fast = copy.deepcopy(model)
-        for name, child in list(fast.named_children()):
-            setattr(fast, name, torch.compile(child))
+        lists = [child for child in fast.children() if isinstance(child, torch.nn.ModuleList)]
+        for parent in (fast, *lists):
+            for name, child in list(parent.named_children()):
+                if child not in lists:
+                    setattr(parent, name, torch.compile(child))
         add("fp32, compiled", lambda: inputs.chunk(fast, torch.float32))
     return rows
 

@@ -117,13 +117,12 @@ class ChunkSampler:
     def _draw(self, last_frames_nm: FloatArray, seeds: Sequence[int], velocities: FloatArray | None) -> Drawn:
         kind = last_frames_nm.dtype
         last = last_frames_nm.astype(np.float64)
-        n_replicas, _, n_atoms, _ = last.shape
-        if self._model.canonical:
-            # One rigid motion per replica, that of its last frame, carried back onto the new frames.
-            rotation, translation = superposition(last[:, -1], self._target, idx=self._fit)
-        else:
-            rotation = np.broadcast_to(np.eye(3), (n_replicas, 3, 3))
-            translation = -last[:, -1].mean(axis=1)
+        n_atoms = last.shape[2]
+        # One rigid motion per replica, that of its last frame, carried back onto the new frames. A model that needs no
+        # canonical pose gets its orientation all the same: what the noise draws (velocities) turns with the molecule.
+        rotation, translation = superposition(last[:, -1], self._target, idx=self._fit)
+        if not self._model.canonical:
+            translation = -np.einsum("rij,rj->ri", rotation, last[:, -1].mean(axis=1))
         canonical = np.einsum("rij,rtnj->rtni", rotation, last) + translation[:, None, None, :]
         noise = draw_noise(self._model, n_atoms, [torch.Generator().manual_seed(seed) for seed in seeds])
         turned = None if velocities is None else np.einsum("rij,rnj->rni", rotation, velocities)
