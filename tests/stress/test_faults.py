@@ -69,11 +69,13 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Sce
 
 def fork(work: Callable[[], object], note: Path) -> int:
     """Run `work` in a process of its own; return its id. It exits with 0, 130 (Ctrl-C) or 1, its error in `note`."""
+    # A shell starts background jobs with SIGINT ignored; the child must heed it from its first moment on.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     child = os.fork()
     if child:
+        signal.signal(signal.SIGINT, before)
         return child
     status = FAILED
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
     try:
         work()
         status = 0
