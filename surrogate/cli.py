@@ -16,52 +16,32 @@ from surrogate.cli_options import (
     Atoms,
     AtomsOpt,
     DeviceOpt,
-    DropLigandOpt,
-    DropWaterOpt,
     EnergyEveryOpt,
-    EnsembleOpt,
-    EquilibrateOpt,
-    ForceFieldOpt,
     ForceOpt,
-    FrictionOpt,
     Guard,
     GuardOpt,
-    HydrogenMassOpt,
-    IonicStrengthOpt,
     JsonOpt,
-    KeepLigandOpt,
-    LevelOpt,
     MdBetweenOpt,
     OverwriteOpt,
-    PaddingOpt,
-    PhOpt,
-    PlatformOpt,
     Precision,
-    PressureOpt,
     QuietOpt,
-    ReplicasOpt,
     ResumeOpt,
     SaveForcesOpt,
     SaveVelocitiesOpt,
     SceneArg,
     SeedOpt,
     SelectOpt,
-    SolventOpt,
     Solver,
-    TemperatureOpt,
-    TimestepOpt,
     ValidationOpt,
     VelocitiesOpt,
     WantedTemperatureOpt,
-    parse_hydrogen_mass_da,
+    spread_options,
 )
 from surrogate.cli_printing import print_comparison, print_json, print_library, print_pairs, print_written
 from surrogate.cli_reproduce import reproduce
+from surrogate.md_options import MDOptions, Preparation, Replicas
 from systems.errors import SurromdError
 from systems.units import (
-    parse_length_nm,
-    parse_molar,
-    parse_rate_per_ps,
     parse_temperature_k,
     parse_time_ps,
     parse_wall_s,
@@ -161,54 +141,18 @@ def systems(
 
 
 @app.command()
+@spread_options
 def plan(
     scene: SceneArg,
+    *,
     time: Annotated[str | None, typer.Option("--time", help="Estimate the wall time of a run this long.")] = None,
-    force_field: ForceFieldOpt = None,
-    solvent: SolventOpt = None,
-    level: LevelOpt = None,
-    padding: PaddingOpt = None,
-    ionic_strength: IonicStrengthOpt = None,
-    temperature: TemperatureOpt = None,
-    friction: FrictionOpt = None,
-    timestep: TimestepOpt = None,
-    hydrogen_mass: HydrogenMassOpt = None,
-    equilibrate: EquilibrateOpt = None,
-    ensemble: EnsembleOpt = None,
-    pressure: PressureOpt = None,
-    replicas: ReplicasOpt = 1,
-    platform: PlatformOpt = "auto",
-    ph: PhOpt = 7.0,
-    keep_ligand: KeepLigandOpt = False,
-    drop_ligand: DropLigandOpt = False,
-    drop_water: DropWaterOpt = False,
+    options: MDOptions,
     as_json: JsonOpt = False,
 ) -> None:
     """What a reference run of SCENE will do, what it skips, why, and what that saves."""
     from surrogate import api
 
-    account = api.plan(
-        scene,
-        force_field=force_field,
-        solvent=solvent,
-        level=level,
-        padding_nm=None if padding is None else parse_length_nm(padding, "--padding"),
-        ionic_strength_molar=None if ionic_strength is None else parse_molar(ionic_strength, "--ionic-strength"),
-        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
-        friction_per_ps=None if friction is None else parse_rate_per_ps(friction, "--friction"),
-        timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
-        equilibrate_ps=None if equilibrate is None else parse_time_ps(equilibrate, "--equilibrate"),
-        ensemble=ensemble,
-        pressure_bar=pressure,
-        replicas=replicas,
-        platform=platform,
-        ph=ph,
-        keep_ligand=keep_ligand,
-        drop_ligand=drop_ligand,
-        drop_water=drop_water,
-        time_ps=None if time is None else parse_time_ps(time, "--time"),
-    )
+    account = api.plan(scene, time_ps=None if time is None else parse_time_ps(time, "--time"), **options)
     if as_json:
         print_json(account)
     else:
@@ -216,31 +160,16 @@ def plan(
 
 
 @app.command()
+@spread_options
 def reference(
     scene: SceneArg,
+    *,
     time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
     save_every: Annotated[
         str | None, typer.Option("--save-every", help="Interval between saved frames. [default: 1ps]")
     ] = None,
-    force_field: ForceFieldOpt = None,
-    solvent: SolventOpt = None,
-    level: LevelOpt = None,
-    padding: PaddingOpt = None,
-    ionic_strength: IonicStrengthOpt = None,
-    temperature: TemperatureOpt = None,
-    friction: FrictionOpt = None,
-    timestep: TimestepOpt = None,
-    hydrogen_mass: HydrogenMassOpt = None,
-    equilibrate: EquilibrateOpt = None,
-    ensemble: EnsembleOpt = None,
-    pressure: PressureOpt = None,
-    replicas: ReplicasOpt = 1,
-    platform: PlatformOpt = "auto",
-    ph: PhOpt = 7.0,
-    keep_ligand: KeepLigandOpt = False,
-    drop_ligand: DropLigandOpt = False,
-    drop_water: DropWaterOpt = False,
+    options: MDOptions,
     save_velocities: SaveVelocitiesOpt = False,
     save_forces: SaveForcesOpt = False,
     seed: SeedOpt = 0,
@@ -257,30 +186,13 @@ def reference(
         out,
         time_ps=parse_time_ps(time, "--time"),
         save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
-        force_field=force_field,
-        solvent=solvent,
-        level=level,
-        padding_nm=None if padding is None else parse_length_nm(padding, "--padding"),
-        ionic_strength_molar=None if ionic_strength is None else parse_molar(ionic_strength, "--ionic-strength"),
-        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
-        friction_per_ps=None if friction is None else parse_rate_per_ps(friction, "--friction"),
-        timestep_ps=None if timestep is None else parse_time_ps(timestep, "--timestep"),
-        hydrogen_mass_da="default" if hydrogen_mass is None else parse_hydrogen_mass_da(hydrogen_mass),
-        equilibrate_ps=None if equilibrate is None else parse_time_ps(equilibrate, "--equilibrate"),
-        ensemble=ensemble,
-        pressure_bar=pressure,
-        replicas=replicas,
-        platform=platform,
-        ph=ph,
-        keep_ligand=keep_ligand,
-        drop_ligand=drop_ligand,
-        drop_water=drop_water,
         save_velocities=save_velocities,
         save_forces=save_forces,
         seed=seed,
         resume=resume,
         overwrite=overwrite,
         quiet=quiet,
+        **options,
     )
     print_written(written, as_json, quiet)
 
@@ -390,15 +302,17 @@ def train(
 
 
 @app.command()
+@spread_options
 def rollout(
     scene: SceneArg,
+    *,
     weights: Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")],
     time: Annotated[str, typer.Option("--time", help="Simulated time, such as 100ns.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
     save_every: Annotated[
         str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
     ] = None,
-    replicas: ReplicasOpt = 1,
+    replicas: Replicas = 1,
     solver: Annotated[Solver | None, typer.Option("--solver", help="Default: the one that suits the weights.")] = None,
     solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
     precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
@@ -409,10 +323,7 @@ def rollout(
     atoms: AtomsOpt = Atoms.all,
     force: ForceOpt = False,
     temperature: WantedTemperatureOpt = None,
-    ph: PhOpt = 7.0,
-    keep_ligand: KeepLigandOpt = False,
-    drop_ligand: DropLigandOpt = False,
-    drop_water: DropWaterOpt = False,
+    preparation: Preparation,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
@@ -429,10 +340,6 @@ def rollout(
         time_ps=parse_time_ps(time, "--time"),
         save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
         replicas=replicas,
-        ph=ph,
-        keep_ligand=keep_ligand,
-        drop_ligand=drop_ligand,
-        drop_water=drop_water,
         seed=seed,
         solver=None if solver is None else solver.value,
         solver_steps=solver_steps,
@@ -447,6 +354,7 @@ def rollout(
         resume=resume,
         overwrite=overwrite,
         quiet=quiet,
+        **preparation,
     )
     print_written(written, as_json, quiet)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints, is_typeddict
 
 import typer
 
-from systems.units import parse_mass_da
+from surrogate.md_options import Flag, flags_of
 
 
 class Solver(StrEnum):
@@ -38,38 +41,6 @@ class Atoms(StrEnum):
 SceneArg = Annotated[
     str, typer.Argument(metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.")
 ]
-PhOpt = Annotated[float, typer.Option("--ph", min=0.0, max=14.0, help="Where a peptide's hydrogens are added.")]
-KeepLigandOpt = Annotated[bool, typer.Option("--keep-ligand", help="Simulate ligands and ions beside a peptide, too.")]
-DropLigandOpt = Annotated[bool, typer.Option("--drop-ligand", help="Leave ligands and ions beside a peptide out.")]
-DropWaterOpt = Annotated[bool, typer.Option("--drop-water", help="Leave the file's waters out.")]
-# What a verb is not told comes from the protocol of a library scene, else from what the help calls the default.
-ForceFieldOpt = Annotated[
-    str | None,
-    typer.Option("--force-field", help="ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb. [default: auto]"),
-]
-SolventOpt = Annotated[
-    str | None, typer.Option("--solvent", help="obc2, gbn2, tip3p, opc, vacuum, amber99-obc. [default: auto]")
-]
-LevelOpt = Annotated[
-    str | None, typer.Option("--level", help="mm or gfn2-xtb, quantum mechanics for molecules. [default: mm]")
-]
-PaddingOpt = Annotated[
-    str | None, typer.Option("--padding", help="From the solute to the walls, in explicit water. [default: 1nm]")
-]
-IonicStrengthOpt = Annotated[
-    str | None, typer.Option("--ionic-strength", help="Of NaCl in explicit water, beside counter-ions. [default: 0M]")
-]
-TemperatureOpt = Annotated[str | None, typer.Option("--temperature", help="Of the bath. [default: 300K]")]
-FrictionOpt = Annotated[str | None, typer.Option("--friction", help="Of the Langevin bath. [default: 1/ps]")]
-TimestepOpt = Annotated[str | None, typer.Option("--timestep", help="Integration step. [default: 4fs]")]
-HydrogenMassOpt = Annotated[
-    str | None, typer.Option("--hydrogen-mass", help="Repartitioned mass, or 'natural'. [default: 3Da]")
-]
-EquilibrateOpt = Annotated[
-    str | None, typer.Option("--equilibrate", help="So long before the first frame, unwritten. [default: 100ps]")
-]
-EnsembleOpt = Annotated[str | None, typer.Option("--ensemble", help="nvt, nve or npt. [default: nvt]")]
-PressureOpt = Annotated[float | None, typer.Option("--pressure", help="Of the barostat (npt), in bar. [default: 1]")]
 SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep them with each frame (.h5).")]
 SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them with each frame (.h5).")]
 ArchOpt = Annotated[
@@ -85,9 +56,6 @@ ValidationOpt = Annotated[
     typer.Option("--validation", help="Trajectory held out whole; repeatable. Default: the last 5 % of each."),
 ]
 DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
-ReplicasOpt = Annotated[
-    int, typer.Option("--replicas", min=1, help="Independent runs; NAME.h5 becomes NAME_r0.h5, ...")
-]
 GuardOpt = Annotated[
     Guard,
     typer.Option("--guard", help="Frames that no reference shows: mark; draw again; relax by OpenMM; MD instead."),
@@ -102,7 +70,6 @@ ForceOpt = Annotated[bool, typer.Option("--force", help="Roll a scene that leave
 WantedTemperatureOpt = Annotated[
     str | None, typer.Option("--temperature", help="Refused if it is not that of the weights.")
 ]
-PlatformOpt = Annotated[str, typer.Option("--platform", help="OpenMM platform; auto: the fastest, timed on the scene.")]
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
 ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
 OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
@@ -110,6 +77,43 @@ QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, 
 JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
-def parse_hydrogen_mass_da(text: str) -> float | None:
-    """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
-    return None if text in ("natural", "none") else parse_mass_da(text, "--hydrogen-mass")
+def spread_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with one option of the command line for each of what surrogate.md_options writes once.
+
+    A parameter that is a TypedDict of such options becomes all of them, in its place, and is given as a dictionary of
+    their values in our units; one that is a single such option becomes that.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    shown: list[inspect.Parameter] = []
+    grouped: dict[str, dict[str, Flag]] = {}
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        if is_typeddict(hint):
+            found = flags_of(hint)
+            grouped[parameter.name] = {name: flag for name, (_, flag) in found.items()}
+            shown += [_parameter(name, kind, flag) for name, (kind, flag) in found.items()]
+        elif isinstance(flag := getattr(hint, "__metadata__", [None])[0], Flag):
+            shown.append(_parameter(parameter.name, hint.__origin__, flag))
+        else:
+            shown.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        for name, flags in grouped.items():
+            given[name] = {option: flag.value(given.pop(option)) for option, flag in flags.items()}
+        command(**given)
+
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return run
+
+
+def _parameter(name: str, kind: Any, flag: Flag) -> inspect.Parameter:
+    """Return an option as typer takes it."""
+    if flag.read is not None:
+        kind, default = str | None, None
+    else:
+        default = flag.default
+    option = typer.Option(flag.flag, help=flag.help, min=flag.least, max=flag.most)
+    annotation = Annotated[kind, option]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

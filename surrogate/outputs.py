@@ -10,6 +10,9 @@ from pathlib import Path
 from systems.errors import InputError, StorageError, SurromdError
 from systems.manifest import campaign_folder, campaign_trajectories
 
+PathLike = str | Path
+# A file, a folder, a glob, a comma-separated list, or a sequence of these: replicas of each other.
+Trajectories = PathLike | Sequence[PathLike]
 TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
 
 
@@ -106,7 +109,7 @@ def _family(path: Path) -> list[Path]:
     return members
 
 
-def find_trajectories(spec: str | Path | Sequence[str | Path], *, verify: bool = False) -> list[Path]:
+def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]:
     """Return the files that a user means by a path, a folder, a glob pattern, a comma-separated list or a sequence.
 
     A folder stands for the trajectories in it (HDF5 before DCD, if it holds both); one of a campaign, or within it, for

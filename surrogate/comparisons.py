@@ -1,0 +1,90 @@
+"""The judge as a verb: files in, a comparison and its report out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surrogate.judge.comparison import Comparison
+    from systems.scene import Scene
+
+
+def compare(
+    reference: Trajectories,
+    candidates: Sequence[Trajectories],
+    out_html: PathLike | None = None,
+    *,
+    replicate: Trajectories | None = None,
+    top: PathLike | None = None,
+    lag_ps: float | None = None,
+    labels: Sequence[str] | None = None,
+    energies: bool = False,
+) -> Comparison:
+    """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
+
+    The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
+    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other. `top`: topology for
+    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. `energies`:
+    judge the potential energy of every k-th frame too, by the force field that the reference's file names.
+    Raises InputError, TrajectoryError, OutOfDomainError.
+    """
+    from surrogate.judge.comparison import compare as judge
+    from surrogate.judge.ensemble import load_ensemble
+
+    if not candidates:
+        raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
+    if labels is not None and len(labels) != len(candidates):
+        raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
+    if out_html is not None:
+        check_outputs([Path(out_html)], [".html"], overwrite=True)
+    truth = load_ensemble(find_trajectories(reference), top=top, lag_ps=lag_ps)
+    others = [
+        load_ensemble(
+            find_trajectories(candidate),
+            label=labels[k] if labels else None,
+            template=truth.scene,
+            top=top,
+            lag_ps=lag_ps,
+        )
+        for k, candidate in enumerate(candidates)
+    ]
+    floor = None
+    if replicate is not None:
+        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=top, lag_ps=lag_ps)
+    energy_fn = _relaxed_energy(truth.scene, truth.record) if energies else None
+    result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
+    if out_html is not None:
+        from surrogate.judge.report import write_report
+
+        write_report(result, Path(out_html))
+    return result
+
+
+def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
+    """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
+    from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+    from md_reference.relaxation import Relaxer
+    from systems.errors import SimulationError
+
+    name, solvent = record.get("force_field"), record.get("solvent")
+    if name is None or solvent is None:
+        raise InputError("--energies: the reference's file does not say with which force field it was made.")
+    spec = resolve(scene, ForceFieldSpec(name, solvent, record.get("hydrogen_mass_da")))
+    relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
+
+    def energy(positions_nm: npt.NDArray[np.float64]) -> float:
+        try:
+            return relaxer.relax(positions_nm).potential_kj_mol
+        except SimulationError:
+            return math.inf
+
+    return energy

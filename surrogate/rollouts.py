@@ -1,0 +1,96 @@
+"""Surrogate rollouts as a verb."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Unpack
+
+from surrogate.data.shipped import weights_path
+from surrogate.md_options import Preparation, takes
+from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, guarded_outputs
+from surrogate.progress import progress_bar
+from surrogate.scenes import prepare_scene
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
+
+
+@takes(Preparation)
+def rollout(
+    scene: str | Scene,
+    weights: str | Path,
+    out: str | Path,
+    *,
+    time_ps: float,
+    save_every_ps: float | None = None,
+    replicas: int = 1,
+    seed: int = 0,
+    solver: str | None = None,
+    solver_steps: int | None = None,
+    precision: str = "auto",
+    guard: str = "flag",
+    energy_every: int = 0,
+    md_between_ps: float = 0.0,
+    select: str | None = None,
+    atoms: str = "all",
+    force: bool = False,
+    temperature_k: float | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+    **preparation: Unpack[Preparation],
+) -> list[Path]:
+    """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
+
+    `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
+    the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
+    run in one batch and are named as by `reference`. `solver`: 'multistep', 'euler' or the adaptive 'dopri5', None for
+    the one that suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
+
+    Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
+    that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
+    MD from the last valid frame ('off': marked, and nothing stops the run). The energy of every `energy_every`-th frame
+    is checked after stiff bonds are relaxed. `md_between_ps` of real MD follow each chunk. What was done stands in the
+    record (`interventions`) and in a column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy')
+    say which atoms are written. `force` rolls a scene that leaves the training domain where that is possible.
+    `temperature_k` is refused unless it is that of the weights. `ph` to `drop_water`: see `systems.prepare.prepare`.
+    Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
+    guard cannot bring a chunk through), StorageError.
+    """
+    from md_reference.replicas import replica_paths
+
+    outs = replica_paths(Path(out), replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
+    file = weights_path(weights)
+    molecule = prepare_scene(scene, preparation, quiet=quiet)
+
+    from surrogate.data.weights import load_weights
+    from surrogate.sampling.rollout import RolloutConfig
+    from surrogate.sampling.rollout import rollout as roll
+
+    config = RolloutConfig(
+        time_ps=time_ps,
+        save_every_ps=save_every_ps,
+        seed=seed,
+        solver=solver,
+        precision=precision,
+        guard=guard,
+        energy_every=energy_every,
+        md_between_ps=md_between_ps,
+        select=select,
+        atoms=atoms,
+        force=force,
+        temperature_k=temperature_k,
+    )
+    if solver_steps is not None:
+        config = replace(config, solver_steps=solver_steps)
+    loaded = load_weights(file)
+    label = f"surrogate {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
+    saved_ps = loaded.domain.lag_ps if save_every_ps is None else save_every_ps
+    with (
+        guarded_outputs(outs, resumable="the same command with --resume goes on"),
+        # The verb counts the frames of one replica; all advance together.
+        progress_bar(label, quiet=quiet, ps_per_frame=saved_ps * replicas) as progress,
+    ):
+        return roll(molecule, loaded, outs, config, resume=resume, overwrite=overwrite, progress=progress)

@@ -1,0 +1,80 @@
+"""Scenes: what the library holds, and what is made of the name or file that a user gives."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from surrogate.md_options import Preparation
+    from systems.scene import Scene
+
+
+def systems(name: str | None = None) -> list[dict[str, Any]]:
+    """Return what the library holds: one record per named scene, or the one asked for, with its protocol and atoms.
+
+    Raises UnknownNameError (with the nearest name).
+    """
+    from systems import library
+
+    if name is not None:
+        return [_describe(name, whole=True)]
+    groups = library.groups()
+    return [_describe(each, whole=False) | {"group": group} for group in groups for each in groups[group]]
+
+
+def _describe(name: str, *, whole: bool) -> dict[str, Any]:
+    from systems import library
+
+    scene = library.load(name)
+    record: dict[str, Any] = {
+        "name": name,
+        "title": library.describe(name),
+        "n_atoms": scene.n_atoms,
+        "formula": scene.formula,
+    }
+    if whole:
+        from systems.chemistry import backbone_torsions
+
+        record |= {
+            "n_bonds": len(scene.bonds),
+            "residues": list(scene.residue_names),
+            "atoms": list(scene.atom_names),
+            "mass_da": float(scene.masses_da.sum()),
+            "charge_e": int(scene.formal_charges.sum()),
+            "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
+            "topology_hash": scene.topology_hash,
+            "molecule_key": scene.molecule_key,
+            "protocol": {k: "natural" if v is None else v for k, v in library.protocol(name).items()},
+            "protocol_source": library.protocol_source(name),
+        }
+        if scene.interactions is not None:
+            record["law"] = scene.interactions
+    return record
+
+
+def prepare_scene(scene: str | Scene, options: Preparation, *, quiet: bool) -> Scene:
+    """Return a Scene for what a user may write; what had to be repaired is said on stderr.
+
+    Raises what `systems.prepare.prepare` raises.
+    """
+    if not isinstance(scene, str):
+        return scene
+    from systems.prepare import prepare
+
+    prepared = prepare(
+        scene,
+        ph=options["ph"],
+        keep_ligand=options["keep_ligand"],
+        drop_ligand=options["drop_ligand"],
+        drop_water=options["drop_water"],
+    )
+    if not quiet:
+        for line in prepared.provenance.get("repairs", []):
+            tell(scene, line)
+    return prepared
+
+
+def tell(name: str, line: str) -> None:
+    """Say a line about a scene on stderr."""
+    sys.stderr.write(f"{name}: {line}\n")

@@ -1,0 +1,121 @@
+"""The options of a reference run: one list for Python, the command line, campaigns and the settings themselves."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import surrogate
+from md_reference.campaign_settings import key_of, read_settings
+from md_reference.protocol import defaults
+from surrogate import api, cli
+from surrogate.md_options import MDOptions, Preparation, flags_of
+from systems.prepare import prepare
+
+FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
+# How many runs there are, and what makes the box: no fields of MDConfig or ForceFieldSpec.
+ELSEWHERE = {"replicas", "level", "padding_nm", "ionic_strength_molar"}
+TYPED = {
+    "force_field": ("ff19SB", "ff19SB"),
+    "solvent": ("opc", "opc"),
+    "level": ("mm", "mm"),
+    "padding_nm": ("12A", 1.2),
+    "ionic_strength_molar": ("150mM", 0.15),
+    "temperature_k": ("310K", 310.0),
+    "friction_per_ps": ("0.1/fs", 100.0),
+    "timestep_ps": ("2fs", 0.002),
+    "hydrogen_mass_da": ("natural", None),
+    "equilibrate_ps": ("1ns", 1000.0),
+    "ensemble": ("npt", "npt"),
+    "pressure_bar": ("2.5", 2.5),
+    "replicas": ("3", 3),
+    "platform": ("CPU", "CPU"),
+    "ph": ("5", 5.0),
+    "keep_ligand": (None, True),
+    "drop_ligand": (None, True),
+    "drop_water": (None, True),
+}
+
+
+def called(monkeypatch: pytest.MonkeyPatch, verb: str, arguments: list[str]) -> dict[str, Any]:
+    """Return the keywords that a command gives to its verb."""
+    seen: dict[str, Any] = {}
+
+    def spy(*_: Any, **keywords: Any) -> Any:
+        seen.update(keywords)
+        return {} if verb == "plan" else []
+
+    monkeypatch.setattr(api, verb, spy)
+    result = CliRunner().invoke(cli.app, [verb, *arguments])
+    assert result.exit_code == 0, result.output
+    return seen
+
+
+ARGUMENTS = {
+    "plan": ["ethanol"],
+    "reference": ["ethanol", "--time", "1ps", "-o", "x.h5"],
+    "rollout": ["ethanol", "--weights", "w", "--time", "1ps", "-o", "x.h5"],
+}
+
+
+@pytest.mark.parametrize("verb", ["plan", "reference"])
+def test_every_flag_arrives_in_our_units(monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
+    assert set(TYPED) == set(FLAGS)
+    typed = [word for name, (text, _) in TYPED.items() for word in (FLAGS[name].flag, text) if word is not None]
+    seen = called(monkeypatch, verb, [*ARGUMENTS[verb], *typed])
+    assert {name: seen[name] for name in FLAGS} == pytest.approx({name: value for name, (_, value) in TYPED.items()})
+
+
+@pytest.mark.parametrize(("verb", "options"), [("plan", MDOptions), ("reference", MDOptions), ("rollout", Preparation)])
+def test_a_flag_left_out_is_the_keyword_left_out(monkeypatch: pytest.MonkeyPatch, verb: str, options: Any) -> None:
+    stated = inspect.signature(getattr(surrogate, verb)).parameters
+    seen = called(monkeypatch, verb, ARGUMENTS[verb])
+    for name in flags_of(options):
+        assert seen[name] == stated[name].default, name
+        assert stated[name].kind is inspect.Parameter.KEYWORD_ONLY
+    assert not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in stated.values())
+
+
+def test_a_keyword_that_is_none_is_refused_before_anything_else() -> None:
+    with pytest.raises(TypeError, match=r"reference\(\) .*tempeature_k"):
+        surrogate.reference("no such scene", "x.h5", time_ps=1.0, tempeature_k=300.0)
+    with pytest.raises(TypeError, match=r"reference\(\) .*time_ps"):
+        surrogate.reference("no such scene", "x.h5")
+
+
+def test_the_verbs_own_documentation_stays() -> None:
+    assert "counter-ions" in (surrogate.reference.__doc__ or "")
+    assert surrogate.rollout.__name__ == "rollout"
+
+
+def test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults() -> None:
+    known = defaults()
+    switches = inspect.signature(prepare).parameters
+    for name, flag in FLAGS.items():
+        if name in ELSEWHERE:
+            continue
+        key = flag.flag.removeprefix("--").replace("-", "_")
+        if name in Preparation.__annotations__:
+            assert (key, flag.default) == (name, switches[name].default)
+            continue
+        # pressure_bar stands with its unit in a campaign's file, where it is a bare number.
+        assert key_of(name) == (name if name == "pressure_bar" else key)
+        stated = re.search(r"\[default: (.+)\]$", flag.help)
+        if stated is None:
+            assert flag.default == known[name], name
+            continue
+        text = stated.group(1)
+        value = flag.read(text, flag.flag) if flag.read else type(known[name])(text)
+        assert value == pytest.approx(known[name]), name
+        assert read_settings({key_of(name): value if name == "pressure_bar" else text}, axes=(), preparation={})
+
+
+def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = {**defaults(), "timestep_ps": 0.002}
+    monkeypatch.setattr(f"{__name__}.defaults", lambda: wrong)
+    with pytest.raises(AssertionError, match="timestep_ps"):
+        test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults()
