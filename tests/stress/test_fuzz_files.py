@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import random
-import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from surrogate.sampling.simulation import Simulation
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
+from time_limits import time_limit
 
 SECONDS_A_FILE = 20
 N_FRAMES = 40
@@ -90,20 +89,6 @@ def mutated(data: bytes, seed: int) -> tuple[str, bytes]:
             mutation(out, rng)
             done.append(mutation.__name__)
     return "+".join(done), bytes(out)
-
-
-@contextmanager
-def time_limit(seconds: int) -> Iterator[None]:
-    def late(signum: int, frame: Any) -> None:
-        raise TimeoutError(f"no answer within {seconds} s")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 # ---- the files: how each is made, and read whole ---------------------------------------------------------------------

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import random
 import re
-import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +14,7 @@ import pytest
 from systems.errors import SurromdError
 from systems.prepare import prepare
 from systems.scene import Scene
+from time_limits import time_limit
 
 SOURCES = ("alanine-dipeptide", "aspirin", "ethanol", "benzene", "ACE-TRP-NME", "ACE-PRO-NME", "ACE-CYS-NME", "toluene")
 SECONDS_A_FILE = 20
@@ -130,20 +128,6 @@ def mutated(seed: int, sources: list[bytes]) -> tuple[str, bytes]:
             data = mutation(data, rng)
             done.append(mutation.__name__)
     return "+".join(done), data
-
-
-@contextmanager
-def time_limit(seconds: int) -> Iterator[None]:
-    def late(signum: int, frame: Any) -> None:
-        raise TimeoutError(f"no answer within {seconds} s")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 _NUMBER = re.compile(r" *[-+]?[0-9]*\.?[0-9]*([eE][-+]?[0-9]+)? *\Z")
