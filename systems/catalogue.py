@@ -59,7 +59,9 @@ TETRAPEPTIDE_PROTOCOL: dict[str, Any] = {
     "save_every_ps": 0.1,
 }
 TETRAPEPTIDE_SOURCE = "MDGen's implicit-solvent runs: Jing, Stärk, Jaakkola and Berger, NeurIPS 2024 (100 ns each)"
-# The friction is ours: low enough that 150 fs, a window of the forecasting task, are all but deterministic.
+# The friction is ours, and low, but a window of the forecasting task is not deterministic: two runs from one state that
+# draw other noise are 0.07 Å (aspirin) to 0.12 Å (ethanol) apart after 100 fs, root mean square over atoms, and 0.10 to
+# 0.22 Å after 150 fs. No forecast of a single run can be expected to do much better.
 MD17_PROTOCOL: dict[str, Any] = {
     "force_field": "gaff2",
     "solvent": "vacuum",
