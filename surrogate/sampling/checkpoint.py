@@ -32,7 +32,8 @@ class Progress:
 
     `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
     where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
-    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before.
+    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
+    all replicas, further draws included, which took `evaluations` of the network together.
     """
 
     last_frames: Float32Array
@@ -41,6 +42,8 @@ class Progress:
     steps: int = 0
     wall_s: float = 0.0
     batch: int | None = None
+    drawn: int = 0
+    evaluations: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     tallies: list[Tally] = field(default_factory=list)
 

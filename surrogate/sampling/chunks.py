@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from surrogate.models.interface import Surrogate, draw_noise
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
 
@@ -56,9 +56,10 @@ class ChunkSampler:
         self.solver_steps = solver_steps
         self.bf16 = precision == "bf16" or (precision == "auto" and model.bf16_by_default and bf16_in_hardware())
         self.batch: int | None = None
-        self._evaluations: float | None = None
+        # Chunks drawn, each row one, and the network evaluations they took together.
+        self.drawn, self.evaluations = 0, 0.0
         self._model = with_bf16_weights(model) if self.bf16 else model
-        self._molecule = Molecule.of(template)
+        self._molecule = model.describe(template)
         self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
@@ -74,8 +75,8 @@ class ChunkSampler:
 
     @property
     def evaluations_per_chunk(self) -> float:
-        """Network evaluations for a chunk of one replica; of an adaptive solver, what the last one took."""
-        return self._evaluations or (self.solver_steps if self._model.solvers else 1)
+        """Network evaluations for a chunk of one replica, the mean of all that were drawn; 0 before any is."""
+        return self.evaluations / self.drawn if self.drawn else 0.0
 
     def draw(
         self, last_frames_nm: FloatArray, seeds: Sequence[int], velocities_nm_ps: FloatArray | None = None
@@ -135,7 +136,9 @@ class ChunkSampler:
                 solver=self.solver,
                 last_velocities_nm_ps=None if turned is None else torch.from_numpy(turned.astype(np.float32)),
             )
-        self._evaluations = chunk.evaluations
+        usual = self.solver_steps if self._model.solvers else 1
+        self.drawn += len(seeds)
+        self.evaluations += len(seeds) * (usual if chunk.evaluations is None else chunk.evaluations)
         moved = chunk.frames_nm.double().numpy() - translation[:, None, None, :]
         ends = None
         if chunk.velocities_nm_ps is not None:

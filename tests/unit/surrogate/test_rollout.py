@@ -91,6 +91,37 @@ def test_an_interrupted_rollout_resumes_bit_for_bit(tmp_path: Path, small_weight
     assert cut.stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("resumed", [False, True])
+def test_evaluations_that_differ_from_chunk_to_chunk_are_counted_over_all(
+    tmp_path: Path, small_weights: Weights, alanine_dipeptide: Scene, monkeypatch: pytest.MonkeyPatch, resumed: bool
+) -> None:
+    counts: list[float] = []
+    whole = LamSlide.next_chunk
+
+    def as_if_adaptive(*args: object, **options: object) -> object:
+        counts.append(10.0 + 3.5 * len(counts))
+        return replace(whole(*args, **options), evaluations=counts[-1])
+
+    class Killed(BaseException):
+        pass
+
+    def kill(done: int, total: int, note: str) -> None:
+        if done > total // 2:
+            raise Killed
+
+    monkeypatch.setattr(LamSlide, "next_chunk", as_if_adaptive)
+    outs = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    if resumed:
+        with pytest.raises(Killed):
+            rollout(alanine_dipeptide, small_weights, outs, CONFIG, progress=kill, flush_every_s=0.0)
+        assert 0 < len(counts) < -(-40 // small_weights.model.n_new)
+    rollout(alanine_dipeptide, small_weights, outs, CONFIG, resume=resumed)
+    assert len(counts) == -(-40 // small_weights.model.n_new)
+    for out in outs:
+        with open_trajectory(out) as reader:
+            assert reader.record["cost"]["network_evaluations"] == round(sum(counts))
+
+
 def test_frames_that_are_not_finite_are_marked_and_stop_the_rollout(tmp_path: Path, small_weights: Weights,
                                                                     alanine_dipeptide: Scene) -> None:  # fmt: skip
     model = LamSlide(small_weights.model.config)
