@@ -22,6 +22,8 @@ _SHAPE_FRAMES, _SHAPE_ATOMS = 20_000, 1_000_000
 # A nitrogen's hydrogens stand to one side where they rise so far above the plane (sine), root mean square: flat groups
 # swing through 0.2, pyramidal amines stand at 0.7 and more.
 _PYRAMIDAL = 0.45
+# Of a combination of features that is weighed, beside that of the strongest.
+_LEAST_VARIANCE = 1e-8
 # The other side counts from this share of frames on.
 _LEAST_SHARE = 0.002
 
@@ -89,7 +91,7 @@ def _hands(site: Site, x: Tensor) -> int:
         about = group.angles(x)[1]
         height = torch.sin(about[..., 1] - about[..., 0])
     else:
-        height = (_unit(group.bonds(x)[..., 0, :]) * _unit(group.features(x)[..., 2, :])).sum(-1)
+        height = (_unit(group.bonds(x)[..., 0, :]) * group.axes(x)[..., 2, :]).sum(-1)
     share = float((height > 0).double().mean())
     pyramidal = float(height.square().mean().sqrt()) > _PYRAMIDAL
     return 2 if pyramidal and _LEAST_SHARE < share < 1.0 - _LEAST_SHARE else 1
@@ -114,7 +116,7 @@ def _fit_shapes(group: SiteGroup, x: Tensor) -> None:
 
 
 def _turning_shape(angles: Tensor) -> tuple[Tensor, Tensor]:
-    """Shape `(k, 3)` of a rotor and what is left `(n, 2k)` rad, from its angles `(n, k, 2)`."""
+    """Shape `(k, 2)` of a rotor and what is left `(n, 2k)` rad, from its angles `(n, k, 2)`."""
     opening, about = angles.unbind(-1)
     relative = about - about[:, :1]
     shift = torch.atan2(relative.sin().mean(0), relative.cos().mean(0))
@@ -123,14 +125,16 @@ def _turning_shape(angles: Tensor) -> tuple[Tensor, Tensor]:
     off = turned - phase[:, None]
     mean = opening.mean(0)
     left = torch.cat([opening - mean, torch.atan2(off.sin(), off.cos())], dim=-1)
-    return torch.stack([mean, shift, torch.zeros_like(mean)], dim=-1), left
+    return torch.stack([mean, shift], dim=-1), left
 
 
 def _held_shape(features: Tensor, vectors: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights `(k, 3)` of the directions `(n, 3, 3)` that come nearest to the bonds `(n, k, 3)` nm, least squares, and
+    """Weights `(k, 12)` of the features `(n, 12, 3)` that come nearest to the bonds `(n, k, 3)` nm, least squares, and
     what is left `(n, 3k)` nm along the axes `(n, 3, 3)`."""
     gram = torch.einsum("tfj,tgj->fg", features, features)
-    weights = torch.linalg.lstsq(gram, torch.einsum("tfj,tkj->fk", features, vectors)).solution.T
+    # Features that do not vary (of two neighbours, of a structure that stands still) get no weight.
+    inverse = torch.linalg.pinv(gram, rtol=_LEAST_VARIANCE, hermitian=True)
+    weights = (inverse @ torch.einsum("tfj,tkj->fk", features, vectors)).T
     mean = _unit(torch.einsum("kf,tfj->tkj", weights, features)) * vectors.norm(dim=-1).mean(0)[:, None]
     return weights, torch.einsum("taj,tkj->tka", axes, vectors - mean).flatten(1)
 

@@ -1,11 +1,11 @@
 """Hydrogens placed about heavy atoms: for a model that works on heavy atoms alone.
 
 A heavy atom with two or more heavy neighbours holds its hydrogens where those leave room (CH, CH2, NH, aromatic CH):
-their mean place is a fixed sum of the directions to the neighbours. One with a single heavy neighbour is a rotor
-(methyl, ammonium, amine, hydroxyl): its hydrogens share one angle about the bond, which moves from frame to frame as it
-did in the training reference, a Markov chain over N_PHASES directions. About either, hydrogens swing with the
-reference's covariance, and bonds have its lengths. Everything is told by unit vectors and their cross products, so
-hydrogens turn with the molecule, and those of its mirror image lie mirrored.
+their mean place in axes laid through the neighbours is linear in the cosines of the angles between these. One with a
+single heavy neighbour is a rotor (methyl, ammonium, amine, hydroxyl): its hydrogens share one angle about the bond,
+which moves from frame to frame as it did in the training reference, a Markov chain over N_PHASES directions. About
+either, hydrogens swing with the reference's covariance, and bonds have its lengths. Hydrogens turn with the molecule,
+and beside three neighbours that of the mirror image lies mirrored.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ from torch import Tensor, nn
 
 # Directions around the circle that a rotor's angle is told by: five degrees each.
 N_PHASES = 72
+# Terms that a held hydrogen's place has along each axis: one, and each cosine between three neighbours.
+_N_TERMS = 4
+# Cosines are told from here, between tetrahedral and trigonal.
+_USUAL_COSINE = -0.4
 
 
 @dataclass(frozen=True)
@@ -73,10 +77,10 @@ class HydrogenPlan:
 class SiteGroup(nn.Module):
     """Sites of one kind: `n` of them with `k` hydrogens each, and what the reference says of these.
 
-    `shape (n, hands, k, 3)`: of a rotor the angle at the parent, the angle about the bond relative to the site's, and
-    zero; else the weights of the three directions. `lengths_nm`, `length_spread_nm (n, k)`; `swing (n, hands, d, d)` a
-    root of the covariance of what is left, d = 2k angles (rad) or 3k coordinates (nm); `shares (n, S)` of the states
-    and `moves (n, S, S)` the probabilities of the next one, both cumulative.
+    `shape`: of a rotor `(n, hands, k, 2)`, the angle at the parent and that about the bond relative to the site's; else
+    `(n, hands, k, 12)`, the weights of the features that place it. `lengths_nm`, `length_spread_nm (n, k)`; `swing
+    (n, hands, d, d)` a root of the covariance of what is left, d = 2k angles (rad) or 3k coordinates (nm); `shares
+    (n, S)` of the states and `moves (n, S, S)` the probabilities of the next one, both cumulative.
     """
 
     parent: Tensor
@@ -106,7 +110,7 @@ class SiteGroup(nn.Module):
         }
         for name, tensor in fixed.items():
             self.register_buffer(name, tensor, persistent=False)
-        self.register_buffer("shape", torch.zeros(n, self.hands, self.k, 3))
+        self.register_buffer("shape", torch.zeros(n, self.hands, self.k, 2 if self.turns else 3 * _N_TERMS))
         self.register_buffer("lengths_nm", torch.full((n, self.k), 0.1))
         self.register_buffer("length_spread_nm", torch.zeros(n, self.k))
         self.register_buffer("swing", torch.zeros(n, self.hands, self.n_coordinates, self.n_coordinates))
@@ -120,7 +124,7 @@ class SiteGroup(nn.Module):
         """Return the orthonormal axes `(..., n, 3 axes, 3)` of each site in frames `x (..., n_atoms, 3)`.
 
         A rotor's first axis runs along the bond towards the parent and its second towards the further atom; the others'
-        first lies between the two first neighbours and their third is normal to both.
+        first lies between the two first neighbours and their third is normal to both, towards a third one.
         """
         if self.turns:
             bond = x[..., self.parent, :] - x[..., self.around[:, 0], :]
@@ -130,15 +134,21 @@ class SiteGroup(nn.Module):
         else:
             near = self._directions(x)
             first, second = _unit(near[..., 0, :] + near[..., 1, :]), _unit(near[..., 0, :] - near[..., 1, :])
-        return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-2)
+        third = torch.linalg.cross(first, second)
+        if not self.turns:
+            away = (near[..., 2, :] * third).sum(-1, keepdim=True) < 0
+            third = torch.where(self.three[:, None] & away, -third, third)
+        return torch.stack([first, second, third], dim=-2)
 
     def features(self, x: Tensor) -> Tensor:
-        """Return the three directions `(..., n, 3, 3)` whose sum places hydrogens that do not turn: to the neighbours;
-        of two neighbours the third is their normal."""
+        """Return the vectors `(..., n, 12, 3)` whose weighted sum places hydrogens that do not turn: each axis, by
+        itself and times each cosine between neighbours."""
         near = self._directions(x)
-        normal = torch.linalg.cross(near[..., 0, :], near[..., 1, :])
-        third = torch.where(self.three[:, None], near[..., 2, :], normal)
-        return torch.stack([near[..., 0, :], near[..., 1, :], third], dim=-2)
+        cosines = (near[..., (0, 0, 1), :] * near[..., (1, 2, 2), :]).sum(-1) - _USUAL_COSINE
+        # Two neighbours have one angle.
+        known = torch.stack([torch.ones_like(self.three), self.three, self.three], dim=-1)
+        terms = torch.cat([torch.ones_like(cosines[..., :1]), torch.where(known, cosines, 0.0)], dim=-1)
+        return (terms[..., :, None, None] * self.axes(x)[..., None, :, :]).flatten(-3, -2)
 
     def bonds(self, x: Tensor) -> Tensor:
         """Return the vectors `(..., n, k, 3)` nm from parents to hydrogens in frames of all atoms."""
@@ -157,7 +167,7 @@ class SiteGroup(nn.Module):
         if self.turns:
             about = self.angles(x)[1]
             return (torch.sin(about[..., 1] - about[..., 0]) > 0).long()
-        return ((self.bonds(x)[..., 0, :] * self.features(x)[..., 2, :]).sum(-1) > 0).long()
+        return ((self.bonds(x)[..., 0, :] * self.axes(x)[..., 2, :]).sum(-1) > 0).long()
 
     def phase(self, x: Tensor, hand: Tensor) -> Tensor:
         """Return a rotor's angle `(..., n)` rad: the mean over its hydrogens, each less its place in the shape."""

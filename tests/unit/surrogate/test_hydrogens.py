@@ -304,3 +304,25 @@ def test_frames_of_heavy_atoms_are_a_view() -> None:
     assert heavy.scene.atom_names == ("C1", "C2", "O1")
     assert np.array_equal(heavy.positions_nm(idx), frames.positions_nm(idx)[:, :, :3])
     assert heavy.coordinates is frames.coordinates
+
+
+def test_the_bench_tells_right_hydrogens_from_wrong_ones() -> None:
+    from surrogate.bench.hydrogens import lines, measure_hydrogens
+
+    scene = load("ethanol")
+
+    def frames(seed: int, hinge: float = 0.0) -> TrainingFrames:
+        positions = hydroxyl(scene, rotor_chain(3000, seed) + hinge)[0]
+        heavy_too = 0.003 * np.random.default_rng(seed).normal(size=(3000, scene.n_atoms, 3))
+        return frames_of(scene, positions + heavy_too)
+
+    found = measure_hydrogens(frames(0), frames(1), n_frames=2560, seed=0)
+    other = measure_hydrogens(frames(0), frames(1, hinge=2.0), n_frames=2560, seed=0)
+    hydroxyls = [next(r for r in f["rotors"] if "O1" in r["atoms"]) for f in (found, other)]
+    assert hydroxyls[0]["jsd"] < 0.03 < 0.3 < hydroxyls[1]["jsd"]
+    assert hydroxyls[0]["memory_placed"][0] == pytest.approx(hydroxyls[0]["memory_md"][0], abs=0.03)
+    assert found["held_hydrogens"][0]["rmsd_nm"] == pytest.approx(0.0095, abs=0.002)
+    assert all(abs(r["md"][0] - r["placed"][0]) < 0.5 for r in found["angles"])
+    assert lines(found)[0].startswith("ethanol: hydrogens of 2560 held-out frames")
+    with pytest.raises(InputError, match="too few"):
+        measure_hydrogens(frames(0), frames(1), n_frames=500, seed=0)
