@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.architectures import architecture
 from surrogate.models.interface import Surrogate
 from systems.errors import InputError, UnknownNameError, WeightsError
@@ -67,7 +68,7 @@ def save_weights(
     dtype = torch.float16 if half else torch.float32
     tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
     text = json.dumps(header)
-    metadata = {"format": FORMAT, "surromd": text, "sha256": _digest(text, tensors)}
+    metadata = {"format": FORMAT, "surromd": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
@@ -101,14 +102,6 @@ def _metadata(path: Path) -> dict[str, str]:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
 
 
-def _digest(header: str, tensors: dict[str, torch.Tensor]) -> str:
-    found = hashlib.sha256(header.encode())
-    for name, tensor in sorted(tensors.items()):
-        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        found.update(tensor.contiguous().numpy().tobytes())
-    return found.hexdigest()
-
-
 def load_weights(path: str | Path) -> Weights:
     """Load a weights file in evaluation mode. Raises InputError, WeightsError (damaged, non-finite, other shapes)."""
     from safetensors import SafetensorError
@@ -122,7 +115,7 @@ def load_weights(path: str | Path) -> Weights:
     except (SafetensorError, ValueError) as error:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
     # Files of earlier versions state no checksum.
-    if "sha256" in metadata and metadata["sha256"] != _digest(metadata["surromd"], state):
+    if "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
         raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
     try:
         arch = architecture(header["arch"])

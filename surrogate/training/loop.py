@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
@@ -247,7 +248,8 @@ def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
         tensors |= {f"optimiser.{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
     tensors["generator"] = generators.contiguous()
     header = {"step": step, "spent_s": spent_s, "stage": config.name, "seed": config.seed, "batch": config.batch}
-    metadata = {"surromd_training": json.dumps(header)}
+    text = json.dumps(header)
+    metadata = {"surromd_training": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
@@ -255,16 +257,25 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
                config: StageConfig, *, process: tuple[int, int] = (0, 1)) -> tuple[int, float]:  # fmt: skip
     """Put a saved state back; return (step, spent_s). `process`: this one's number and that of all.
 
-    Raises InputError when the state is of another run or of another number of processes.
+    Raises InputError when the state is damaged, of another run or of another number of processes.
     """
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt") as handle:
-            header = json.loads(handle.metadata()["surromd_training"])
+            metadata = handle.metadata()
+            header = json.loads(metadata["surromd_training"])
             tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"training state {path} cannot be read ({error}); train again without --resume.") from error
+    # States of earlier versions carry no checksum; a name that is neither is one that was altered.
+    if set(metadata) - {"surromd_training", "sha256"} or (
+        "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd_training"], tensors)
+    ):
+        raise InputError(
+            f"training state {path} is damaged: it is not what was written (checksum); restore it from a whole copy, "
+            "or train again without --resume."
+        )
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch)):
         if header[key] != expected:
             raise InputError(f"training state {path} has {key} {header[key]!r}, this run {expected!r}.")
