@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import distributions
-from surrogate.judge.block_means import equal_rows, group_labels, over_groups
 from surrogate.judge.curves import BondLength
+from surrogate.judge.equal_atoms import equal_rows, group_labels, over_groups
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
 from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate, pooled
 from surrogate.judge.structure import CONSTRAINED_BELOW_NM, bond_label

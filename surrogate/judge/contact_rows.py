@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from surrogate.judge.block_means import Means, block_means, family_of, shift_row
+from surrogate.judge.block_means import Means, block_means, family_of, over_equal, shift_row
 from surrogate.judge.charts import BarChart, Chart
+from surrogate.judge.equal_atoms import equal_rows, group_labels
 from surrogate.judge.metrics import ONE_KJ_FACTOR
 from surrogate.judge.rows import Row, Trio, observable_row
 
@@ -44,12 +45,13 @@ def contact_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
                       "", 0.03, "± 0.03",
                       lambda c, r: f"{100 * c:.3g} % of the reference's contacts are formed instead of {100 * r:.3g} %")
         )  # fmt: skip
-    single = [block_means(s, family_of(s, "contacts")) for s in trio.samples]
+    groups = equal_rows(probes.contacts, probes.classes)
+    single = [over_equal(block_means(s, family_of(s, "contacts")), groups) for s in trio.samples]
     rows.append(
         shift_row(
             trio,
             single,
-            probes.labels("contacts"),
+            group_labels(probes.labels("contacts"), groups),
             key="contact_shift",
             group="populations",
             metric="Largest shift of a contact's probability",
@@ -68,7 +70,8 @@ def hydrogen_bond_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped
     """Return rows of the mean number of hydrogen bonds and of the most populated ones, and a chart of populations.
 
     Criterion: see `hydrogen_bonds.is_formed`. A bond is shown when the reference or the candidate forms it in more than
-    1 % of frames.
+    1 % of frames. Of bonds that the molecule's symmetry makes equal, such as those of an ammonium's three hydrogens,
+    the population is the mean.
     """
     probes = trio.reference.features.probes
     if probes is None:
@@ -81,10 +84,11 @@ def hydrogen_bond_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped
     number = [
         block_means(s, [x.sum(axis=1, keepdims=True) for x in v]) for s, v in zip(trio.samples, formed, strict=True)
     ]
-    single = [block_means(s, v) for s, v in zip(trio.samples, formed, strict=True)]
-    labels = probes.labels("hydrogen_bonds")
+    groups = equal_rows(probes.hydrogen_bonds, probes.classes)
+    single = [over_equal(block_means(s, v), groups) for s, v in zip(trio.samples, formed, strict=True)]
+    labels = group_labels(probes.labels("hydrogen_bonds"), groups)
     rows: list[Row] = []
-    if len(labels) > 1 and max(m.values[0] for m in number) > 0:
+    if len(probes.hydrogen_bonds) > 1 and max(m.values[0] for m in number) > 0:
         rows.append(
             _mean_row(trio, number, 0, "hydrogen_bonds", "Hydrogen bonds, mean number", "",
                       (1.0 - 1.0 / ONE_KJ_FACTOR) * float(number[0].values[0]), "± 1 kJ/mol",
@@ -147,7 +151,8 @@ def _chart(labels: Sequence[str], single: Sequence[Means], order: Sequence[int])
         BarChart(
             section="structure",
             title="Hydrogen bonds",
-            caption="Share of frames in which each is formed (H to acceptor below 2.5 Å, angle above 120°).",
+            caption="Share of frames in which each is formed (H to acceptor below 2.5 Å, angle above 120°); of equal "
+            "ones the mean.",
             y_label="frames / %",
             names=tuple(labels[k] for k in order),
             reference=pick(0, "value"),

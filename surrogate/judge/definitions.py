@@ -92,7 +92,8 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Contacts, hydrogen bonds",
         "Contact: two heavy atoms more than three bonds apart within 4.5 Å; in chains of five residues or more, two "
         "alpha carbons three or more residues apart within 8 Å. Hydrogen bond: H to acceptor (N, O) below 2.5 Å, angle "
-        "at H above 120°.",
+        "at H above 120°. Of those that the molecule's symmetry makes equal (the hydrogens of an ammonium, the oxygens "
+        "of a carboxylate) the mean is taken.",
         "Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97 (1984)",
     ),
     Definition(

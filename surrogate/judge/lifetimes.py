@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from surrogate.judge.block_means import column, family_of
 from surrogate.judge.charts import Chart
+from surrogate.judge.equal_atoms import equal_rows, group_labels
 from surrogate.judge.relaxation import speed_words
 from surrogate.judge.rows import Row, Trio, observable_row
 from surrogate.judge.statistics import Blocks
@@ -22,7 +23,7 @@ _LEAST_BREAKS = 20
 
 
 def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str]]]:
-    """Return the mean lifetime of the hydrogen bonds that the reference breaks most often.
+    """Return the mean lifetime of the hydrogen bonds that the reference breaks most often, equal ones together.
 
     Skipped where the reference breaks none of them at least twenty times.
     """
@@ -31,15 +32,16 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
         return [], [], [(_NAME, "no hydrogen bond is followed")]
     lag_ps = trio.reference.features.lag_ps
     formed = [family_of(s, "hydrogen_bonds") for s in trio.samples]
-    labels = probes.labels("hydrogen_bonds")
-    first = [lifetime_sums(column(formed[0], k), trio.reference.blocks) for k in range(len(labels))]
+    groups = equal_rows(probes.hydrogen_bonds, probes.classes)
+    labels = group_labels(probes.labels("hydrogen_bonds"), groups)
+    first = [_group_sums(formed[0], group, trio.reference.blocks) for group in groups]
     order = sorted(range(len(labels)), key=lambda k: -first[k][1].sum())
     chosen = [k for k in order[:_MOST] if first[k][1].sum() >= _LEAST_BREAKS]
     if not chosen:
         return [], [], [(_NAME, f"the reference breaks none of them {_LEAST_BREAKS} times")]
     rows = []
     for k in chosen:
-        sums = [lifetime_sums(column(f, k), s.blocks) for f, s in zip(formed, trio.samples, strict=True)]
+        sums = [_group_sums(f, groups[k], s.blocks) for f, s in zip(formed, trio.samples, strict=True)]
         with np.errstate(invalid="ignore", divide="ignore"):
             values = [float(lag_ps * f.sum() / b.sum()) if b.sum() else np.nan for f, b in sums]
             draws = [lag_ps * (s.weights @ f) / (s.weights @ b) for (f, b), s in zip(sums, trio.samples, strict=True)]
@@ -59,6 +61,14 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
             )
         )
     return rows, [], []
+
+
+def _group_sums(
+    formed: Sequence[BoolArray], columns: npt.NDArray[np.intp], blocks: Blocks
+) -> tuple[FloatArray, FloatArray]:
+    """Return the `lifetime_sums` of several columns of `formed` `(n, k)` together."""
+    each = [lifetime_sums(column(formed, int(k)), blocks) for k in columns]
+    return np.sum([held for held, _ in each], axis=0), np.sum([broken for _, broken in each], axis=0)
 
 
 def lifetime_sums(formed: Sequence[BoolArray], blocks: Blocks) -> tuple[FloatArray, FloatArray]:

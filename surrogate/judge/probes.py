@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import hydrogen_bonds, puckers
+from surrogate.judge.equal_atoms import equal_rows
 from surrogate.judge.torsions import Torsion, find_torsions
 from systems.frame_columns import bond_angle, column_blocks, squared_distance, torsion_angle
 from systems.scene import Scene
@@ -47,7 +48,8 @@ class Probes:
 
     `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
     (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
-    reference forms in more than half of its frames. `classes` `(n_atoms,)`: equal for atoms that have no identity of
+    reference forms in more than half of its frames. What the molecule's symmetry makes equal is chosen together.
+    `classes` `(n_atoms,)`: equal for atoms that have no identity of
     their own, such as the hydrogens of a methyl group. `left_out` says what is not measured, and why.
     """
 
@@ -111,8 +113,11 @@ def find_probes(
     triplets = hydrogen_bonds.find_triplets(scene)
     with np.errstate(invalid="ignore"):
         blocks = [block for _, block in column_blocks(sample_nm, _widest(contacts, triplets, angles))]
+    classes = atom_classes(whole)[np.arange(scene.n_atoms) if kept is None else kept]
+    equal_contacts, equal_triplets = equal_rows(contacts, classes), equal_rows(triplets, classes)
     in_contact = _share(lambda x: squared_distance(x, contacts) < contact_nm**2, blocks, len(contacts))
     bonded = _share(lambda x: hydrogen_bonds.is_formed(x, triplets), blocks, len(triplets))
+    in_contact, bonded = _evened(in_contact, equal_contacts), _evened(bonded, equal_triplets)
     amplitude = [np.mean(np.concatenate([puckers.pucker(b, r)[0] for b in blocks])) for r in rings]
     return Probes(
         scene=scene,
@@ -123,11 +128,11 @@ def find_probes(
         ends=_ends(scene),
         contact_nm=contact_nm,
         all_contacts=contacts,
-        contacts=contacts[_foremost(np.minimum(in_contact, 1 - in_contact), "contacts", left_out)],
+        contacts=contacts[_foremost(np.minimum(in_contact, 1 - in_contact), equal_contacts, "contacts", left_out)],
         native=np.flatnonzero(in_contact > 0.5),
-        hydrogen_bonds=triplets[_foremost(bonded, "hydrogen bonds", left_out)],
+        hydrogen_bonds=triplets[_foremost(bonded, equal_triplets, "hydrogen bonds", left_out)],
         rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
-        classes=atom_classes(whole)[np.arange(scene.n_atoms) if kept is None else kept],
+        classes=classes,
         left_out=tuple(left_out),
     )
 
@@ -220,11 +225,30 @@ def _share(
     return np.asarray(sum(formed(block).sum(axis=1) for block in blocks) / total, dtype=np.float64)
 
 
-def _foremost(share: npt.NDArray[np.float64], what: str, left_out: list[tuple[str, str]]) -> IntArray:
+def _evened(share: npt.NDArray[np.float64], groups: Sequence[npt.NDArray[np.intp]]) -> npt.NDArray[np.float64]:
+    """Return the share of each `(k,)` with that of equal ones in its place, their mean."""
+    out = share.copy()
+    for group in groups:
+        out[group] = share[group].mean()
+    return out
+
+
+def _foremost(
+    share: npt.NDArray[np.float64],
+    groups: Sequence[npt.NDArray[np.intp]],
+    what: str,
+    left_out: list[tuple[str, str]],
+) -> IntArray:
+    """Return the columns of the greatest share, at most `MAX_COLUMNS`, with all that are equal to one of them."""
     if len(share) <= MAX_COLUMNS:
         return np.arange(len(share))
-    left_out.append((f"Single {what}", f"{MAX_COLUMNS} of {len(share)} possible ones are followed one by one"))
-    return np.sort(np.argsort(-share, kind="stable")[:MAX_COLUMNS])
+    chosen: list[int] = []
+    for group in sorted(groups, key=lambda g: -share[g[0]]):
+        if len(chosen) + len(group) > MAX_COLUMNS:
+            break
+        chosen += group.tolist()
+    left_out.append((f"Single {what}", f"{len(chosen)} of {len(share)} possible ones are followed one by one"))
+    return np.sort(np.array(chosen, dtype=np.int64))
 
 
 def _thin(rows: IntArray, what: str, left_out: list[tuple[str, str]]) -> IntArray:

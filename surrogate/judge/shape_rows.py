@@ -14,15 +14,14 @@ from surrogate.judge.block_means import (
     block_means,
     bounds,
     column,
-    equal_rows,
     family_of,
-    group_labels,
-    over_groups,
+    over_equal,
     shift_row,
 )
 from surrogate.judge.charts import BarChart, Chart
 from surrogate.judge.curves import histogram
 from surrogate.judge.distributions import Bins
+from surrogate.judge.equal_atoms import equal_rows, group_labels
 from surrogate.judge.rows import Group, Row, Trio, distance_row, observable_row
 
 FloatArray = npt.NDArray[np.float64]
@@ -139,7 +138,8 @@ def mean_distance(
 
 
 def _fluctuation(trio: Trio) -> tuple[Row, Chart]:
-    """RMSF about the reference's mean structure after superposition: its root mean square, and one bar per atom.
+    """RMSF about the reference's mean structure after superposition: its root mean square, and one bar per atom, or for
+    all of a kind that the molecule's symmetry makes equal.
 
     Every trajectory is laid over the same mean structure, so that a shifted mean shows as well as another spread.
     """
@@ -165,8 +165,10 @@ def _fluctuation(trio: Trio) -> tuple[Row, Chart]:
         statement=lambda c, r: f"atoms fluctuate by {c:.3g} Å instead of {r:.3g} Å (RMSF)",
         log=True,
     )
-    shown = np.unique(np.linspace(0, len(probes.fit_idx) - 1, _MAX_DRAWN).astype(int))
-    labels = probes.labels("deviation")
+    groups = equal_rows(probes.fit_idx[:, None], probes.classes)
+    means = [over_equal(m, groups) for m in means]
+    labels = group_labels(probes.labels("deviation"), groups)
+    shown = np.unique(np.linspace(0, len(groups) - 1, _MAX_DRAWN).astype(int))
     bands = [[10.0 * np.sqrt(np.maximum(np.nanquantile(m.draws[:, shown], q, axis=0), 0.0)) for q in (0.025, 0.975)]
              for m in means]  # fmt: skip
     values = [10.0 * np.sqrt(m.values[shown]) for m in means]
@@ -194,10 +196,8 @@ def _angle_rows(trio: Trio) -> list[Row]:
     limits = bounds(angles[0])
     means = [block_means(s, v, limits) for s, v in zip(trio.samples, angles, strict=True)]
     groups = equal_rows(probes.angles, probes.classes)
-    in_degrees = [
-        Means(np.degrees(over_groups(m.values, groups)), np.degrees(over_groups(m.draws, groups)), m.n_blocks)
-        for m in means
-    ]
+    pooled = [over_equal(m, groups) for m in means]
+    in_degrees = [Means(np.degrees(m.values), np.degrees(m.draws), m.n_blocks) for m in pooled]
     shift = shift_row(
         trio,
         in_degrees,

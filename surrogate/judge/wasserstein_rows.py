@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.block_means import equal_rows, family_of
+from surrogate.judge.block_means import family_of
 from surrogate.judge.charts import Chart
+from surrogate.judge.equal_atoms import equal_rows
 from surrogate.judge.rows import Row, Trio
 from surrogate.judge.statistics import Blocks, Estimate, estimate, permutation_p
 
