@@ -10,11 +10,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
+from systems.elements import ATOMIC_NUMBERS
 from systems.geometry import signed_volumes, torsion
 from systems.scene import Scene
 
@@ -105,6 +107,33 @@ def _refine(colours: list[int], neighbours: list[list[int]], labels: dict[tuple[
         if len(set(refined)) == n_classes:
             return refined
         colours, n_classes = refined, len(set(refined))
+
+
+def local_handedness(scene: Scene) -> dict[int, int]:
+    """Return the handedness of each stereocentre, -1 or 1, by an order of neighbours that means the same in every
+    molecule; 0 where that order leaves two of them alike.
+
+    Neighbours are ranked by their atomic number, then by the sorted atomic numbers one, two and three bonds behind
+    them, as the rules of Cahn, Ingold and Prelog begin; the sign is that of the three highest.
+    """
+    graph = element_graph(scene.elements, scene.bonds)
+    number = [ATOMIC_NUMBERS.get(e, 0) for e in scene.elements]
+
+    def rank(start: int, centre: int) -> tuple[tuple[int, ...], ...]:
+        shells, before, here = [], {centre}, {start}
+        for _ in range(4):
+            shells.append(tuple(sorted((number[i] for i in here), reverse=True)))
+            before |= here
+            here = {j for i in here for j in graph[i]} - before
+        return tuple(shells)
+
+    found = {}
+    for centre, *_ in classify(scene).centres:
+        ranked = sorted(((rank(j, centre), j) for j in graph[centre]), reverse=True)
+        alike = any(a == b for (a, _), (b, _) in pairwise(ranked))
+        top = [j for _, j in ranked[:3]]
+        found[centre] = 0 if alike else _sign(scene, (centre, top[0], top[1], top[2]))
+    return found
 
 
 def _sign(scene: Scene, row: tuple[int, int, int, int]) -> int:

@@ -43,7 +43,8 @@ class TrainingFrames:
 
     `coordinates` (n_frames, n_atoms, 3) int16 in units of QUANTUM_NM, centred, and superposed on the scene by its
     heavy atoms when `canonical`. `starts` holds the first frame of each trajectory and, last, n_frames. Frames that
-    carry `velocities` (n_frames, n_atoms, 3) nm/ps have their centre of mass at the origin and at rest.
+    carry `velocities` (n_frames, n_atoms, 3) nm/ps have their centre of mass at the origin and at rest. `turn` (3, 3):
+    applied to frames as they are read, where the scene has been posed anew since they were laid on it.
     """
 
     scene: Scene
@@ -55,6 +56,7 @@ class TrainingFrames:
     sources: tuple[dict[str, Any], ...]
     velocities: npt.NDArray[np.float32] | None = None
     split: Split = field(default_factory=Split)
+    turn: npt.NDArray[np.float64] | None = None
 
     @property
     def n_frames(self) -> int:
@@ -66,7 +68,8 @@ class TrainingFrames:
 
     def positions_nm(self, idx: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return frames `(*idx.shape, n_atoms, 3)` nm."""
-        return self.coordinates[idx].astype(np.float32) * np.float32(QUANTUM_NM)
+        found = self.coordinates[idx].astype(np.float32) * np.float32(QUANTUM_NM)
+        return found if self.turn is None else found @ self.turn.T.astype(np.float32)
 
     def window_starts(self, length: int, *, validation: bool) -> npt.NDArray[np.int64]:
         """Return the first frames of all windows of `length` frames that cross no boundary of trajectories or split.
@@ -102,6 +105,8 @@ class TrainingFrames:
 
     def save(self, path: str | Path) -> None:
         """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
+        if self.turn is not None:
+            raise InputError("frames that have been posed anew are not kept; save them as they were read.")
 
         def fill(temporary: Path) -> None:
             with _new_file(temporary, self.n_frames, self.scene.n_atoms, moving=self.velocities is not None) as handle:

@@ -25,21 +25,57 @@ class TrainingDomain:
     """What the weights were trained for. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
     `geometry` is what its frames say of valid ones (systems.validity.Geometry as a dictionary), `limits` how far they
-    go beyond that (systems.limits.Limits; None in files of older versions)."""
+    go beyond that (systems.limits.Limits; None in files of older versions).
+
+    `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
+    jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
+    `transferable`: molecules that look like these from within are covered too (sampling.coverage).
+    """
 
     scene: Scene
     lag_ps: float
     conditions: dict[str, Any]
     geometry: dict[str, Any]
     limits: dict[str, Any] | None = None
+    jumps: tuple[tuple[float, float, float], ...] = ()
+    further: tuple[TrainingDomain, ...] = ()
+    transferable: bool = False
+
+    @property
+    def members(self) -> tuple[TrainingDomain, ...]:
+        """The domains of all molecules trained on."""
+        return (self, *self.further)
+
+    @property
+    def longest_lag_ps(self) -> float:
+        return self.jumps[-1][0] if self.jumps else self.lag_ps
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a weights file keeps; what a single molecule and lag leave empty is left out."""
+        out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
+        out["further"] = [domain.to_dict() for domain in self.further]
+        return {key: value for key, value in out.items() if value or key not in ("jumps", "further", "transferable")}
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> TrainingDomain:
+        further = tuple(TrainingDomain.from_dict(domain) for domain in record.get("further", ()))
+        jumps = tuple((float(lag), float(least), float(most)) for lag, least, most in record.get("jumps", ()))
+        return TrainingDomain(
+            **{**record, "scene": Scene.from_dict(record["scene"]), "further": further, "jumps": jumps}
+        )
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
         c = self.conditions
-        return (
-            f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms), {c.get('force_field')}/"
-            f"{c.get('solvent')}, {c.get('temperature_k')} K, frames {self.lag_ps:g} ps apart"
-        )
+        lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
+        what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
+        if self.further:
+            names = [domain.scene.name for domain in self.members]
+            listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+            most = max(domain.scene.n_atoms for domain in self.members)
+            what = f"{len(names)} molecules of up to {most} atoms ({listed})"
+        what += " and molecules like them" if self.transferable else ""
+        return f"{what}, {c.get('force_field')}/{c.get('solvent')}, {c.get('temperature_k')} K, frames {lags} ps apart"
 
 
 @dataclass(frozen=True)
@@ -62,7 +98,7 @@ def save_weights(
     header = {
         "arch": model.arch,
         "config": model.config.to_dict(),
-        "domain": {**vars(domain), "scene": domain.scene.to_dict()},
+        "domain": domain.to_dict(),
         "provenance": provenance,
     }
     dtype = torch.float16 if half else torch.float32
@@ -131,10 +167,9 @@ def load_weights(path: str | Path) -> Weights:
         raise WeightsError(
             f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download."
         )
-    domain = header["domain"]
     return Weights(
         model=model.eval().requires_grad_(False),
-        domain=TrainingDomain(**{**domain, "scene": Scene.from_dict(domain["scene"])}),
+        domain=TrainingDomain.from_dict(header["domain"]),
         provenance=header["provenance"],
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
+from surrogate.models.atom_features import AtomFeatures
 from systems.elements import ATOMIC_NUMBERS, PARTICLE
+from systems.errors import InputError
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -20,12 +22,13 @@ class Molecule:
     """What a model is told of a scene, beside its frames.
 
     `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
-    `bonds` (n_bonds, 2) int64.
+    `bonds` (n_bonds, 2) int64; `atoms`: features of the covalent graph, for a model that asks for them.
     """
 
     elements: Tensor
     masses_da: Tensor
     bonds: Tensor
+    atoms: AtomFeatures | None = None
 
     @staticmethod
     def of(scene: Scene) -> Molecule:
@@ -42,11 +45,13 @@ class Molecule:
         return len(self.elements)
 
     def to(self, device: torch.device) -> Molecule:
-        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device))
+        atoms = None if self.atoms is None else self.atoms.to(device)
+        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), atoms)
 
     def permuted(self, order: Tensor) -> Molecule:
         """Return the molecule whose atom k is this one's atom order[k]."""
-        return Molecule(self.elements[order], self.masses_da[order], torch.argsort(order)[self.bonds])
+        atoms = None if self.atoms is None else self.atoms.permuted(order)
+        return Molecule(self.elements[order], self.masses_da[order], torch.argsort(order)[self.bonds], atoms)
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,16 @@ class Surrogate(nn.Module, ABC):
     @abstractmethod
     def n_new(self) -> int:
         """Frames one call returns."""
+
+    @property
+    def knows_bonds(self) -> bool:
+        """Whether the model wants a molecule's features of the covalent graph (`Molecule.atoms`)."""
+        return False
+
+    def at_lag(self, lag_ps: float) -> Surrogate:
+        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError where it was not trained
+        for that; most models have one spacing, that of their weights."""
+        raise InputError(f"{self.arch} was trained for one spacing of frames and takes no lag.")
 
     @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:

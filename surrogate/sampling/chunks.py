@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from surrogate.data.descriptions import describe
+from surrogate.models.interface import Surrogate, draw_noise
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
 
@@ -59,7 +60,7 @@ class ChunkSampler:
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
         self._model = with_bf16_weights(model) if self.bf16 else model
-        self._molecule = Molecule.of(template)
+        self._molecule = describe(model, template)
         self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry import bonded_graph, rotatable_torsions
+from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, cover, torsion_environments
+from surrogate.sampling.lags import at_lag, choose_lag
+from systems.chemistry import bonded_graph
 from systems.errors import OutOfDomainError
 from systems.matching import match_atoms
 from systems.scene import Scene
@@ -19,33 +20,23 @@ if TYPE_CHECKING:
     # Sampling and training know nothing of each other at run time: the api hands the weights over.
     from surrogate.data.weights import TrainingDomain, Weights
 
+__all__ = [
+    "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain", "match_scene",
+    "torsion_environments",
+]  # fmt: skip
 # A model that does not take the temperature as an input has one; a thermostat is set more finely than this by nobody.
 TEMPERATURE_TOLERANCE_K = 0.5
 
 
-@dataclass(frozen=True)
-class Deviation:
-    """One way in which a scene leaves the training domain.
-
-    `what`: elements, size, charge, bond types, torsion environments, connectivity, stereo, start or temperature.
-    `reason`: the two sides, in words. `forcible`: whether the model can be run nevertheless.
-    """
-
-    what: str
-    reason: str
-    forcible: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what a trajectory's record keeps of it."""
-        return {"what": self.what, "reason": self.reason}
-
-
 @dataclass(frozen=True, eq=False)
 class DomainMatch:
-    """Model atom k is scene atom `order[k]`, `(n_atoms,)`; `deviations` are those that were overruled."""
+    """Model atom k is scene atom `order[k]`, `(n_atoms,)`; `deviations` are those that were overruled. `domain`: of the
+    one molecule that the scene is rolled as; `seen` whether that was trained on."""
 
     order: npt.NDArray[np.int64]
+    domain: TrainingDomain
     deviations: tuple[Deviation, ...] = ()
+    seen: bool = True
 
 
 def find_deviations(
@@ -53,11 +44,12 @@ def find_deviations(
 ) -> tuple[Deviation, ...]:
     """Return how a scene leaves a training domain, the gravest first; nothing where the weights cover it.
 
-    Compared are elements, the number of atoms, the total charge, bond types (elements and order), the surroundings of
-    rotatable bonds, connectivity, stereo, the starting structure (by the validity of the training reference's frames)
-    and the temperature, where one is asked for.
+    Weights that know atoms by their bonds cover other molecules too: see `coverage.cover`. Compared are elements, the
+    number of atoms, the total charge, bond types (elements and order), the surroundings of rotatable bonds,
+    connectivity, stereo, the starting structure (by the validity of the training reference's frames) and the
+    temperature, where one is asked for.
     """
-    return _compare(scene, domain, temperature_k)[1]
+    return _compare(scene, domain, temperature_k).deviations
 
 
 def match_domain(
@@ -69,10 +61,11 @@ def match_domain(
     stereoisomer, a strained start and another temperature can, and the rollout's record says so.
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
-    order, deviations = _compare(scene, weights.domain, temperature_k)
+    found = _compare(scene, weights.domain, temperature_k)
+    deviations = found.deviations
     barred = [d for d in deviations if not d.forcible]
-    if order is not None and not barred and (force or not deviations):
-        return DomainMatch(order, deviations)
+    if not barred and (force or not deviations):
+        return found
     reasons = "; ".join(f"{d.what}: {d.reason}" for d in deviations)
     advice = (
         "Run `surromd reference` for this molecule, then `surromd train` on it."
@@ -85,6 +78,23 @@ def match_domain(
     )
 
 
+def fit_weights(
+    scene: Scene,
+    weights: Weights,
+    *,
+    temperature_k: float | None = None,
+    force: bool = False,
+    lag_ps: float | None = None,
+    save_every_ps: float | None = None,
+) -> tuple[Weights, DomainMatch]:
+    """Return weights as a rollout of this scene takes them, for one molecule at one lag, and the match to that.
+
+    Raises OutOfDomainError as `match_domain` does, InputError for a lag that the weights were not trained for.
+    """
+    match = match_domain(scene, weights, temperature_k=temperature_k, force=force)
+    return at_lag(weights, match.domain, choose_lag(weights, lag_ps, save_every_ps)), match
+
+
 def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     """Return `order (n_atoms,)` of a scene that the weights cover: model atom k is scene atom order[k].
 
@@ -93,45 +103,42 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     return match_domain(scene, weights).order
 
 
-def _compare(
-    scene: Scene, domain: TrainingDomain, temperature_k: float | None
-) -> tuple[npt.NDArray[np.int64] | None, tuple[Deviation, ...]]:
-    order, found = _compare_molecules(scene, domain.scene)
-    if order is not None:
-        found += _compare_start(scene, order, Geometry.from_dict(domain.geometry))
+def _compare(scene: Scene, domain: TrainingDomain, temperature_k: float | None) -> DomainMatch:
+    own, beyond = cover(scene, domain)
+    seen = not domain.transferable or any(own.scene is member.scene for member in domain.members)
+    found, order = list(beyond), np.arange(0)
+    if not seen:
+        order = np.arange(scene.n_atoms)
+    elif not beyond:
+        order, found = _compare_molecules(scene, own.scene)
+        if not any(not d.forcible for d in found):
+            found += _compare_start(scene, order, Geometry.from_dict(own.geometry))
     trained_k = domain.conditions.get("temperature_k")
     asked_k = trained_k if temperature_k is None else temperature_k
     if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
         reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
         found.append(Deviation("temperature", reason, forcible=True))
-    return order, tuple(found)
+    return DomainMatch(order, own, tuple(found), seen)
 
 
-def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.int64] | None, list[Deviation]]:
+def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.int64], list[Deviation]]:
+    """Return the order of atoms and what differs; the order means nothing where that cannot be forced."""
     try:
         return match_atoms(scene, template), []
     except OutOfDomainError as error:
         refusal = str(error).rstrip(".")
     found = [
-        *_compare_sets("elements", set(scene.elements), set(template.elements)),
+        *compare_sets("elements", scene, [template], lambda s: set(s.elements), forcible=False),
         *_compare_sizes(scene, template),
-        *_compare_sets("bond types", bond_types(scene), bond_types(template)),
-        *_compare_sets("torsion environments", torsion_environments(scene), torsion_environments(template)),
+        *compare_sets("bond types", scene, [template], bond_types, forcible=False),
+        *compare_sets("torsion environments", scene, [template], torsion_environments, forcible=False),
     ]
     if found or scene.interactions != template.interactions:
-        return None, found or [Deviation("connectivity", refusal, forcible=False)]
+        return np.arange(0), found or [Deviation("connectivity", refusal, forcible=False)]
     order = _order_without_stereo(scene, template)
     if order is None:
-        return None, [Deviation("connectivity", refusal, forcible=False)]
+        return np.arange(0), [Deviation("connectivity", refusal, forcible=False)]
     return order, [Deviation("stereo", refusal, forcible=True)]
-
-
-def _compare_sets(what: str, ours: set[str], theirs: set[str]) -> list[Deviation]:
-    new = sorted(ours - theirs)
-    if not new:
-        return []
-    listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
-    return [Deviation(what, f"{listed} not seen in training", forcible=False)]
 
 
 def _compare_sizes(scene: Scene, template: Scene) -> list[Deviation]:
@@ -167,33 +174,3 @@ def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64
     )
     image = next(matcher.isomorphisms_iter(), None)
     return None if image is None else np.array([image[k] for k in range(template.n_atoms)], dtype=np.int64)
-
-
-def bond_types(scene: Scene) -> set[str]:
-    """Return the kinds of bonds by elements and order: {'C-H', 'C=O', 'C:N', ...}; ~ where no order is given.
-
-    A bond between C, N or O inside an aromatic ring or a delocalised group has the order that its source draws.
-    """
-    symbol = {0.0: "~", 1.0: "-", 1.5: ":", 2.0: "=", 3.0: "#"}
-    kinds = set()
-    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
-        a, b = sorted((scene.elements[i], scene.elements[j]))
-        kinds.add(f"{a}{symbol.get(order, '~')}{b}")
-    return kinds
-
-
-def torsion_environments(scene: Scene) -> set[str]:
-    """Return the surroundings of each rotatable bond: the two atoms, each with its other neighbours.
-
-    'C(C,H,N)-C(N,O)' is psi of alanine. Names, order and positions play no part.
-    """
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
-
-    def end(atom: int, other: int) -> str:
-        rest = Counter(scene.elements[k] for k in near[atom] if k != other)
-        return f"{scene.elements[atom]}({','.join(sorted(rest.elements()))})"
-
-    return {"-".join(sorted((end(b, c), end(c, b)))) for _, b, c, _ in rotatable_torsions(scene).tolist()}

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.domain import DomainMatch, match_domain
+from surrogate.sampling.domain import DomainMatch
 from surrogate.sampling.settings import RolloutConfig
 from systems.errors import InputError
 from systems.scene import Scene
@@ -46,14 +46,12 @@ class Plan:
 
 
 def settle_plan(
-    scene: Scene, weights: Weights, config: RolloutConfig, sampler: ChunkSampler, *, n_replicas: int
+    scene: Scene, weights: Weights, match: DomainMatch, config: RolloutConfig, sampler: ChunkSampler, *, n_replicas: int
 ) -> Plan:
-    """Match the scene to the weights and turn durations into numbers of frames.
+    """Turn durations into numbers of frames; `weights` and `match` are what `domain.fit_weights` made of the scene.
 
-    Raises OutOfDomainError for a scene that the weights do not cover, UnitError for intervals that do not divide,
-    InputError for a selection that means no atom.
+    Raises UnitError for intervals that do not divide, InputError for a selection that means no atom.
     """
-    match = match_domain(scene, weights, temperature_k=config.temperature_k, force=config.force)
     lag_ps = weights.domain.lag_ps
     save_every_ps = lag_ps if config.save_every_ps is None else config.save_every_ps
     stride = whole_steps(save_every_ps, lag_ps, "save interval in the weights' frame spacing")
@@ -76,6 +74,8 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
+    if settings["lag_ps"] is None:
+        del settings["lag_ps"]  # as checkpoints of earlier versions have it
     return Plan(
         scene=scene,
         weights=weights,

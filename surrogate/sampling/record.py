@@ -43,6 +43,8 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         **weights.domain.conditions,
         "interventions": _interventions(plan, Tally(), {}, checks),
     }
+    if not plan.match.seen:
+        record["unseen_molecule"] = True
     if plan.match.deviations:
         record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
     if len(plan.kept_atoms) < plan.scene.n_atoms:

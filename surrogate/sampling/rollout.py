@@ -16,6 +16,7 @@ from surrogate.sampling.account import Clock, Tally
 from surrogate.sampling.checkpoint import Progress, checkpoint_path, read_checkpoint, write_checkpoint
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
+from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk, Interventions
 from surrogate.sampling.plan import Plan, settle_plan
@@ -59,8 +60,16 @@ def rollout(
     Raises OutOfDomainError, InputError, StorageError; SimulationError when the guard cannot bring a chunk through
     (under 'flag' and 'off' the chunk is in the file, marked; else what came before).
     """
+    weights, match = fit_weights(
+        scene,
+        weights,
+        temperature_k=config.temperature_k,
+        force=config.force,
+        lag_ps=config.lag_ps,
+        save_every_ps=config.save_every_ps,
+    )
     sampler = ChunkSampler(weights, solver_steps=config.solver_steps, solver=config.solver, precision=config.precision)
-    plan = settle_plan(scene, weights, config, sampler, n_replicas=len(outs))
+    plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     state_path = checkpoint_path(outs[0])
     if resume and not state_path.exists() and _just_begun(outs):
         resume, overwrite = False, True

@@ -13,7 +13,8 @@ GUARDS = ("off", "flag", "resample", "repair", "fallback")
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """One rollout. `save_every_ps` None keeps every model frame. `solver` None is the one that suits the weights, else
+    """One rollout. `save_every_ps` None keeps every model frame. `lag_ps` is the time between these, of weights that
+    were trained for several; None is what `lags.choose_lag` says. `solver` None is the one that suits the weights, else
     one that its model knows. `precision`: 'fp32', 'bf16' (autocast of the network; coordinates and integration stay
     fp32) or 'auto' (bf16 where the processor multiplies it in hardware).
 
@@ -25,6 +26,7 @@ class RolloutConfig:
 
     time_ps: float
     save_every_ps: float | None = None
+    lag_ps: float | None = None
     seed: int = 0
     solver_steps: int = 20
     solver: str | None = None

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from surrogate.sampling.checkpoint import UNREADABLE
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.domain import match_domain
+from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.openmm_state import SurrogateState
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
@@ -36,7 +36,8 @@ class Simulation:
     kineticEnergy=False, temperature=False)`.
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
-    `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how.
+    `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
+    the time of a step, of weights that were trained for several.
     Raises OutOfDomainError, InputError, WeightsError.
     """
 
@@ -51,12 +52,13 @@ class Simulation:
         precision: str = "auto",
         energy_fn: EnergyFn | None = None,
         force: bool = False,
+        lag_ps: float | None = None,
     ) -> None:
         import openmm
         from openmm import unit
 
         scene, weights = _given(scene, weights)
-        match = match_domain(scene, weights, force=force)
+        weights, match = fit_weights(scene, weights, force=force, lag_ps=lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
         self.topology = scene.to_openmm_topology()

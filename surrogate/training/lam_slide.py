@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,19 @@ import torch
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
+from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
+from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
-from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
+from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.training.provenance import provenance_of, training_domain
-from systems.elements import ATOMIC_NUMBERS
+from surrogate.training.subjects import Subject, normalise_latents, pick
 from systems.errors import InputError
+from systems.units import whole_steps
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
 LATENT_CACHE_BYTES = 2_000_000_000
@@ -56,6 +60,8 @@ class TrainingConfig:
     # Tell the network which rare state a window visits, and learn the odds of each kind by themselves: rare windows
     # then count as much as others and yet come as often as they should.
     rare_kinds: bool = False
+    # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
+    longest_lag_ps: float | None = None
 
     def stages(self) -> tuple[StageConfig, StageConfig]:
         share = STAGE_ONE_SHARE
@@ -70,7 +76,7 @@ class TrainingConfig:
 
 
 def train_lam_slide(
-    frames: TrainingFrames,
+    frames: TrainingFrames | FrameSets,
     out: str | Path,
     model_config: LamSlideConfig,
     config: TrainingConfig,
@@ -81,28 +87,22 @@ def train_lam_slide(
 ) -> Path:
     """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
 
+    Frames of several molecules (`data.molecules`) need a configuration with `graph`; each step is shown one of them.
     With `start`, stage two goes on from those weights for the whole budget, and stage one is taken over as it is.
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
-    n_atoms = frames.scene.n_atoms
-    if frames.canonical != model_config.canonical:
-        raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
-    if n_atoms > model_config.autoencoder.identifier_pool:
-        raise InputError(
-            f"{n_atoms} atoms need autoencoder.identifier_pool >= {n_atoms}, not "
-            f"{model_config.autoencoder.identifier_pool}."
-        )
+    sets = frames if isinstance(frames, FrameSets) else FrameSets((frames,))
+    first = sets.trained[0]
+    model_config = _settle(sets, model_config, config)
     length = model_config.approximator.chunk_frames
-    if config.rare_kinds and not model_config.approximator.rare_kinds:
-        told = replace(model_config.approximator, rare_kinds=rare_kinds(frames, length))
-        model_config = replace(model_config, approximator=told)
     told_of = model_config.approximator.rare_kinds
-    kinds = window_kinds(frames, told_of, length) if told_of else None
+    kinds = window_kinds(first, told_of, length) if told_of else None
+    strides = _strides(first, model_config)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
-    elements = torch.tensor([ATOMIC_NUMBERS[e] for e in frames.scene.elements], device=device)
+    subjects, unseen = ([Subject.of(f, model) for f in some] for some in (sets.trained, sets.unseen))
     log_path = out.with_suffix(".csv")
     states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
     if not resume and is_first_process():
@@ -110,23 +110,25 @@ def train_lam_slide(
             path.unlink(missing_ok=True)
     if start is None:
         one, two = config.stages()
-        spent_one = _stage_one(model, frames, elements, one, states[0], log_path, resume, progress)
-        normalise_latents(model, frames, elements, config.seed)
+        spent_one = _stage_one(model, subjects, unseen, one, states[0], log_path, resume, progress)
+        normalise_latents(model, subjects, config.seed)
     else:
-        _check_start(start, frames, model_config)
+        _check_start(start, first, model_config)
         two = replace(config.stages()[1], budget_s=config.budget_s)
         spent_one = 0.0
         _take_over(model, start)
     if kinds is not None and (start is None or not start.model.config.approximator.rare_kinds):
-        own = frames.window_starts(length, validation=False)
+        own = first.window_starts(length, validation=False)
         model.approximator.set_odds(np.bincount(kinds[own], minlength=len(told_of) + 1) / len(own))
 
-    domain = training_domain(frames)
+    domains = [training_domain(f, strides=strides if len(strides) > 1 else ()) for f in sets.trained]
+    domain = replace(domains[0], further=tuple(domains[1:]), transferable=model_config.graph)
 
     def write(spent_s: float) -> None:
-        save_weights(out, model, domain, _provenance(frames, config, spent_one, spent_s, start))
+        save_weights(out, model, domain, _provenance(sets, config, spent_one, spent_s, start))
 
-    spent_two = _stage_two(model, frames, elements, two, states[1], log_path, resume, progress, write, config, kinds)
+    spent_two = _stage_two(model, subjects, unseen, two, states[1], log_path, resume, progress, write, config, kinds,
+                           strides)  # fmt: skip
     if is_first_process():
         write(spent_two)
         for path in states:
@@ -135,108 +137,135 @@ def train_lam_slide(
     return out
 
 
-def _stage_one(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
-               resume: bool, progress: ProgressFn | None) -> float:  # fmt: skip
-    starts = frames.window_starts(1, validation=False)
-    held = frames.window_starts(1, validation=True)
-    held = held[np.linspace(0, len(held) - 1, min(2048, len(held))).astype(int)]
-    device = elements.device
+def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfig) -> LamSlideConfig:
+    """Return the configuration with what the frames decide. Raises InputError where the two do not fit."""
+    first = sets.trained[0]
+    if any(f.canonical != model_config.canonical for f in (*sets.trained, *sets.unseen)):
+        raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
+    if not model_config.graph:
+        if len(sets.trained) > 1 or sets.unseen:
+            raise InputError(f"{sets.names}: a model of several molecules knows atoms by their bonds; add --graph.")
+        if first.scene.n_atoms > model_config.autoencoder.identifier_pool:
+            raise InputError(
+                f"{first.scene.n_atoms} atoms need autoencoder.identifier_pool >= {first.scene.n_atoms}, not "
+                f"{model_config.autoencoder.identifier_pool}."
+            )
+    told = model_config.approximator
+    if config.longest_lag_ps is not None:
+        told = replace(told, lag_range_ps=(first.lag_ps, config.longest_lag_ps))
+    if (model_config.graph or told.lag_range_ps) and (config.rare_draws or config.rare_kinds or told.rare_kinds):
+        raise InputError("rare windows are told of one molecule at one lag; leave --rare-draws and --rare-kinds out.")
+    if config.rare_kinds and not told.rare_kinds:
+        told = replace(told, rare_kinds=rare_kinds(first, told.chunk_frames))
+    return replace(model_config, approximator=told)
 
-    def draw(generator: torch.Generator) -> Tensor:
-        idx = torch.randint(len(starts), (stage.batch,), generator=generator).numpy()
-        x = torch.from_numpy(frames.positions_nm(starts[idx]))
-        if not model.canonical:
-            x = torch.einsum("bij,bnj->bni", random_rotations(len(x), generator), x)
-        return x.to(device)
+
+def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
+    """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
+    lags = model_config.approximator.lag_range_ps
+    if lags is None:
+        return (1,)
+    if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
+        raise InputError(f"the model's lags begin at {lags[0]:g} ps, frames of {frames.scene.name} are saved every "
+                         f"{frames.lag_ps:g} ps.")  # fmt: skip
+    longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
+    if longest < 2:
+        raise InputError("the longest lag must be at least twice the frames' spacing; leave it out for one lag alone.")
+    return strides_up_to(longest)
+
+
+def _stage_one(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Subject], stage: StageConfig, state: Path,
+               log: Path, resume: bool, progress: ProgressFn | None) -> float:  # fmt: skip
+    starts = [subject.frames.window_starts(1, validation=False) for subject in subjects]
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        return autoencoder_loss(model, draw(generator), elements, generator)
+        k = pick(subjects, generator)
+        subject, own = subjects[k], starts[k]
+        idx = own[torch.randint(len(own), (stage.batch,), generator=generator).numpy()]
+        x = torch.from_numpy(subject.frames.positions_nm(idx))
+        x, atoms = subject.seen(model, x, subject.poses(model, len(x), generator))
+        return autoencoder_loss(model, x, subject.molecule.elements, generator, atoms)
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
-        x = torch.from_numpy(frames.positions_nm(held)).to(device)
-        error = model.decode(model.encode(x, elements), frames.scene.n_atoms) - x
-        return {"validation_rmsd_nm": float(error.square().sum(-1).mean().sqrt())}
+        found = {"validation_rmsd_nm": subjects, "unseen_rmsd_nm": unseen}
+        return {
+            name: float(np.mean([subject.reconstruction_error_nm(model) for subject in some]))
+            for name, some in found.items()
+            if some
+        }
 
-    return run_stage(model.autoencoder, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
-                     device=device, progress=progress)  # fmt: skip
-
-
-@torch.no_grad()
-def normalise_latents(model: LamSlide, frames: TrainingFrames, elements: Tensor, seed: int) -> None:
-    """Measure the latents' means and common scale on training frames and set them in the model."""
-    starts = frames.window_starts(1, validation=False)
-    idx = np.random.default_rng(seed).choice(len(starts), size=min(20_000, len(starts)), replace=False)
-    x = torch.from_numpy(frames.positions_nm(starts[np.sort(idx)])).to(elements.device)
-    model.latent_mean.zero_()
-    model.latent_scale.fill_(1.0)
-    z = model.encode(x, elements)
-    model.latent_mean.copy_(z.mean(0))
-    model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
+    return run_stage(model.first_stage, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+                     device=model.latent_mean.device, progress=progress)  # fmt: skip
 
 
-@torch.no_grad()
-def encode_all(model: LamSlide, frames: TrainingFrames, elements: Tensor, block: int = 8192) -> Tensor:
-    """Encode every frame once: `(n_frames, n_latents, latent_dim)` float32 on the CPU."""
-    parts = []
-    for start in range(0, frames.n_frames, block):
-        idx = np.arange(start, min(start + block, frames.n_frames))
-        x = torch.from_numpy(frames.positions_nm(idx)).to(elements.device)
-        parts.append(model.encode(x, elements).cpu())
-    return torch.cat(parts)
-
-
-def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool) -> Tensor:
-    """Return the frames `(b, length)` of windows from their first frames `(b,)`; reversed ones with probability 1/2."""
-    idx = first[:, None] + torch.arange(length)
+def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
+                  stride: Tensor | None = None) -> Tensor:  # fmt: skip
+    """Return the frames `(b, length)` of windows from their first frames `(b,)`, `stride` (b,) apart, one apart where
+    None; reversed ones with probability 1/2."""
+    ahead = torch.arange(length)[None]
+    idx = first[:, None] + (ahead if stride is None else ahead * stride[:, None])
     if not time_reversal:
         return idx
     backwards = torch.rand(len(idx), 1, generator=generator) < 0.5
     return torch.where(backwards, idx.flip(1), idx)
 
 
-def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage: StageConfig, state: Path, log: Path,
-               resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig,
-               kinds: npt.NDArray[np.int64] | None) -> float:  # fmt: skip
-    length = model.config.approximator.chunk_frames
-    n_atoms, device = frames.scene.n_atoms, elements.device
-    sampler = window_sampler(frames, length, config.rare_draws, kinds)
-    held = torch.from_numpy(frames.window_starts(length, validation=True))
-    held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
-    held_kinds = None if kinds is None else torch.from_numpy(kinds)[held].to(device)
-    model.autoencoder.requires_grad_(False)
+def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Subject], stage: StageConfig, state: Path,
+               log: Path, resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig,
+               kinds: npt.NDArray[np.int64] | None, strides: tuple[int, ...]) -> float:  # fmt: skip
+    length, device = model.config.approximator.chunk_frames, model.latent_mean.device
+    if len(strides) > 1:
+        wide = [StrideSampler.of(subject.frames, length, strides) for subject in subjects]
+    else:
+        plain = [window_sampler(subject.frames, length, config.rare_draws, kinds) for subject in subjects]
+    model.first_stage.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
-    ae = model.config.autoencoder
-    fits = 4 * frames.n_frames * ae.n_latents * ae.latent_dim <= LATENT_CACHE_BYTES
-    cache = encode_all(model, frames, elements).to(device) if model.canonical and fits else None
+    ae, turned = model.config.autoencoder, model.config.graph and model.config.atoms.turn
+    n_frames = sum(subject.frames.n_frames for subject in subjects)
+    if model.canonical and not turned and 4 * n_frames * ae.n_latents * ae.latent_dim <= LATENT_CACHE_BYTES:
+        for subject in subjects:
+            subject.keep_latents(model)
 
-    def windows(first: Tensor, generator: torch.Generator, *, time_reversal: bool = False) -> Tensor:
-        idx = window_frames(first, length, generator, time_reversal=time_reversal)
-        if cache is not None:
-            return cache[idx.to(device)]
-        x = torch.from_numpy(frames.positions_nm(idx.numpy()))
-        if not model.canonical:
-            x = torch.einsum("bij,btnj->btni", random_rotations(len(x), generator), x)
-        with torch.no_grad():
-            return model.encode(x.to(device), elements)
+    def loss_of(subject: Subject, idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator,
+                **more: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+        latents, atoms = subject.windows(model, idx, generator)
+        lags = None if stride is None else (stride * subject.frames.lag_ps).to(device)
+        told = model.told(atoms, lags, len(idx))
+        return flow_loss(model, latents, subject.n_atoms, tau, generator, atoms=atoms, told=told, **more)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        first, importance, kind = sampler.draw(stage.batch, generator)
+        k = pick(subjects, generator)
+        importance = kind = stride = None
+        if len(strides) > 1:
+            first, stride = wide[k].draw(stage.batch, generator)
+        else:
+            first, importance, kind = plain[k].draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
-        batch = windows(first, generator, time_reversal=config.time_reversal)
-        kind = None if kind is None else kind.to(device)
-        return flow_loss(model, batch, n_atoms, tau, generator, importance=importance.to(device), kind=kind)
+        idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
+        weight = None if importance is None else importance.to(device)
+        return loss_of(subjects[k], idx, stride, tau, generator, importance=weight,
+                       kind=None if kind is None else kind.to(device))  # fmt: skip
+
+    held = {name: [_held_windows(subject, length, strides, kinds) for subject in some]
+            for name, some in (("validation", subjects), ("unseen", unseen)) if some}  # fmt: skip
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
-        # The same noise and flow times each time, so that the curve shows the model and not the draw.
-        generator = torch.Generator().manual_seed(0)
-        tau = draw_flow_times(model, len(held), generator).to(device)
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
-            _, terms = flow_loss(model, windows(held, generator), n_atoms, tau, generator, kind=held_kinds)
-        return {f"validation_{k}": float(v) for k, v in terms.items()}
+        found: dict[str, list[float]] = {}
+        for name, windows in held.items():
+            for subject, idx, stride, kind in windows:
+                # The same noise and flow times each time, so that the curve shows the model and not the draw.
+                generator = torch.Generator().manual_seed(0)
+                tau = draw_flow_times(model, len(idx), generator).to(device)
+                with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
+                    _, terms = loss_of(subject, idx, stride, tau, generator,
+                                       kind=None if kind is None else kind.to(device))  # fmt: skip
+                for key, value in terms.items():
+                    found.setdefault(f"{name}_{key}", []).append(float(value))
+        return {key: float(np.mean(values)) for key, values in found.items()}
 
     next_snapshot = [config.snapshot_every_s or float("inf")]
 
@@ -251,6 +280,19 @@ def _stage_two(model: LamSlide, frames: TrainingFrames, elements: Tensor, stage:
                      device=device, progress=progress, on_save=on_save)  # fmt: skip
 
 
+def _held_windows(
+    subject: Subject, length: int, strides: tuple[int, ...], kinds: npt.NDArray[np.int64] | None
+) -> tuple[Subject, Tensor, Tensor | None, Tensor | None]:
+    """Return up to 256 held-out windows, evenly spaced, as frames `(b, length)`, their strides and kinds."""
+    if len(strides) > 1:
+        sampler = StrideSampler.of(subject.frames, length, strides, validation=True)
+        first, stride = sampler.draw(256, torch.Generator().manual_seed(0))
+        return subject, first[:, None] + torch.arange(length) * stride[:, None], stride, None
+    held = torch.from_numpy(subject.frames.window_starts(length, validation=True))
+    held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
+    return subject, held[:, None] + torch.arange(length), None, None if kinds is None else torch.from_numpy(kinds)[held]
+
+
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
     """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
     name, of = start.path.name, start.domain
@@ -259,7 +301,7 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
     same = replace(start.model.config, approximator=replace(start.model.config.approximator, rare_kinds=told))
     if same != model_config:
         raise InputError(f"{name} has another configuration; a training goes on with the one it began with.")
-    if of.scene.topology_hash != frames.scene.topology_hash:
+    if not model_config.graph and of.scene.topology_hash != frames.scene.topology_hash:
         raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
     if not np.isclose(of.lag_ps, frames.lag_ps, rtol=1e-4):
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
@@ -271,9 +313,9 @@ def _take_over(model: LamSlide, start: Weights) -> None:
     assert not surplus and all(name.startswith(("approximator.embed_kind", "approximator.odds")) for name in missing)
 
 
-def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float, spent_two: float,
+def _provenance(sets: FrameSets, config: TrainingConfig, spent_one: float, spent_two: float,
                 start: Weights | None) -> dict[str, Any]:  # fmt: skip
-    settings = {
+    settings: dict[str, Any] = {
         "seed": config.seed,
         "time_reversal": config.time_reversal,
         "rare_draws": config.rare_draws,
@@ -281,4 +323,6 @@ def _provenance(frames: TrainingFrames, config: TrainingConfig, spent_one: float
         "stage_one_s": round(spent_one, 1),
         "stage_two_s": round(spent_two, 1),
     }
-    return provenance_of(frames, settings, start)
+    if sets.unseen:
+        settings["held_out_molecules"] = [frames.scene.name for frames in sets.unseen]
+    return provenance_of(sets.trained[0], settings, start, sets.trained[1:])

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.atoms import Atoms
 from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.model import LamSlide
 
@@ -26,22 +27,26 @@ def random_rotations(n: int, generator: torch.Generator) -> Tensor:
 
 
 def autoencoder_loss(
-    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator
+    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator, atoms: Atoms | None = None
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1."""
+    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1, or,
+    where a model knows atoms by their bonds, their tags, and displacements from the template."""
     c = model.config.autoencoder
     batch, n_atoms, _ = frames_nm.shape
     x = frames_nm / model.config.position_scale_nm
-    identifiers = model.identifiers(n_atoms).expand(batch, n_atoms)
-    if c.random_identifiers > 0:
+    identifiers, rest = model.identifiers(n_atoms).expand(batch, n_atoms), torch.zeros((), device=x.device)
+    if atoms is not None:
+        each = atoms.spread(x.shape[:1])
+        identifiers, rest = each.tags, each.template
+    elif c.random_identifiers > 0:
         drawn = draw_identifiers(n_atoms, c.identifier_pool, batch, generator).to(x.device)
         pick = torch.rand(batch, 1, generator=generator).to(x.device) < c.random_identifiers
         identifiers = torch.where(pick, drawn, identifiers)
     numbers = elements.expand(batch, n_atoms)
-    latents = model.autoencoder.encode(x, numbers, identifiers)
+    latents = model.autoencoder.encode(x - rest, numbers, identifiers)
     noise = torch.randn(latents.shape, generator=generator).to(x.device)
     decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_elements=c.type_weight > 0)
-    position, distance = reconstruction_losses(x, decoded.positions)
+    position, distance = reconstruction_losses(x, decoded.positions + rest)
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
     if decoded.element_logits is not None:
@@ -66,11 +71,14 @@ def flow_loss(
     *,
     importance: Tensor | None = None,
     kind: Tensor | None = None,
+    atoms: Atoms | None = None,
+    told: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames, plus decoded position and distance.
 
     `importance` (b,): what each window counts (data.rarity); None is one each. With the `kind` (b,) of each window it
     counts in the cross entropy of the kinds alone: the network is told the kind, and within a kind draws are plain.
+    `atoms` and `told` (b, width): see `LamSlide.atoms_of` and `LamSlide.told`.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
@@ -80,7 +88,8 @@ def flow_loss(
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
-    prediction = model.approximator(alpha * latents + sigma * noise, tau, known, kind=kind)[:, c.n_conditioning :]
+    noisy = alpha * latents + sigma * noise
+    prediction = model.approximator(noisy, tau, known, kind=kind, told=told)[:, c.n_conditioning :]
     target = latents[:, c.n_conditioning :]
     weight = torch.ones_like(tau)
     if c.precondition:
@@ -96,9 +105,9 @@ def flow_loss(
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm
-        decoded = model.decode(prediction[:, pick], n_atoms) / scale
+        decoded = model.decode(prediction[:, pick], n_atoms, atoms) / scale
         with torch.no_grad():
-            clean = model.decode(target[:, pick], n_atoms) / scale
+            clean = model.decode(target[:, pick], n_atoms, atoms) / scale
         w = weight.reshape(-1, 1, 1, 1).sqrt()
         position = ((decoded - clean) * w).square().sum(-1).mean()
         i, j = torch.triu_indices(n_atoms, n_atoms, 1)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.atoms import Conditioning
 from surrogate.models.lam_slide.config import ApproximatorConfig
 from surrogate.models.layers import KeysValues, ParallelBlock, TimeEmbedding, rotary_angles
 from systems.errors import InputError
@@ -46,7 +47,8 @@ class Approximator(nn.Module):
     cos_latent: Tensor
     sin_latent: Tensor
 
-    def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int) -> None:
+    def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int, tag_dim: int = 0) -> None:
+        """`tag_dim`: of the tags of atoms, where the network is told of the molecule."""
         super().__init__()
         self.config = c = config
         if n_latents % c.latents_per_token:
@@ -61,6 +63,7 @@ class Approximator(nn.Module):
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
         self.final = nn.Linear(c.width, latent_dim)
+        self.conditioning = Conditioning(c.width, tag_dim, c.lag_range_ps) if tag_dim or c.lag_range_ps else None
         if c.n_kinds:
             if c.n_conditioning < 1:
                 raise InputError("rare_kinds need a conditioning frame, from which the odds of each kind follow.")
@@ -103,29 +106,33 @@ class Approximator(nn.Module):
         return (uniform[:, None] >= upper).sum(-1).clamp(max=self.config.n_kinds)
 
     def forward(
-        self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, kind: Tensor | None = None
-    ) -> Tensor:
+        self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, kind: Tensor | None = None,
+        told: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
         """Return the predicted data `(b, T, L, dim)`.
 
         `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
         first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
         `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds.
+        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds; `told`
+        (b, width): molecule and lag, as `conditioning` has them, for one that knows those.
         """
         c = self.config
-        told = None if kind is None else self.embed_kind(kind)[:, None, None, :]
+        of_kind = None if kind is None else self.embed_kind(kind)[:, None, None, :]
+        time = self.embed_time(tau) if told is None else self.embed_time(tau) + told
         if c.clean_conditioning:
-            known = self.remember(conditioning) if memory is None else memory
+            known = self.remember(conditioning, told) if memory is None else memory
             n_known = conditioning.shape[1]
-            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, tau, known, n_known, told))
+            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, time, known, n_known, of_kind))
             return torch.cat([conditioning.to(found.dtype), found], dim=1)
-        return self._denoise(o, tau, lambda x: self._network(x, tau, conditioning, told))
+        return self._denoise(o, tau, lambda x: self._network(x, time, conditioning, of_kind))
 
-    def remember(self, conditioning: Tensor) -> Memory:
+    def remember(self, conditioning: Tensor, told: Tensor | None = None) -> Memory:
         """Return keys and values of clean frames `(b, n_conditioning, L, dim)`, which see each other alone and no flow
         time but that of the data (tau = 1)."""
         h = self.embed_conditioning(self._tokens(conditioning)) + self.embed_mask.weight[1] + self.embed_latent
-        modulation, _ = self._modulations(torch.ones(len(h), device=h.device))
+        time = self.embed_time(torch.ones(len(h), device=h.device))
+        modulation, _ = self._modulations(time if told is None else time + told)
         memory: Memory = []
         h = h.transpose(1, 2)
         for layer in self.layers:
@@ -140,7 +147,7 @@ class Approximator(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
         return skip * o + out * network(o * scale_in)
 
-    def _network(self, o: Tensor, tau: Tensor, conditioning: Tensor, told: Tensor | None) -> Tensor:
+    def _network(self, o: Tensor, time: Tensor, conditioning: Tensor, of_kind: Tensor | None) -> Tensor:
         shape = o.shape
         o, conditioning = self._tokens(o), self._tokens(conditioning)
         n_known, n_frames = conditioning.shape[1], o.shape[1]
@@ -150,17 +157,17 @@ class Approximator(nn.Module):
         noisy = torch.where(known[None, :, None, None] == 1, 0.0, o)
         h = self.embed_noisy(noisy) + self.embed_conditioning(padded)
         h = h + self.embed_mask(known)[None, :, None, :] + self.embed_latent
-        h = h if told is None else h + told
-        return self._transform(h, tau, 0, [None] * len(self.layers)).reshape(shape)
+        h = h if of_kind is None else h + of_kind
+        return self._transform(h, time, 0, [None] * len(self.layers)).reshape(shape)
 
-    def _network_after(self, o: Tensor, tau: Tensor, memory: Memory, n_known: int, told: Tensor | None) -> Tensor:
+    def _network_after(self, o: Tensor, time: Tensor, memory: Memory, n_known: int, of_kind: Tensor | None) -> Tensor:
         h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
-        h = h if told is None else h + told
-        return self._transform(h, tau, n_known, memory).reshape(o.shape)
+        h = h if of_kind is None else h + of_kind
+        return self._transform(h, time, n_known, memory).reshape(o.shape)
 
-    def _transform(self, h: Tensor, tau: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:
+    def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:
         """Embedded frames `(b, T, L, width)`, of which the first has the place `first`, through all layers."""
-        modulation, final_modulation = self._modulations(tau)
+        modulation, final_modulation = self._modulations(time)
         ropes = self._ropes(first, h.shape[1])
         h = h.transpose(1, 2)
         for layer, before in zip(self.layers, past, strict=True):
@@ -173,8 +180,9 @@ class Approximator(nn.Module):
         per_token = self.config.latents_per_token
         return o if per_token == 1 else o.unflatten(2, (-1, per_token)).flatten(-2)
 
-    def _modulations(self, tau: Tensor) -> tuple[Tensor, Tensor]:
-        time = F.silu(self.embed_time(tau))
+    def _modulations(self, time: Tensor) -> tuple[Tensor, Tensor]:
+        """From the embedded flow time `(b, width)`, molecule and lag included where the network knows them."""
+        time = F.silu(time)
         return self.modulation(time).unflatten(-1, (6, -1)), self.final_modulation(time)
 
     def _ropes(self, first: int, n_frames: int) -> tuple[Rope, Rope]:

@@ -58,9 +58,15 @@ class Autoencoder(nn.Module):
         self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
         self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))
 
+    def tags(self, identifiers: Tensor) -> Tensor:
+        """Identifiers `(b, n)` -> what tells atoms apart, `(b, n, identifier_dim)`; such tags given stay as they are
+        (lam_slide.atoms makes them of the covalent graph)."""
+        tags: Tensor = identifiers if identifiers.is_floating_point() else self.identifiers(identifiers)
+        return tags
+
     def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
         """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
-        entity = self.embed_entity(torch.cat([self.elements(elements), self.identifiers(identifiers)], dim=-1))
+        entity = self.embed_entity(torch.cat([self.elements(elements), self.tags(identifiers)], dim=-1))
         scale, shift = entity.chunk(2, dim=-1)
         tokens = self.embed_coordinates(fourier_features(x, self.config.n_octaves)) * scale + shift
         tokens = tokens + self.embed(tokens)
@@ -74,7 +80,7 @@ class Autoencoder(nn.Module):
         """Latents `(b, n_latents, dim)`, identifiers `(b, n)` -> positions `(b, n, 3)` (scaled), element logits."""
         context = F.layer_norm(latents, (self.config.latent_dim,))
         # The residual stream and the last layer stay in float32: bf16 would round positions to 0.001 nm.
-        h = self.query(self.identifiers(identifiers)).float()
+        h = self.query(self.tags(identifiers)).float()
         for block in self.decoder:
             h = block(h, context)
         logits = self.to_element(h).float() if with_elements else None

@@ -8,6 +8,7 @@ from typing import Any
 
 from surrogate.models.lam_slide.kinds import Kind
 from surrogate.models.settings import build, read_toml
+from systems.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class ApproximatorConfig:
     position_weight: float = 0.25
     distance_weight: float = 0.25
     auxiliary_frames: int = 4
+    # Shortest and longest spacing of frames, in ps: the network is told which it is asked for. None: one spacing alone.
+    lag_range_ps: tuple[float, float] | None = None
     # Kinds of rare windows that the network is told of and a head gives the odds of (data.rarity).
     rare_kinds: tuple[Kind, ...] = ()
 
@@ -66,14 +69,35 @@ class ApproximatorConfig:
 
 
 @dataclass(frozen=True)
+class GraphConfig:
+    """Atoms known by the covalent graph (`LamSlideConfig.graph`). `turn`: training turns each window at random, its
+    template with it; else every molecule keeps the pose that its own shape decides (data.poses)."""
+
+    width: int = 96
+    n_rounds: int = 4
+    n_octaves: int = 3
+    turn: bool = False
+
+
+@dataclass(frozen=True)
 class LamSlideConfig:
     """The whole model. `canonical`: frames are superposed on the template by heavy atoms (exact SE(3) equivariance);
-    without it, training rotates at random instead (the paper's augmentation)."""
+    without it, training rotates at random instead (the paper's augmentation).
+
+    `graph`: atoms are known by their bonds and by where their molecule's template has them, not by identifiers, and
+    the network codes how far they are from there: one model for many molecules, and unseen ones.
+    """
 
     canonical: bool = True
     position_scale_nm: float = 0.2
+    graph: bool = False
+    atoms: GraphConfig = field(default_factory=GraphConfig)
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
     approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
+
+    def __post_init__(self) -> None:
+        if self.graph and not self.canonical:
+            raise InputError("graph = true lays frames on each molecule's template; leave canonical = true.")
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -84,7 +108,11 @@ class LamSlideConfig:
         record = dict(record)
         approximator = dict(record.pop("approximator", {}))
         approximator["rare_kinds"] = tuple(Kind.of(k) for k in approximator.pop("rare_kinds", ()))
+        if approximator.get("lag_range_ps") is not None:
+            low, high = approximator["lag_range_ps"]
+            approximator["lag_range_ps"] = (float(low), float(high))
         sub = {
+            "atoms": build(GraphConfig, record.pop("atoms", {}), "atoms."),
             "autoencoder": build(AutoencoderConfig, record.pop("autoencoder", {}), "autoencoder."),
             "approximator": build(ApproximatorConfig, approximator, "approximator."),
         }

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.approximator import Approximator
+from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.kinds import kinds_of_windows
+from systems.errors import InputError
 
 # Of a chunk that is not of the kind that was drawn.
 MAX_REDRAWS = 40
@@ -38,7 +41,11 @@ class LamSlide(Surrogate):
         self.solvers = flow.solvers_for(config.approximator.interpolant)
         ae = config.autoencoder
         self.autoencoder = Autoencoder(ae)
-        self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim)
+        self.atom_encoder = AtomEncoder(config.atoms, ae.identifier_dim) if config.graph else None
+        tag_dim = ae.identifier_dim if config.graph else 0
+        self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim, tag_dim)
+        # Of the frames that `next_chunk` returns; the shortest that it knows, until `at_lag` says otherwise.
+        self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
         self.register_buffer("latent_mean", torch.zeros(ae.n_latents, ae.latent_dim))
         self.register_buffer("latent_scale", torch.ones(()))
 
@@ -59,20 +66,71 @@ class LamSlide(Surrogate):
         permutes identifiers with them, because scenes are matched to the template before they get here."""
         return torch.arange(n_atoms, device=self.latent_mean.device)
 
-    def encode(self, frames_nm: Tensor, elements: Tensor) -> Tensor:
-        """Frames `(..., n_atoms, 3)` nm -> latents `(..., n_latents, latent_dim)`."""
+    @property
+    def first_stage(self) -> nn.Module:
+        """What stage one trains and stage two leaves as it is."""
+        if self.atom_encoder is None:
+            return self.autoencoder
+        return nn.ModuleDict({"autoencoder": self.autoencoder, "atom_encoder": self.atom_encoder})
+
+    def at_lag(self, lag_ps: float) -> LamSlide:
+        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
+        known = self.config.approximator.lag_range_ps
+        if known is None or not known[0] * (1 - 1e-6) <= lag_ps <= known[1] * (1 + 1e-6):
+            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
+        model = copy.copy(self)
+        model.lag_ps = lag_ps
+        return model
+
+    @property
+    def knows_bonds(self) -> bool:
+        return self.config.graph
+
+    def atoms_of(self, molecule: Molecule, turns: Tensor | None = None) -> Atoms | None:
+        """Return what the network is told of a molecule's atoms, with `turns` (b, 3, 3) in b poses; None of a model
+        that goes by identifiers."""
+        if self.atom_encoder is None:
+            return None
+        if molecule.atoms is None:
+            raise InputError("this model knows atoms by their bonds; make molecules by `data.descriptions.describe`.")
+        template = molecule.atoms.template_nm[None] / self.config.position_scale_nm
+        template = template if turns is None else template @ turns.mT
+        return Atoms(self.atom_encoder(molecule, molecule.atoms, template), template)
+
+    def told(self, atoms: Atoms | None, lag_ps: Tensor | None, rows: int) -> Tensor | None:
+        """Return what the latent flow is told `(rows, width)` of the molecule and of the lags `(rows,)` asked for (the
+        model's own where None); None of a model that is told neither."""
+        conditioning = self.approximator.conditioning
+        if conditioning is None:
+            return None
+        if lag_ps is None and self.lag_ps is not None:
+            lag_ps = torch.full((rows,), self.lag_ps, device=self.latent_mean.device)
+        found: Tensor = conditioning(atoms, lag_ps)
+        return found.expand(rows, -1)
+
+    def encode(self, frames_nm: Tensor, elements: Tensor, atoms: Atoms | None = None) -> Tensor:
+        """Frames `(..., n_atoms, 3)` nm -> latents `(..., n_latents, latent_dim)`. `atoms`: of each leading row, or one
+        for all."""
         lead, n_atoms = frames_nm.shape[:-2], frames_nm.shape[-2]
         x = frames_nm.reshape(-1, n_atoms, 3).float() / self.config.position_scale_nm
         rows = x.shape[0]
-        z = self.autoencoder.encode(x, elements.expand(rows, n_atoms), self.identifiers(n_atoms).expand(rows, n_atoms))
+        tags = self.identifiers(n_atoms).expand(rows, n_atoms)
+        if atoms is not None:
+            each = atoms.spread(lead)
+            x, tags = x - each.template, each.tags
+        z = self.autoencoder.encode(x, elements.expand(rows, n_atoms), tags)
         return ((z - self.latent_mean) / self.latent_scale).unflatten(0, lead)
 
-    def decode(self, latents: Tensor, n_atoms: int) -> Tensor:
-        """Latents `(..., n_latents, latent_dim)` -> frames `(..., n_atoms, 3)` nm."""
+    def decode(self, latents: Tensor, n_atoms: int, atoms: Atoms | None = None) -> Tensor:
+        """Latents `(..., n_latents, latent_dim)` -> frames `(..., n_atoms, 3)` nm; `atoms` as for `encode`."""
         lead = latents.shape[:-2]
         z = latents.reshape(-1, *latents.shape[-2:]) * self.latent_scale + self.latent_mean
-        decoded = self.autoencoder.decode(z, self.identifiers(n_atoms).expand(z.shape[0], n_atoms))
-        return (decoded.positions * self.config.position_scale_nm).unflatten(0, lead)
+        if atoms is None:
+            x = self.autoencoder.decode(z, self.identifiers(n_atoms).expand(z.shape[0], n_atoms)).positions
+        else:
+            each = atoms.spread(lead)
+            x = self.autoencoder.decode(z, each.tags).positions + each.template
+        return (x * self.config.position_scale_nm).unflatten(0, lead)
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         ae = self.config.autoencoder
@@ -88,22 +146,25 @@ class LamSlide(Surrogate):
             mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
             return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
         c = self.config.approximator
-        known = self.encode(last_frames_nm, molecule.elements)
+        atoms = self.atoms_of(molecule)
+        known = self.encode(last_frames_nm, molecule.elements, atoms)
+        of_molecule = self.told(atoms, None, len(known))
         kind = self.approximator.draw_kinds(known, noise)
         evaluations = 0.0
 
         def solve(rows: Tensor, noise: Tensor) -> Tensor:
             told = None if kind is None else kind[rows]
             before = known[rows]
-            memory = self.approximator.remember(before) if c.clean_conditioning else None
+            about = None if of_molecule is None else of_molecule[rows]
+            memory = self.approximator.remember(before, about) if c.clean_conditioning else None
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 nonlocal evaluations
                 evaluations += len(rows) / len(known)
-                return self.approximator(o, tau, before, memory, told)
+                return self.approximator(o, tau, before, memory, told, about)
 
             latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
-            return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
+            return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2], atoms)
 
         frames = solve(torch.arange(len(noise), device=noise.device), noise)
         if kind is not None:

@@ -120,7 +120,7 @@ def test_chunks_are_of_the_kind_that_was_drawn(
     network.approximator.set_odds([0.5 if k in (0, visits) else 0.0 for k in range(len(KINDS) + 1)])
     calls: list[int] = []
 
-    def decode(latents: torch.Tensor, n_atoms: int) -> torch.Tensor:
+    def decode(latents: torch.Tensor, n_atoms: int, atoms: None = None) -> torch.Tensor:
         """Half of all rows, by a number of theirs, visit the mirror image in their middle."""
         calls.append(len(latents))
         rare = latents[:, 0, 0, 0] > 0
