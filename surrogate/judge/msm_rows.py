@@ -22,6 +22,8 @@ IntArray = npt.NDArray[np.int64]
 Skipped = tuple[str, str]
 
 _CHECKED_LAGS = 5
+# A process is of every state that carries this share of its variance in the reference.
+_LEAST_SHARE = 0.25
 _DRAWN_LAGS = (0.2, 0.5, 1.0, 2.0, 3.0, 5.0)
 _LANDSCAPE_BINS = 50
 ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
@@ -60,11 +62,12 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     states = [_states(model, s, x) for s, x in zip(trio.samples, coordinates, strict=True)]
     names = state_names(trio, states[0].macro, model.n_states)
     rows = [_population_row(trio, states), _transition_row(trio, states, format_time_ps(lag * lag_ps))]
-    rows += _timescale_rows(trio, model, states)
+    timescales, skipped = _timescale_rows(trio, model, states, names)
+    rows += timescales
     charts: list[Chart] = [*_landscape(trio, states), _free_energies(trio, model, states, names)]
     charts += [_check_chart(trio, model, s, role) for s, role in zip(states[:2], ROLES, strict=False)]
-    charts.append(_timescale_chart(trio, model, states))
-    return rows, charts, []
+    charts.append(_timescale_chart(trio, model, states, names))
+    return rows, charts, skipped
 
 
 def _states(model: msm.Model, sample: Sample, coordinates: list[FloatArray]) -> _States:
@@ -119,25 +122,58 @@ def _transition_row(trio: Trio, states: Sequence[_States], lag: str) -> Row:
     )
 
 
-def _timescale_rows(trio: Trio, model: msm.Model, states: Sequence[_States]) -> list[Row]:
+def _never_visited(s: _States) -> npt.NDArray[np.bool_]:
+    """Return whether each metastable state `(n_states,)` holds no frame of a sample."""
+    return np.asarray(s.occupancy.sum(0)[:-1] == 0)
+
+
+def _states_of(model: msm.Model, function: FloatArray, counts: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which metastable states `(n_states,)` a process is of: those that carry much of its variance.
+
+    `function` `(n_micro,)` of mean zero in the reference, whose transition counts are `counts` `(n_micro, n_micro)`.
+    """
+    weight = (counts.sum(0) + counts.sum(1)) * function**2
+    inside = model.state_of >= 0
+    share = np.bincount(model.state_of[inside], weights=weight[inside], minlength=model.n_states)
+    return np.asarray(share >= _LEAST_SHARE * weight.sum())
+
+
+def _timescale_rows(
+    trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]
+) -> tuple[list[Row], list[Skipped]]:
+    """Return a row for each slow process of the reference, and those that the candidate's data say nothing about.
+
+    The process that leads into a state where the candidate never is cannot be timed there: what its function decays
+    by in such a trajectory is motion within the other states.
+    """
     lag_ps = trio.reference.features.lag_ps
     lag = model.lag_frames * lag_ps
     n_slow, n_micro = model.n_states - 1, len(model.centres)
-    _, functions = msm.slow_functions(states[0].micro_counts.sum(0).reshape(n_micro, n_micro), n_slow)
-    sums = [[msm.function_sums(s.micro_counts, f) for f in functions] for s in states]
-    rows = []
-    for k in range(n_slow):
+    counts = states[0].micro_counts.sum(0).reshape(n_micro, n_micro)
+    _, functions = msm.slow_functions(counts, n_slow)
+    rows: list[Row] = []
+    skipped: list[Skipped] = []
+    for k, function in enumerate(functions):
+        metric = f"Implied timescale {k + 1} of the Markov state model"
+        of = _states_of(model, function, counts)
+        _, missing, missing_in_replicate = (of & _never_visited(s) for s in states)
+        if missing.any():
+            where = " and ".join(names[i] for i in np.flatnonzero(missing).tolist())
+            skipped.append((metric, f"the candidate is never in {where}, into which this process leads"))
+            continue
+        sums = [msm.function_sums(s.micro_counts, function) for s in states]
+        values = [float(timescale(lagged_eigenvalue(own), lag)) for own in sums]
+        draws = [timescale(lagged_eigenvalue(own, s.sample.weights), lag) for own, s in zip(sums, states, strict=True)]
+        if missing_in_replicate.any():
+            values[2], draws[2] = math.nan, np.full_like(draws[2], np.nan)
         rows.append(
             observable_row(
                 trio,
-                [float(timescale(lagged_eigenvalue(own[k]), lag)) for own in sums],
-                [
-                    timescale(lagged_eigenvalue(own[k], s.sample.weights), lag)
-                    for own, s in zip(sums, states, strict=True)
-                ],
+                values,
+                draws,
                 key=f"msm_timescale:{k + 1}",
                 group="kinetics",
-                metric=f"Implied timescale {k + 1} of the Markov state model",
+                metric=metric,
                 unit="ps",
                 tolerance=0.2,
                 tolerance_text="± 20 %",
@@ -145,7 +181,7 @@ def _timescale_rows(trio: Trio, model: msm.Model, states: Sequence[_States]) -> 
                 log=True,
             )
         )
-    return rows
+    return rows, skipped
 
 
 def _landscape(trio: Trio, states: Sequence[_States]) -> list[Chart]:
@@ -215,25 +251,34 @@ def _check_chart(trio: Trio, model: msm.Model, s: _States, role: Role) -> Chart:
     )
 
 
-def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States]) -> Chart:
-    """Implied timescales against the lag they were estimated at: level where the model is Markovian."""
+def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:
+    """Implied timescales against the lag they were estimated at: level where the model is Markovian.
+
+    Of what is never in one of the states there is one process less.
+    """
     lag_ps = trio.reference.features.lag_ps
     n_micro, n_slow = len(model.centres), model.n_states - 1
     longest = min(max(s.sample.features.segment_lengths) for s in states)
     lags = sorted({max(1, round(f * model.lag_frames)) for f in _DRAWN_LAGS})
     lags = [lag for lag in lags if 10 * lag <= longest]
     lines = []
+    caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference."
     for s, role in zip(states, ROLES, strict=True):
+        missing = _never_visited(s)
+        if missing.any():
+            where = " and ".join(names[i] for i in np.flatnonzero(missing).tolist())
+            caption += f" The {role} is never in {where}, and has so many processes less."
         times = []
         for lag in lags:
             counts = msm.block_transitions(s.micro, s.sample.blocks, n_micro, lag).sum(0).reshape(n_micro, n_micro)
             times.append(timescale(msm.slow_functions(counts, n_slow)[0], lag * lag_ps))
         table = np.array(times)
-        lines += [Line(f"{role}, process {k + 1}", role, np.array(lags) * lag_ps, table[:, k]) for k in range(n_slow)]
+        n_own = n_slow - int(missing.sum())
+        lines += [Line(f"{role}, process {k + 1}", role, np.array(lags) * lag_ps, table[:, k]) for k in range(n_own)]
     return LineChart(
         section="kinetics",
         title="Implied timescales",
-        caption="Of the Markov state model against the lag it is estimated at; states are those of the reference.",
+        caption=caption,
         x_label="lag / ps",
         y_label="timescale / ps",
         lines=tuple(lines),

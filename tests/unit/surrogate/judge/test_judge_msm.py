@@ -132,3 +132,44 @@ def test_rows_pass_a_replicate_and_reject_a_wrong_time_axis(trio: tuple[Ensemble
     titles = [getattr(chart, "title", "") for chart in fair.curves.charts]
     for title in ("TICA landscape", "Free energies of the metastable states", "Implied timescales"):
         assert title in titles
+
+
+def phi_of(ensemble: Ensemble) -> np.ndarray:
+    from systems.chemistry import backbone_torsions
+    from systems.geometry import torsion
+
+    return torsion(ensemble.segments[0][:], backbone_torsions(ensemble.scene)["phi"])[:, 0]
+
+
+def test_a_process_into_a_state_that_is_never_visited_is_not_timed(trio: tuple[Ensemble, Ensemble, Ensemble]) -> None:
+    """The toy's left-handed state (phi > 0) is cut out of the candidate, or of the replicate."""
+    from dataclasses import replace
+
+    reference, candidate, replicate = trio
+    options = replace(QUICK, tica_lag_ps=2.0)
+    blind = replace(candidate, segments=[candidate.segments[0][:][phi_of(candidate) < 0]])
+    fair, wrong = compare(reference, [candidate, blind], replicate, options=options).judgements
+    timed = {row.key for row in fair.rows if row.key.startswith("msm_timescale")}
+    assert len(timed) >= 2
+    assert not any(what.startswith("Implied timescale") for what, _ in fair.skipped)
+    left_out = [(what, why) for what, why in wrong.skipped if what.startswith("Implied timescale")]
+    kept = {row.key for row in wrong.rows if row.key.startswith("msm_timescale")}
+    assert len(left_out) + len(kept) == len(timed) and left_out and kept, (
+        "the process between the others is still timed"
+    )
+    assert "the candidate is never in state" in left_out[0][1] and "φ 6" in left_out[0][1]
+    # What it lacks is not forgiven: the populations say so.
+    assert wrong.row("msm_jsd").verdict == "differs"
+
+    def drawn(judgement, role: str) -> int:  # type: ignore[no-untyped-def]
+        chart = next(c for c in judgement.curves.charts if getattr(c, "title", "") == "Implied timescales")
+        assert ("never in state" in chart.caption) == (judgement is not fair)
+        return sum(line.role == role for line in chart.lines)
+
+    assert drawn(wrong, "candidate") == len(timed) - 1 == drawn(fair, "candidate") - 1
+
+    lame = replace(replicate, segments=[replicate.segments[0][:][phi_of(replicate) < 0]])
+    (other,) = compare(reference, [candidate], lame, options=options).judgements
+    gone = [row for row in other.rows if row.key.startswith("msm_timescale") and not np.isfinite(row.replicate.value)]
+    assert len(gone) == len(left_out) and all(np.isfinite(row.candidate.value) for row in gone)
+    assert all(row.verdict in ("agrees", "undecided") for row in gone)
