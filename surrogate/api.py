@@ -149,6 +149,8 @@ def train(
     time_reversal: bool = False,
     rare_draws: float = 0.0,
     rare_kinds: bool = False,
+    graph: bool = False,
+    longest_lag_ps: float | None = None,
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
@@ -165,7 +167,11 @@ def train(
     on; without any it is the last twentieth of each. A stretch of motion that would be both trained on and validated
     on is refused. `time_reversal` shows every other window backwards,
     right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
-    (surrogate.data.rarity), `rare_kinds` also tells the network which, and learns how often each comes. Beside `out`, a
+    (surrogate.data.rarity), `rare_kinds` also tells the network which, and learns how often each comes.
+    `graph`: lam-slide knows atoms by their bonds, so that references may be of many molecules and the weights cover
+    unseen ones that look like them (surrogate.sampling.coverage); trajectories in `validation` of molecules that are
+    not trained on hold those out whole. `longest_lag_ps`: lam-slide learns every spacing of frames from that of the
+    references to this one, and takes it as an input. Beside `out`, a
     CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
     drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
@@ -190,6 +196,8 @@ def train(
         time_reversal=time_reversal,
         rare_draws=rare_draws,
         rare_kinds=rare_kinds,
+        graph=graph,
+        longest_lag_ps=longest_lag_ps,
         seed=seed,
         device=device,
         resume=resume,

@@ -267,6 +267,12 @@ def train(
     rare_kinds: Annotated[
         bool, typer.Option("--rare-kinds", help="Tell the network the rare state, and learn how often each comes.")
     ] = False,
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Know atoms by their bonds: one model for many molecules, and unseen ones.")
+    ] = False,
+    longest_lag: Annotated[
+        str | None, typer.Option("--longest-lag", help="Learn every frame spacing up to this one, such as 1ns.")
+    ] = None,
     device: DeviceOpt = "auto",
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,
@@ -289,6 +295,8 @@ def train(
         time_reversal=time_reversal,
         rare_draws=rare_draws,
         rare_kinds=rare_kinds,
+        graph=graph,
+        longest_lag_ps=None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag"),
         seed=seed,
         device=device,
         resume=resume,
@@ -311,6 +319,9 @@ def rollout(
     out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
     save_every: Annotated[
         str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
+    ] = None,
+    lag: Annotated[
+        str | None, typer.Option("--lag", help="Of one step, of weights for several. Default: --save-every if it fits.")
     ] = None,
     replicas: Replicas = 1,
     solver: Annotated[Solver | None, typer.Option("--solver", help="Default: the one that suits the weights.")] = None,
@@ -339,6 +350,7 @@ def rollout(
         out,
         time_ps=parse_time_ps(time, "--time"),
         save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
+        lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
         replicas=replicas,
         seed=seed,
         solver=None if solver is None else solver.value,

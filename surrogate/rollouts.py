@@ -24,6 +24,7 @@ def rollout(
     *,
     time_ps: float,
     save_every_ps: float | None = None,
+    lag_ps: float | None = None,
     replicas: int = 1,
     seed: int = 0,
     solver: str | None = None,
@@ -44,7 +45,9 @@ def rollout(
     """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
 
     `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
-    the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Replicas
+    the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Weights
+    that were trained for several lags step at `lag_ps`, by default at the longest that `save_every_ps` is a multiple
+    of; weights that know atoms by their bonds take molecules that look like those they were trained on. Replicas
     run in one batch and are named as by `reference`. `solver`: 'multistep', 'euler' or the adaptive 'dopri5', None for
     the one that suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
 
@@ -66,12 +69,14 @@ def rollout(
     molecule = prepare_scene(scene, preparation, quiet=quiet)
 
     from surrogate.data.weights import load_weights
+    from surrogate.sampling.lags import choose_lag
     from surrogate.sampling.rollout import RolloutConfig
     from surrogate.sampling.rollout import rollout as roll
 
     config = RolloutConfig(
         time_ps=time_ps,
         save_every_ps=save_every_ps,
+        lag_ps=lag_ps,
         seed=seed,
         solver=solver,
         precision=precision,
@@ -87,7 +92,7 @@ def rollout(
         config = replace(config, solver_steps=solver_steps)
     loaded = load_weights(file)
     label = f"surrogate {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
-    saved_ps = loaded.domain.lag_ps if save_every_ps is None else save_every_ps
+    saved_ps = choose_lag(loaded, lag_ps, save_every_ps) if save_every_ps is None else save_every_ps
     with (
         guarded_outputs(outs, resumable="the same command with --resume goes on"),
         # The verb counts the frames of one replica; all advance together.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +36,8 @@ class TrainingRequest:
     time_reversal: bool
     rare_draws: float
     rare_kinds: bool
+    graph: bool
+    longest_lag_ps: float | None
     seed: int
     device: str
     resume: bool
@@ -52,9 +54,12 @@ class TrainingRequest:
                 raise InputError("--steps must be at least 2: one for each stage.")
             if self.start_from is not None and self.config is not None:
                 raise InputError("--from takes the configuration of its weights; leave --config out.")
+            if self.start_from is not None and (self.graph or self.longest_lag_ps is not None):
+                raise InputError("--from takes the configuration of its weights; leave --graph and --longest-lag out.")
         else:
             others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws,
-                      "--rare-kinds": self.rare_kinds}  # fmt: skip
+                      "--rare-kinds": self.rare_kinds, "--graph": self.graph,
+                      "--longest-lag": self.longest_lag_ps}  # fmt: skip
             self._refuse([k for k, v in others.items() if v], "does not know it")
 
     def _refuse(self, options: list[str], why: str) -> None:
@@ -78,6 +83,7 @@ def prepare_training(request: TrainingRequest) -> Prepared:
 
 
 def _lam_slide(request: TrainingRequest) -> Prepared:
+    from surrogate.data.molecules import FrameSets, collect_sets
     from surrogate.data.weights import load_weights
     from surrogate.models.lam_slide.config import LamSlideConfig
     from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
@@ -90,9 +96,15 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         model_config = start.model.config
     else:
         model_config = LamSlideConfig() if request.config is None else LamSlideConfig.from_toml(request.config)
-    frames = read_frames(request, canonical=model_config.canonical)
-    for validation in (False, True):  # too short a reference is refused before the first stage has been trained
-        frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
+    if request.graph:
+        model_config = replace(model_config, graph=True)
+    if model_config.graph:
+        sets = collect_sets(request.paths, held=request.held, spool=request.out.parent)
+    else:
+        sets = FrameSets((read_frames(request, canonical=model_config.canonical),))
+    for frames in sets.trained:  # too short a reference is refused before the first stage has been trained
+        for validation in (False, True):
+            frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
     steps = request.steps
     first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
     settings = TrainingConfig(
@@ -104,6 +116,7 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         time_reversal=request.time_reversal,
         rare_draws=request.rare_draws,
         rare_kinds=request.rare_kinds,
+        longest_lag_ps=request.longest_lag_ps,
     )
     share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
@@ -112,10 +125,10 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
             advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
 
         return train_lam_slide(
-            frames, request.out, model_config, settings, start=start, resume=request.resume, progress=report
+            sets, request.out, model_config, settings, start=start, resume=request.resume, progress=report
         )
 
-    return Prepared(frames.scene.name, run)
+    return Prepared(sets.names, run)
 
 
 def _forecaster(request: TrainingRequest) -> Prepared:

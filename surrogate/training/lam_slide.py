@@ -98,7 +98,7 @@ def train_lam_slide(
     length = model_config.approximator.chunk_frames
     told_of = model_config.approximator.rare_kinds
     kinds = window_kinds(first, told_of, length) if told_of else None
-    strides = _strides(first, model_config)
+    strides = _strides(sets, model_config)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
@@ -160,9 +160,9 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
     return replace(model_config, approximator=told)
 
 
-def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
+def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
-    lags = model_config.approximator.lag_range_ps
+    frames, lags = sets.trained[0], model_config.approximator.lag_range_ps
     if lags is None:
         return (1,)
     if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
@@ -171,7 +171,10 @@ def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int,
     longest = whole_steps(lags[1], frames.lag_ps, "the longest lag in the frames' spacing")
     if longest < 2:
         raise InputError("the longest lag must be at least twice the frames' spacing; leave it out for one lag alone.")
-    return strides_up_to(longest)
+    strides = strides_up_to(longest)
+    for each in sets.trained:  # too short a reference is refused before the first stage has been trained
+        StrideSampler.of(each, model_config.approximator.chunk_frames, strides)
+    return strides
 
 
 def _stage_one(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Subject], stage: StageConfig, state: Path,

@@ -1,0 +1,90 @@
+"""`train --graph` and `--longest-lag`, `rollout` of an unseen molecule and `--lag`, at the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from surrogate.cli import app
+from systems.prepare import prepare
+from systems.trajectory import open_trajectory, open_writer
+
+SMALL = """
+[atoms]
+width = 24
+n_rounds = 1
+[autoencoder]
+latent_dim = 12
+width = 32
+head_dim = 8
+[approximator]
+chunk_frames = 4
+width = 32
+n_layers = 1
+n_heads = 2
+auxiliary_frames = 2
+"""
+
+
+def run(*args: str) -> Result:
+    return CliRunner().invoke(app, [*args])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two references, and weights of both for lags of 1 to 10 ps."""
+    here = tmp_path_factory.mktemp("molecules")
+    (here / "small.toml").write_text(SMALL)
+    for smiles in ("CCCO", "CCC"):
+        scene, rng = prepare(f"smiles:{smiles}"), np.random.default_rng(0)
+        with open_writer(here / f"{smiles}.h5", scene, {"temperature_k": 300.0}) as writer:
+            frames = scene.positions_nm + 0.004 * rng.normal(size=(120, scene.n_atoms, 3))
+            writer.append(frames, np.arange(1.0, 121.0))
+    references = [str(here / "CCCO.h5"), str(here / "CCC.h5")]
+    weights = ["-o", str(here / "w.safetensors"), "--config", str(here / "small.toml"), "--steps", "8", "-q"]
+    refused = run("train", *references, *weights)
+    assert refused.exit_code == 1 and "--graph" in refused.stderr
+    done = run("train", *references, *weights, "--graph", "--longest-lag", "10ps")
+    assert done.exit_code == 0, done.stderr
+    return here
+
+
+def test_info_names_all_molecules(folder: Path) -> None:
+    found = json.loads(run("info", str(folder / "w.safetensors"), "--json").stdout)
+    assert len(found["molecules"]) == 2 and "C3H8O" in found["molecules"][0]
+    assert found["covers_unseen_molecules"] is True
+    assert (found["lag_ps"], found["longest_lag_ps"]) == (1.0, 10.0)
+
+
+def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
+    out = folder / "ethanol.h5"
+    common = ["--weights", str(folder / "w.safetensors"), "-o", str(out), "--guard", "off", "--steps", "2", "-q"]
+    done = run("rollout", "smiles:CCO", *common, "--time", "60ps", "--save-every", "10ps")
+    assert done.exit_code == 0, done.stderr
+    with open_trajectory(out) as reader:
+        assert np.allclose(reader.time_ps, 10.0 * np.arange(1, 7))
+        assert reader.record["unseen_molecule"] and reader.record["lag_ps"] == 10.0
+    for scene, more, why in (
+        ("smiles:CCO", ["--lag", "50ps"], "lags of 1 ps to 10 ps"),
+        ("smiles:CCCCC", [], "size"),
+        ("smiles:CCN", ["--force"], "elements"),
+    ):
+        refused = run("rollout", scene, *common, "--time", "100ps", "--overwrite", *more)
+        assert refused.exit_code == 1 and why in refused.stderr and refused.stderr.count("\n") == 1, refused.stderr
+    forced = run("rollout", "smiles:CCCC", *common, "--time", "10ps", "--lag", "5ps", "--overwrite", "--force")
+    assert forced.exit_code == 0, forced.stderr
+
+
+def test_other_architectures_and_further_training_take_neither(folder: Path) -> None:
+    reference, out = str(folder / "CCC.h5"), str(folder / "x.safetensors")
+    for more in (["--graph"], ["--longest-lag", "10ps"]):
+        refused = run("train", reference, "-o", out, "--arch", "painet", "--steps", "4", *more)
+        assert refused.exit_code == 1 and more[0] in refused.stderr
+        refused = run("train", reference, "-o", out, "--from", str(folder / "w.safetensors"), "--steps", "4", *more)
+        assert refused.exit_code == 1 and "leave --graph and --longest-lag out" in refused.stderr
+    further = run("train", reference, "-o", out, "--from", str(folder / "w.safetensors"), "--steps", "4", "-q")
+    assert further.exit_code == 0, further.stderr
