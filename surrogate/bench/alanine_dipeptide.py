@@ -36,8 +36,12 @@ ROLLOUT_REPLICAS = 16
 CURVE_PS = 20_000.0
 FIGURES = ("joint_jsd", "correlation:1", "correlation_time", "valid:2", "valid:4")
 SNAPSHOT_S = 600.0
-# The second training starts from the weights of the first, at a lower rate, and draws rare windows more often.
-FURTHER_RATE, FURTHER_SEED, RARE_DRAWS = 7e-4, 10, 0.3
+STAGES = ("first", "further", "model")
+# Each further training starts from the weights of the one before, at a lower rate, and draws rare windows more often.
+# The last one also names the kind of a window to the network: without, crossings to phi > 0 are never made.
+RARE_DRAWS = 0.3
+FURTHER_RATE, FURTHER_SEED = 7e-4, 10
+KINDS_RATE, KINDS_SEED = 6e-4, 11
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,12 @@ class Paths:
     def reference(self, kind: str, n: int) -> list[Path]:
         return replica_paths(self.folder / f"{kind}.h5", n)
 
-    @property
-    def first(self) -> Path:
-        return self.folder / "first.safetensors"
+    def stage(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
 
     @property
     def weights(self) -> Path:
-        return self.folder / "model.safetensors"
+        return self.stage(STAGES[-1])
 
     @property
     def shipped(self) -> Path:
@@ -70,22 +73,35 @@ def make_reference(paths: Paths, kinds: dict[str, tuple[int, int]]) -> list[Path
     return [path for kind, (_, n) in kinds.items() for path in paths.reference(kind, n)]
 
 
-def train(paths: Paths, references: list[Path], further: list[Path], budgets_s: tuple[float, float], *,
+def train(paths: Paths, references: list[Path], further: list[Path], budgets_s: tuple[float, float, float], *,
           compile_: bool) -> Path:  # fmt: skip
-    """Train on `references`, then further on these and `further`, and write float32 weights.
+    """Train on `references`, then twice further on these and `further`, and write float32 weights.
 
-    Snapshots every ten minutes stay beside both, for the curve of error against time.
+    Snapshots every ten minutes stay beside each, for the curve of error against time.
     """
     from surrogate.data.weights import load_weights
     from surrogate.training.lam_slide import TrainingConfig
 
     common: dict[str, Any] = {"snapshot_every_s": SNAPSHOT_S, "time_reversal": True, "compile": compile_}
-    first = TrainingConfig(budget_s=budgets_s[0], **common)
-    _train(paths.first, references, first, None)
-    second = TrainingConfig(
-        budget_s=budgets_s[1], stage_two_rate=FURTHER_RATE, seed=FURTHER_SEED, rare_draws=RARE_DRAWS, **common
-    )
-    return _train(paths.weights, [*references, *further], second, load_weights(paths.first))
+    configs = [
+        TrainingConfig(budget_s=budgets_s[0], **common),
+        TrainingConfig(
+            budget_s=budgets_s[1], stage_two_rate=FURTHER_RATE, seed=FURTHER_SEED, rare_draws=RARE_DRAWS, **common
+        ),
+        TrainingConfig(
+            budget_s=budgets_s[2],
+            stage_two_rate=KINDS_RATE,
+            seed=KINDS_SEED,
+            rare_draws=RARE_DRAWS,
+            rare_kinds=True,
+            **common,
+        ),
+    ]
+    start = None
+    for number, (name, config) in enumerate(zip(STAGES, configs, strict=True)):
+        _train(paths.stage(name), references if number == 0 else [*references, *further], config, start)
+        start = load_weights(paths.stage(name))
+    return paths.weights
 
 
 def _train(out: Path, references: list[Path], config: TrainingConfig, start: Weights | None) -> Path:
@@ -178,6 +194,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/alanine-dipeptide"))
     parser.add_argument("--budget", default="65min", help="of the first training, both stages (default 65min)")
     parser.add_argument("--further", default="94min", help="of the further training, second stage (default 94min)")
+    parser.add_argument("--kinds", default="45min", help="of the last one, with rare kinds named (default 45min)")
     parser.add_argument("--compile", action="store_true", help="compile the network (needs a C++ compiler)")
     parser.add_argument("--solver-steps", type=int, default=None)
     parser.add_argument("--curve", action="store_true", help="also judge every snapshot of the training")
@@ -187,7 +204,7 @@ def main() -> None:
     references = make_reference(paths, TRAIN)
     further = make_reference(paths, FURTHER)
     held = make_reference(paths, HELD)
-    budgets_s = (parse_wall_s(args.budget), parse_wall_s(args.further))
+    budgets_s = (parse_wall_s(args.budget), parse_wall_s(args.further), parse_wall_s(args.kinds))
     train(paths, references, further, budgets_s, compile_=args.compile)
     ship(paths.weights, paths.shipped)
     steps = args.solver_steps
@@ -196,8 +213,8 @@ def main() -> None:
     rolled = replica_paths(paths.folder / "rollout.h5", ROLLOUT_REPLICAS)
     figures["floor"] = noise_floor([*references, *further, *held], rolled)
     if args.curve:
-        snapshots = [p for stem in ("first", "model") for p in sorted(paths.folder.glob(f"{stem}.at*min.safetensors"))]
-        for weights in [*snapshots, paths.first, paths.weights]:
+        snapshots = [p for stem in STAGES for p in sorted(paths.folder.glob(f"{stem}.at*min.safetensors"))]
+        for weights in [*snapshots, *(paths.stage(name) for name in STAGES)]:
             name = "curve_" + weights.stem.replace(".at", "_")
             figures[name] = judge(weights, held, paths.folder, name, total_ps=CURVE_PS, solver_steps=steps)
     (paths.folder / "figures.json").write_text(json.dumps(figures, indent=1))
