@@ -122,9 +122,13 @@ def _transition_row(trio: Trio, states: Sequence[_States], lag: str) -> Row:
     )
 
 
-def _never_visited(s: _States) -> npt.NDArray[np.bool_]:
-    """Return whether each metastable state `(n_states,)` holds no frame of a sample."""
-    return np.asarray(s.occupancy.sum(0)[:-1] == 0)
+def _never_held(s: _States) -> npt.NDArray[np.bool_]:
+    """Return for each metastable state `(n_states,)` whether a sample is never in it at both ends of a lag.
+
+    A frame that strays across its border now and then is no visit.
+    """
+    n = s.occupancy.shape[1] - 1
+    return np.asarray(np.diag(s.transitions.sum(0).reshape(n, n)) == 0)
 
 
 def _states_of(model: msm.Model, function: FloatArray, counts: FloatArray) -> npt.NDArray[np.bool_]:
@@ -143,8 +147,8 @@ def _timescale_rows(
 ) -> tuple[list[Row], list[Skipped]]:
     """Return a row for each slow process of the reference, and those that the candidate's data say nothing about.
 
-    The process that leads into a state where the candidate never is cannot be timed there: what its function decays
-    by in such a trajectory is motion within the other states.
+    The process that leads into a state where the candidate never stays cannot be timed there: what its function
+    decays by in such a trajectory is motion within the other states.
     """
     lag_ps = trio.reference.features.lag_ps
     lag = model.lag_frames * lag_ps
@@ -156,10 +160,10 @@ def _timescale_rows(
     for k, function in enumerate(functions):
         metric = f"Implied timescale {k + 1} of the Markov state model"
         of = _states_of(model, function, counts)
-        _, missing, missing_in_replicate = (of & _never_visited(s) for s in states)
+        _, missing, missing_in_replicate = (of & _never_held(s) for s in states)
         if missing.any():
             where = " and ".join(names[i] for i in np.flatnonzero(missing).tolist())
-            skipped.append((metric, f"the candidate is never in {where}, into which this process leads"))
+            skipped.append((metric, f"the candidate never stays in {where}, into which this process leads"))
             continue
         sums = [msm.function_sums(s.micro_counts, function) for s in states]
         values = [float(timescale(lagged_eigenvalue(own), lag)) for own in sums]
@@ -254,7 +258,7 @@ def _check_chart(trio: Trio, model: msm.Model, s: _States, role: Role) -> Chart:
 def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:
     """Implied timescales against the lag they were estimated at: level where the model is Markovian.
 
-    Of what is never in one of the states there is one process less.
+    Of what never stays in one of the states there is one process less.
     """
     lag_ps = trio.reference.features.lag_ps
     n_micro, n_slow = len(model.centres), model.n_states - 1
@@ -264,10 +268,10 @@ def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States], na
     lines = []
     caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference."
     for s, role in zip(states, ROLES, strict=True):
-        missing = _never_visited(s)
+        missing = _never_held(s)
         if missing.any():
             where = " and ".join(names[i] for i in np.flatnonzero(missing).tolist())
-            caption += f" The {role} is never in {where}, and has so many processes less."
+            caption += f" The {role} never stays in {where}, and has so many processes less."
         times = []
         for lag in lags:
             counts = msm.block_transitions(s.micro, s.sample.blocks, n_micro, lag).sum(0).reshape(n_micro, n_micro)
