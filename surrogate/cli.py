@@ -327,6 +327,9 @@ def rollout(
     solver: Annotated[Solver | None, typer.Option("--solver", help="Default: the one that suits the weights.")] = None,
     solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
     precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
+    compile_: Annotated[
+        bool, typer.Option("--compile", help="Compile the network: a minute, a C++ compiler; for long rollouts.")
+    ] = False,
     guard: GuardOpt = Guard.flag,
     energy_every: EnergyEveryOpt = 0,
     md_between: MdBetweenOpt = None,
@@ -356,6 +359,7 @@ def rollout(
         solver=None if solver is None else solver.value,
         solver_steps=solver_steps,
         precision=precision.value,
+        compile=compile_,
         guard=guard.value,
         energy_every=energy_every,
         md_between_ps=0.0 if md_between is None else parse_time_ps(md_between, "--md-between"),

@@ -30,6 +30,7 @@ def rollout(
     solver: str | None = None,
     solver_steps: int | None = None,
     precision: str = "auto",
+    compile: bool = False,
     guard: str = "flag",
     energy_every: int = 0,
     md_between_ps: float = 0.0,
@@ -49,7 +50,8 @@ def rollout(
     that were trained for several lags step at `lag_ps`, by default at the longest that `save_every_ps` is a multiple
     of; weights that know atoms by their bonds take molecules that look like those they were trained on. Replicas
     run in one batch and are named as by `reference`. `solver`: 'multistep', 'euler' or the adaptive 'dopri5', None for
-    the one that suits the weights. `precision`: 'fp32', 'bf16' or 'auto'.
+    the one that suits the weights. `precision`: 'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a
+    C++ compiler and about a minute, and pays in long rollouts.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
@@ -80,6 +82,7 @@ def rollout(
         seed=seed,
         solver=solver,
         precision=precision,
+        compile=compile,
         guard=guard,
         energy_every=energy_every,
         md_between_ps=md_between_ps,

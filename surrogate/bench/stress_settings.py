@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.bench.stress_measures import measure_bonds, measure_validity
+from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule, Surrogate, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
 from systems.errors import SurromdError
@@ -73,12 +74,7 @@ def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> lis
         finally:
             torch.set_num_threads(threads)
     if compiled:
-        fast = copy.deepcopy(model)
-        lists = [child for child in fast.children() if isinstance(child, torch.nn.ModuleList)]
-        for parent in (fast, *lists):
-            for name, child in list(parent.named_children()):
-                if child not in lists:
-                    setattr(parent, name, torch.compile(child))
+        fast = with_compiled_parts(model)
         add("fp32, compiled", lambda: inputs.chunk(fast, torch.float32))
     return rows
 

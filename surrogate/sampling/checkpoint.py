@@ -67,8 +67,8 @@ def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def read_checkpoint(path: Path, settings: dict[str, Any]) -> Progress:
-    """Return where a rollout of these settings stood.
+def read_checkpoint(path: Path, settings: dict[str, Any] | None) -> Progress:
+    """Return where a rollout of these settings stood, or of any (None).
 
     Raises InputError when the file cannot be read, or the rollout was started with other settings.
     """
@@ -85,7 +85,9 @@ def read_checkpoint(path: Path, settings: dict[str, Any]) -> Progress:
         raise InputError(f"checkpoint {path} cannot be read ({reason}); start again with --overwrite.") from error
     if progress is None:
         raise InputError(f"checkpoint {path} is of another version of surromd; start again with --overwrite.")
-    for key, value in settings.items():
-        if key not in known or known[key] != value:
-            raise InputError(f"{path}: this rollout was started with {key} = {known.get(key)!r}, not {value!r}.")
+    wanted = known if settings is None else settings
+    for key in {**known, **wanted}:
+        was, now = known.get(key), wanted.get(key)
+        if was != now:
+            raise InputError(f"{path}: this rollout was started with {key} = {was!r}, not {now!r}.")
     return progress

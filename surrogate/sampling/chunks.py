@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data.descriptions import describe
+from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
@@ -37,13 +38,15 @@ class ChunkSampler:
     """One model, ready to draw chunks: what a rollout does with the weights, and all that it does with them.
 
     Atoms are in the model's order throughout. `batch` is the most replicas computed at once: None for all, until
-    memory runs out, and then half as many, for good. Raises InputError for a solver or precision that does not suit
-    the weights.
+    memory runs out, and then half as many, for good. `compile`: the networks are compiled for the first batch drawn;
+    others, such as a single chunk drawn again, go through the plain ones. Raises InputError for a solver or precision
+    that does not suit the weights, and where there is nothing to compile with.
     """
 
     def __init__(
-        self, weights: Weights, *, solver_steps: int = 20, solver: str | None = None, precision: str = "auto"
-    ) -> None:
+        self, weights: Weights, *, solver_steps: int = 20, solver: str | None = None, precision: str = "auto",
+        compile: bool = False,
+    ) -> None:  # fmt: skip
         if precision not in ("auto", "fp32", "bf16"):
             raise InputError(f"precision {precision!r} is unknown; choose auto, fp32 or bf16.")
         model, template = weights.model, weights.domain.scene
@@ -60,6 +63,8 @@ class ChunkSampler:
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
         self._model = with_bf16_weights(model) if self.bf16 else model
+        self._compiled = with_compiled_parts(self._model) if compile else None
+        self._compiled_rows: int | None = None
         self._molecule = describe(model, template)
         self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
@@ -108,6 +113,7 @@ class ChunkSampler:
                             "memory does not suffice for one replica; use smaller weights."
                         ) from error
                     self.batch = -(-size // 2)
+                    self._compiled_rows = None
                     continue
                 start += size
         order = np.argsort(np.concatenate([rows for rows, _ in parts]))
@@ -128,8 +134,12 @@ class ChunkSampler:
         canonical = np.einsum("rij,rtnj->rtni", rotation, last) + translation[:, None, None, :]
         noise = draw_noise(self._model, n_atoms, [torch.Generator().manual_seed(seed) for seed in seeds])
         turned = None if velocities is None else np.einsum("rij,rnj->rni", rotation, velocities)
+        model = self._model
+        if self._compiled is not None:
+            self._compiled_rows = self._compiled_rows or len(seeds)
+            model = self._compiled if len(seeds) == self._compiled_rows else model
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
-            chunk = self._model.next_chunk(
+            chunk = model.next_chunk(
                 torch.from_numpy(canonical.astype(np.float32)),
                 self._molecule,
                 noise,

@@ -74,8 +74,9 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    if settings["lag_ps"] is None:
-        del settings["lag_ps"]  # as checkpoints of earlier versions have it
+    for key in ("lag_ps", "compile"):
+        if not settings[key]:
+            del settings[key]  # as checkpoints of earlier versions have it
     return Plan(
         scene=scene,
         weights=weights,

@@ -37,6 +37,7 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         "save_every_ps": plan.save_every_ps,
         "lag_ps": weights.domain.lag_ps,
         "precision": "bf16" if sampler.bf16 else "fp32",
+        "compiled": config.compile,
         "solver": sampler.solver,
         "solver_steps": config.solver_steps,
         "chunk_frames": sampler.n_new,

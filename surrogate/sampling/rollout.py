@@ -68,7 +68,13 @@ def rollout(
         lag_ps=config.lag_ps,
         save_every_ps=config.save_every_ps,
     )
-    sampler = ChunkSampler(weights, solver_steps=config.solver_steps, solver=config.solver, precision=config.precision)
+    sampler = ChunkSampler(
+        weights,
+        solver_steps=config.solver_steps,
+        solver=config.solver,
+        precision=config.precision,
+        compile=config.compile,
+    )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     state_path = checkpoint_path(outs[0])
     if resume and not state_path.exists() and _just_begun(outs):

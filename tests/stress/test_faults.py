@@ -119,7 +119,7 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
         expected = {signal.SIGKILL: [-9], signal.SIGINT: [INTERRUPTED], signal.SIGTERM: [INTERRUPTED, -15]}[number]
         assert code in expected, note.read_text() if note.exists() else code
         stopped += 1
-        known = read_checkpoint(state, {}).steps if state.exists() else 0
+        known = read_checkpoint(state, None).steps if state.exists() else 0
         assert known >= promised, "what a checkpoint has seen stays"
         # A kill between the append and its checkpoint leaves one chunk more, which is cut and computed again.
         assert all(known <= len(frames_of(path)) <= known + chunk for path in outs if known or path.exists())
