@@ -9,6 +9,7 @@ from typing import Any
 from surrogate.models.baselines import BASELINES, BaselineConfig
 from surrogate.models.interface import Surrogate
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.heavy import lam_slide_model
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
@@ -24,7 +25,7 @@ class Architecture:
 
 
 ARCHITECTURES: dict[str, Architecture] = {
-    LamSlide.arch: Architecture(LamSlideConfig.from_dict, LamSlide),
+    LamSlide.arch: Architecture(LamSlideConfig.from_dict, lam_slide_model),
     Painet.arch: Architecture(PainetConfig.from_dict, Painet),
     EgnnForecaster.arch: Architecture(PainetConfig.from_dict, EgnnForecaster),
     **{kind.arch: Architecture(BaselineConfig.from_dict, kind) for kind in BASELINES},

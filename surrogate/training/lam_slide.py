@@ -21,6 +21,7 @@ from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.devices import is_first_process, wait_for_all
+from surrogate.training.heavy import on_heavy_atoms
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.objectives import autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.training.provenance import provenance_of, training_domain
@@ -92,6 +93,10 @@ def train_lam_slide(
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
+    heavy = None
+    if model_config.on_heavy_atoms:
+        heavy = on_heavy_atoms(frames, model_config, start, several_lags=config.longest_lag_ps is not None)
+        frames, model_config, start = heavy.frames, heavy.config, heavy.start
     sets = frames if isinstance(frames, FrameSets) else FrameSets((frames,))
     first = sets.trained[0]
     model_config = _settle(sets, model_config, config)
@@ -125,7 +130,8 @@ def train_lam_slide(
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=model_config.graph)
 
     def write(spent_s: float) -> None:
-        save_weights(out, model, domain, _provenance(sets, config, spent_one, spent_s, start))
+        whole, of = (model, domain) if heavy is None else heavy.dressed(model)
+        save_weights(out, whole, of, _provenance(sets, config, spent_one, spent_s, start))
 
     spent_two = _stage_two(model, subjects, unseen, two, states[1], log_path, resume, progress, write, config, kinds,
                            strides)  # fmt: skip

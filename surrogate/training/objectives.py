@@ -10,6 +10,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.atoms import Atoms
 from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 
 # The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
 TAU_MAX = 0.995
@@ -50,8 +51,13 @@ def autoencoder_loss(
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
     if decoded.element_logits is not None:
-        terms["type"] = F.cross_entropy(decoded.element_logits.flatten(0, 1), numbers.flatten())
+        types = model.autoencoder.types(numbers)
+        terms["type"] = F.cross_entropy(decoded.element_logits.flatten(0, 1), types.flatten())
         loss = loss + c.type_weight * terms["type"]
+    if isinstance(model.autoencoder, ResidueAutoencoder):
+        terms["frame"] = model.autoencoder.frame_loss(x, decoded.positions)
+        terms["torsion"] = model.autoencoder.torsion_loss(x, decoded.positions)
+        loss = loss + c.frame_weight * terms["frame"] + c.torsion_weight * terms["torsion"]
     return loss, {k: v.detach() for k, v in terms.items()}
 
 
@@ -115,4 +121,7 @@ def flow_loss(
         distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
         loss = loss + c.position_weight * position + c.distance_weight * distance
         terms |= {"position": position.detach(), "distance": distance.detach()}
+        if isinstance(model.autoencoder, ResidueAutoencoder):
+            frame = model.autoencoder.frame_loss(clean, decoded, w)
+            loss, terms["frame"] = loss + c.frame_weight * frame, frame.detach()
     return loss, terms

@@ -64,6 +64,10 @@ class Autoencoder(nn.Module):
         tags: Tensor = identifiers if identifiers.is_floating_point() else self.identifiers(identifiers)
         return tags
 
+    def types(self, elements: Tensor) -> Tensor:
+        """Return what the type logits are to name, given elements `(b, n_atoms)`: these themselves."""
+        return elements
+
     def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
         """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
         entity = self.embed_entity(torch.cat([self.elements(elements), self.tags(identifiers)], dim=-1))

@@ -6,7 +6,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surrogate.models.hydrogens import HydrogenPlan
 from surrogate.models.lam_slide.kinds import Kind
+from surrogate.models.lam_slide.residues import ResidueLayout
 from surrogate.models.settings import build, read_toml
 from systems.errors import InputError
 
@@ -30,6 +32,9 @@ class AutoencoderConfig:
     position_weight: float = 1.0
     distance_weight: float = 1.0
     type_weight: float = 0.01
+    # Of residues alone (Table 12).
+    frame_weight: float = 1.0
+    torsion_weight: float = 0.1
     # Share of stage-one samples whose identifiers are drawn at random (Algorithm 1; 1.0 is the paper). The others get
     # the canonical assignment, which is what stage two and rollouts use; one molecule learns it faster.
     random_identifiers: float = 0.0
@@ -57,6 +62,8 @@ class ApproximatorConfig:
     tau_scale: float = 1.4
     position_weight: float = 0.25
     distance_weight: float = 0.25
+    # Of residues alone (Table 12).
+    frame_weight: float = 0.25
     auxiliary_frames: int = 4
     # Shortest and longest spacing of frames, in ps: the network is told which it is asked for. None: one spacing alone.
     lag_range_ps: tuple[float, float] | None = None
@@ -94,10 +101,29 @@ class LamSlideConfig:
     atoms: GraphConfig = field(default_factory=GraphConfig)
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
     approximator: ApproximatorConfig = field(default_factory=ApproximatorConfig)
+    # 'modelled' like any atom, or 'placed': the network moves heavy atoms alone, and hydrogens are placed about them as
+    # the reference has them (models.hydrogens). Either way rollouts have all atoms.
+    hydrogens: str = "modelled"
+    # What an identifier stands for and the encoder codes: an 'atom', or a 'residue' of a peptide with its heavy atoms;
+    # hydrogens are then placed.
+    entities: str = "atom"
+    # Where hydrogens and residues are; training finds it.
+    hydrogen_plan: HydrogenPlan | None = None
+    residues: ResidueLayout | None = None
 
     def __post_init__(self) -> None:
+        for name, known in (("hydrogens", ("modelled", "placed")), ("entities", ("atom", "residue"))):
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} = {getattr(self, name)!r} is unknown; choose {' or '.join(known)}.")
         if self.graph and not self.canonical:
             raise InputError("graph = true lays frames on each molecule's template; leave canonical = true.")
+        if self.graph and self.on_heavy_atoms:
+            raise InputError("graph = true knows all atoms of many molecules; hydrogens are placed for one alone.")
+
+    @property
+    def on_heavy_atoms(self) -> bool:
+        """Whether the network sees heavy atoms alone."""
+        return self.hydrogens == "placed" or self.entities == "residue"
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -115,6 +141,8 @@ class LamSlideConfig:
             "atoms": build(GraphConfig, record.pop("atoms", {}), "atoms."),
             "autoencoder": build(AutoencoderConfig, record.pop("autoencoder", {}), "autoencoder."),
             "approximator": build(ApproximatorConfig, approximator, "approximator."),
+            "hydrogen_plan": HydrogenPlan.of(record.pop("hydrogen_plan", None)),
+            "residues": ResidueLayout.of(record.pop("residues", None)),
         }
         return build(LamSlideConfig, {**record, **sub}, "")
 

@@ -16,6 +16,7 @@ from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.kinds import kinds_of_windows
+from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from systems.errors import InputError
 
 # Of a chunk that is not of the kind that was drawn.
@@ -40,7 +41,11 @@ class LamSlide(Surrogate):
         self.config = config
         self.solvers = flow.solvers_for(config.approximator.interpolant)
         ae = config.autoencoder
-        self.autoencoder = Autoencoder(ae)
+        self.autoencoder = (
+            Autoencoder(ae)
+            if config.residues is None
+            else ResidueAutoencoder(ae, config.residues, config.position_scale_nm)
+        )
         self.atom_encoder = AtomEncoder(config.atoms, ae.identifier_dim) if config.graph else None
         tag_dim = ae.identifier_dim if config.graph else 0
         self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim, tag_dim)
