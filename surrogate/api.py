@@ -149,6 +149,8 @@ def train(
     time_reversal: bool = False,
     rare_draws: float = 0.0,
     rare_kinds: bool = False,
+    hydrogens: str | None = None,
+    entities: str | None = None,
     graph: bool = False,
     longest_lag_ps: float | None = None,
     seed: int = 0,
@@ -168,6 +170,8 @@ def train(
     on is refused. `time_reversal` shows every other window backwards,
     right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
     (surrogate.data.rarity), `rare_kinds` also tells the network which, and learns how often each comes.
+    `hydrogens` 'placed': lam-slide learns heavy atoms alone, and rollouts get their hydrogens from the reference's
+    local geometry; `entities` 'residue': of peptides, whose residues are then what it codes; both as in `config`.
     `graph`: lam-slide knows atoms by their bonds, so that references may be of many molecules and the weights cover
     unseen ones that look like them (surrogate.sampling.coverage); trajectories in `validation` of molecules that are
     not trained on hold those out whole. `longest_lag_ps`: lam-slide learns every spacing of frames from that of the
@@ -196,6 +200,8 @@ def train(
         time_reversal=time_reversal,
         rare_draws=rare_draws,
         rare_kinds=rare_kinds,
+        hydrogens=hydrogens,
+        entities=entities,
         graph=graph,
         longest_lag_ps=longest_lag_ps,
         seed=seed,

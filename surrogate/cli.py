@@ -17,9 +17,11 @@ from surrogate.cli_options import (
     AtomsOpt,
     DeviceOpt,
     EnergyEveryOpt,
+    EntitiesOpt,
     ForceOpt,
     Guard,
     GuardOpt,
+    HydrogensOpt,
     JsonOpt,
     MdBetweenOpt,
     OverwriteOpt,
@@ -267,6 +269,8 @@ def train(
     rare_kinds: Annotated[
         bool, typer.Option("--rare-kinds", help="Tell the network the rare state, and learn how often each comes.")
     ] = False,
+    hydrogens: HydrogensOpt = None,
+    entities: EntitiesOpt = None,
     graph: Annotated[
         bool, typer.Option("--graph", help="Know atoms by their bonds: one model for many molecules, and unseen ones.")
     ] = False,
@@ -295,6 +299,8 @@ def train(
         time_reversal=time_reversal,
         rare_draws=rare_draws,
         rare_kinds=rare_kinds,
+        hydrogens=hydrogens,
+        entities=entities,
         graph=graph,
         longest_lag_ps=None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag"),
         seed=seed,

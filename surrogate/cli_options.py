@@ -33,6 +33,16 @@ class Guard(StrEnum):
     fallback = "fallback"
 
 
+class Hydrogens(StrEnum):
+    modelled = "modelled"
+    placed = "placed"
+
+
+class Entities(StrEnum):
+    atom = "atom"
+    residue = "residue"
+
+
 class Atoms(StrEnum):
     all = "all"
     heavy = "heavy"
@@ -66,6 +76,14 @@ EnergyEveryOpt = Annotated[
 MdBetweenOpt = Annotated[str | None, typer.Option("--md-between", help="So much real MD after each chunk.")]
 SelectOpt = Annotated[str | None, typer.Option("--select", help="Atoms to write, in MDTraj's words: backbone.")]
 AtomsOpt = Annotated[Atoms, typer.Option("--atoms", help="Write all atoms or no hydrogens.")]
+HydrogensOpt = Annotated[
+    Hydrogens | None,
+    typer.Option("--hydrogens", help="placed: learn heavy atoms alone; rollouts get hydrogens. [default: modelled]"),
+]
+EntitiesOpt = Annotated[
+    Entities | None,
+    typer.Option("--entities", help="residue: of peptides, as units; hydrogens are placed. [default: atom]"),
+]
 ForceOpt = Annotated[bool, typer.Option("--force", help="Roll a scene that leaves the training domain, marked.")]
 WantedTemperatureOpt = Annotated[
     str | None, typer.Option("--temperature", help="Refused if it is not that of the weights.")

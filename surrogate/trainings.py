@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from systems.errors import InputError
 
@@ -36,6 +36,9 @@ class TrainingRequest:
     time_reversal: bool
     rare_draws: float
     rare_kinds: bool
+    # 'modelled' or 'placed', 'atom' or 'residue'; None is what the configuration says.
+    hydrogens: str | None
+    entities: str | None
     graph: bool
     longest_lag_ps: float | None
     seed: int
@@ -54,12 +57,15 @@ class TrainingRequest:
                 raise InputError("--steps must be at least 2: one for each stage.")
             if self.start_from is not None and self.config is not None:
                 raise InputError("--from takes the configuration of its weights; leave --config out.")
-            if self.start_from is not None and (self.graph or self.longest_lag_ps is not None):
-                raise InputError("--from takes the configuration of its weights; leave --graph and --longest-lag out.")
+            settings = {"--graph": self.graph, "--longest-lag": self.longest_lag_ps, "--hydrogens": self.hydrogens,
+                        "--entities": self.entities}  # fmt: skip
+            told = [k for k, v in settings.items() if v]
+            if self.start_from is not None and told:
+                raise InputError(f"--from takes the configuration of its weights; leave {' and '.join(told)} out.")
         else:
             others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws,
-                      "--rare-kinds": self.rare_kinds, "--graph": self.graph,
-                      "--longest-lag": self.longest_lag_ps}  # fmt: skip
+                      "--rare-kinds": self.rare_kinds, "--hydrogens": self.hydrogens, "--entities": self.entities,
+                      "--graph": self.graph, "--longest-lag": self.longest_lag_ps}  # fmt: skip
             self._refuse([k for k, v in others.items() if v], "does not know it")
 
     def _refuse(self, options: list[str], why: str) -> None:
@@ -96,8 +102,8 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         model_config = start.model.config
     else:
         model_config = LamSlideConfig() if request.config is None else LamSlideConfig.from_toml(request.config)
-    if request.graph:
-        model_config = replace(model_config, graph=True)
+    told: dict[str, Any] = {"graph": request.graph, "hydrogens": request.hydrogens, "entities": request.entities}
+    model_config = replace(model_config, **{key: value for key, value in told.items() if value})
     if model_config.graph:
         sets = collect_sets(request.paths, held=request.held, spool=request.out.parent)
     else:

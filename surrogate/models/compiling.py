@@ -10,6 +10,7 @@ from typing import TypeVar
 import torch
 from torch import nn
 
+from surrogate.models.interface import Surrogate
 from systems.errors import InputError
 
 _Model = TypeVar("_Model", bound=nn.Module)
@@ -23,8 +24,10 @@ def with_compiled_parts(model: _Model) -> _Model:
     if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
         raise InputError("compiling needs a C++ compiler (g++ or clang++), which is not on the PATH; leave it out.")
     copied = copy.deepcopy(model)
-    lists = [child for child in copied.children() if isinstance(child, nn.ModuleList)]
-    parents: list[nn.Module] = [copied, *lists]
+    # Of a model that dresses another one, that one's.
+    within = next((child for child in copied.children() if isinstance(child, Surrogate)), copied)
+    lists = [child for child in within.children() if isinstance(child, nn.ModuleList)]
+    parents: list[nn.Module] = [within, *lists]
     for parent in parents:
         for name, child in list(parent.named_children()):
             if child not in lists:

@@ -1,0 +1,75 @@
+"""`train --hydrogens placed` and `--entities residue`, and what `rollout --atoms` writes of such weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from surrogate.cli import app
+from systems.library import load
+from systems.trajectory import open_trajectory, open_writer
+
+SMALL = """
+[autoencoder]
+latent_dim = 12
+width = 32
+head_dim = 8
+[approximator]
+chunk_frames = 4
+width = 32
+n_layers = 1
+n_heads = 2
+auxiliary_frames = 2
+"""
+
+
+def run(*args: str) -> Result:
+    return CliRunner().invoke(app, [*args])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reference of alanine dipeptide that shakes, and a small configuration."""
+    here = tmp_path_factory.mktemp("heavy")
+    (here / "small.toml").write_text(SMALL)
+    scene, rng = load("alanine-dipeptide"), np.random.default_rng(0)
+    with open_writer(here / "ref.h5", scene, {"temperature_k": 300.0}) as writer:
+        writer.append(scene.positions_nm + 0.003 * rng.normal(size=(160, scene.n_atoms, 3)), np.arange(1.0, 161.0))
+    return here
+
+
+@pytest.mark.parametrize("option", [("--hydrogens", "placed"), ("--entities", "residue")])
+def test_weights_of_heavy_atoms_roll_all_atoms(folder: Path, option: tuple[str, str]) -> None:
+    weights, out = str(folder / f"{option[1]}.safetensors"), folder / f"{option[1]}.h5"
+    common = ["--config", str(folder / "small.toml"), "--steps", "20", "-q"]
+    done = run("train", str(folder / "ref.h5"), "-o", weights, *common, *option)
+    assert done.exit_code == 0, done.stderr
+    config = json.loads(run("info", weights, "--json").stdout)["config"]
+    assert config[option[0].removeprefix("--")] == option[1]
+    scene = load("alanine-dipeptide")
+    for atoms, n_atoms in (("all", scene.n_atoms), ("heavy", len(scene.heavy_idx))):
+        rolled = run("rollout", "alanine-dipeptide", "--weights", weights, "--time", "9ps", "-o", str(out), "--guard",
+                     "off", "--steps", "2", "--atoms", atoms, "--overwrite", "-q")  # fmt: skip
+        assert rolled.exit_code == 0, rolled.stderr
+        with open_trajectory(out) as reader:
+            assert reader.read().shape == (9, n_atoms, 3)
+    further = run("train", str(folder / "ref.h5"), "-o", str(folder / "f.safetensors"), "--from", weights, "--steps",
+                  "4", "-q", "--overwrite")  # fmt: skip
+    assert further.exit_code == 0, further.stderr
+    refused = run("train", str(folder / "ref.h5"), "-o", str(folder / "g.safetensors"), "--from", weights, "--steps",
+                  "4", *option)  # fmt: skip
+    assert refused.exit_code == 1
+    assert f"leave {option[0]} out" in refused.stderr
+
+
+def test_other_architectures_take_neither(folder: Path) -> None:
+    for option in (["--hydrogens", "placed"], ["--entities", "residue"]):
+        refused = run("train", str(folder / "ref.h5"), "-o", str(folder / "p.safetensors"), "--arch", "egnn", "--steps",
+                      "4", *option)  # fmt: skip
+        assert refused.exit_code == 1
+        assert option[0] in refused.stderr
+    assert run("train", str(folder / "ref.h5"), "-o", "x.safetensors", "--hydrogens", "some").exit_code == 2
