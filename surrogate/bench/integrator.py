@@ -89,6 +89,26 @@ def judge_integrator(model: Surrogate, frames: TrainingFrames, energy: EnergyFn,
     )
 
 
+def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: int, seed: int = 0) -> IntegratorReport:
+    """`judge_integrator` of a weights file of PAINET, with OpenMM's energies of its force field, bonds flexible.
+
+    Raises InputError for weights that carry no velocities.
+    """
+    from md_reference.engine import Engine
+    from md_reference.forcefield import ForceFieldSpec
+
+    weights = load_weights(path)
+    if not isinstance(weights.model, Painet):
+        raise InputError(f"{path} ({weights.model.arch}) carries no velocities.")
+    of = weights.domain.conditions
+    spec = ForceFieldSpec(of["force_field"], of["solvent"], None, constrain_hydrogens=False)
+    nve = Painet(replace(weights.model.config, friction_per_ps=0.0)).eval()
+    nve.load_state_dict(weights.model.state_dict())
+    strided = replace(frames, lag_ps=frames.lag_ps * weights.model.config.frame_stride)
+    with Engine(frames.scene, spec, platform="Reference", timestep_ps=0.0005) as engine:
+        return judge_integrator(weights.model, strided, engine.energy, nve=nve, starts=starts, chunks=chunks, seed=seed)
+
+
 @torch.inference_mode()
 def rolled(model: Surrogate, scene: Scene, x: npt.NDArray[np.float32], v: npt.NDArray[np.float32], chunks: int,
            seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
@@ -142,23 +162,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args()
-    from md_reference.engine import Engine
-    from md_reference.forcefield import ForceFieldSpec
     from surrogate.bench.forecasters import cut
 
     torch.set_num_threads(1)
-    weights = load_weights(args.weights)
-    if not isinstance(weights.model, Painet):
-        raise SystemExit(f"{args.weights} ({weights.model.arch}) carries no velocities.")
     _, frames = cut(collect_frames([args.reference], canonical=False, velocities=True), args.share)
-    of = weights.domain.conditions
-    spec = ForceFieldSpec(of["force_field"], of["solvent"], None, constrain_hydrogens=False)
-    nve = Painet(replace(weights.model.config, friction_per_ps=0.0)).eval()
-    nve.load_state_dict(weights.model.state_dict())
-    strided = replace(frames, lag_ps=frames.lag_ps * weights.model.config.frame_stride)
-    with Engine(frames.scene, spec, platform="Reference", timestep_ps=0.0005) as engine:
-        report = judge_integrator(weights.model, strided, engine.energy, nve=nve, starts=args.starts,
-                                  chunks=args.chunks, seed=args.seed)  # fmt: skip
+    report = judge_weights(args.weights, frames, starts=args.starts, chunks=args.chunks, seed=args.seed)
     for key, value in asdict(report).items():
         sys.stdout.write(f"{key:20} {value:.5g}\n")
     if args.json is not None:

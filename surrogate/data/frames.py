@@ -243,6 +243,8 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
             if len(steps) == 0 or not np.allclose(steps, steps[0], rtol=1e-4):
                 raise InputError(f"{path}: frames are not evenly spaced in time; training needs one save interval.")
             found = {key: reader.record.get(key) for key in CONDITIONS}
+            if reader.record.get("constrain_hydrogens") is False:
+                found["constrain_hydrogens"] = False
             if scene is None:
                 scene, lag_ps, conditions = reader.scene, float(steps[0]), found
             if reader.scene.topology_hash != scene.topology_hash:

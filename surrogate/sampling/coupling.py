@@ -56,7 +56,10 @@ class Coupling:
             )
         try:
             asked = ForceFieldSpec(
-                self._conditions["force_field"], self._conditions["solvent"], self._conditions.get("hydrogen_mass_da")
+                self._conditions["force_field"],
+                self._conditions["solvent"],
+                self._conditions.get("hydrogen_mass_da"),
+                constrain_hydrogens=self._conditions.get("constrain_hydrogens", True),
             )
             self._spec: ForceFieldSpec = resolve(self._scene, asked)
             self._system = build_system(self._scene, self._spec)

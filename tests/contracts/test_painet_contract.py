@@ -27,6 +27,8 @@ def lively(config: PainetConfig, kind: type[Painet] = Painet) -> Painet:
                 p.normal_(std=0.05)
             elif name.endswith(("e_phi", "e_psi")):
                 p.normal_()
+            elif name.endswith(("table.weight", "to_force.weight")):
+                p.normal_(std=0.1)
     return model.eval().requires_grad_(False)
 
 
@@ -52,6 +54,16 @@ class TestPainetAllPairs(TestPainet):
 
     def make(self, n_atoms: int) -> Surrogate:
         return lively(replace(SMALL, edges="all"))
+
+
+LEAPFROG = replace(SMALL, decoder="leapfrog", edges="all", n_radial=6, n_scalars=3, n_vectors=2)
+
+
+class TestPainetLeapfrog(TestPainet):
+    sizes = (1, 2, 40)
+
+    def make(self, n_atoms: int) -> Surrogate:
+        return lively(LEAPFROG)
 
 
 def test_the_factored_attention_equals_the_dense_one() -> None:

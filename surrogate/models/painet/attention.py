@@ -81,12 +81,12 @@ class EnergyAttention(nn.Module):
 
     def type_matrices(self) -> tuple[Tensor, Tensor]:
         """Return Phi and Psi `(n_heads, n_types, n_types)`."""
-        phi, psi = (torch.sigmoid(0.5 * (e + e.transpose(-1, -2)).float()) for e in (self.e_phi, self.e_psi))
+        phi, psi = (torch.sigmoid(0.5 * _wide(e + e.transpose(-1, -2))) for e in (self.e_phi, self.e_psi))
         return phi, self.psi_limit * phi * psi
 
     def forward(self, h: Tensor, types: Tensor, groups: TypeGroups) -> Tensor:
         """Embeddings `(b, n, width)`, types `(n,)` among those present, their atoms `groups` -> embeddings."""
-        q, k, v = self.qkv(h).float().unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k, v = _wide(self.qkv(h)).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
         q, k = F.normalize(q, dim=-1), F.normalize(k, dim=-1)
         phi, psi = self.type_matrices()
         # Sums over all atoms stay in float32: in bf16 the two forms would differ by more than rounding.
@@ -98,3 +98,8 @@ class EnergyAttention(nn.Module):
                 phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
                 mean = linear_mean(q, k, v, phi, psi, groups)
         return (1.0 - self.step) * h + self.step * self.out(mean.transpose(1, 2).flatten(-2))
+
+
+def _wide(s: Tensor) -> Tensor:
+    """`s` in float32, or as it is where that is float64."""
+    return s.to(torch.promote_types(s.dtype, torch.float32))

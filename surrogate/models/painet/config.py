@@ -18,6 +18,10 @@ class PainetConfig:
     (the decoder alone, which is EGNN). `edges` 'bonds' (with second neighbours) or 'all' pairs. `lag_ps` between
     predicted frames, `temperature_k` and `friction_per_ps` of the bath that refreshes velocities between chunks; a
     training takes the three from its reference.
+
+    `decoder` 'egnn' (the paper's) or 'leapfrog' (ours: layers are steps of an integrator whose forces keep momentum,
+    angular momentum and depend on positions alone), with `n_radial` functions of the distance per shell of pairs and
+    `n_scalars` and `n_vectors` sums over an atom's neighbours.
     """
 
     n_new: int = 8
@@ -28,6 +32,10 @@ class PainetConfig:
     n_decoder_layers: int = 4
     attention: str = "linear"
     edges: str = "bonds"
+    decoder: str = "egnn"
+    n_radial: int = 12
+    n_scalars: int = 8
+    n_vectors: int = 6
     # Share of the attention's mean in the next embedding, eta of the descent step.
     step: float = 0.5
     # Largest Psi / Phi: below one, weights stay positive whatever the embeddings.
@@ -42,6 +50,13 @@ class PainetConfig:
             raise InputError(f"attention = {self.attention!r} is unknown; choose linear, dense or none.")
         if self.edges not in ("bonds", "all"):
             raise InputError(f"edges = {self.edges!r} is unknown; choose bonds or all.")
+        if self.decoder not in ("egnn", "leapfrog"):
+            raise InputError(f"decoder = {self.decoder!r} is unknown; choose egnn or leapfrog.")
+        if self.n_radial < 2 or min(self.n_scalars, self.n_vectors, self.n_decoder_layers) < 1:
+            raise InputError(
+                f"n_radial = {self.n_radial} must be at least 2, n_scalars = {self.n_scalars}, n_vectors = "
+                f"{self.n_vectors} and n_decoder_layers = {self.n_decoder_layers} at least 1."
+            )
         if self.n_new < 1 or self.frame_stride < 1:
             raise InputError(f"n_new = {self.n_new} and frame_stride = {self.frame_stride} must be at least 1.")
         if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:

@@ -14,6 +14,8 @@ from surrogate.models.graphs import Graph, molecular_graph
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.painet.attention import EnergyAttention, TypeGroups
 from surrogate.models.painet.config import PainetConfig
+from surrogate.models.painet.leapfrog import Leapfrog
+from surrogate.models.painet.pairs import Pairs, molecular_pairs
 from systems.errors import InputError
 
 # Atomic numbers up to xenon; 0 is a particle of a model system.
@@ -26,11 +28,12 @@ BOLTZMANN_KJ_MOL_K = 0.00831446261815324
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What of a molecule does not change from chunk to chunk: edges, the type of each atom, each type's atoms."""
+    """What of a molecule does not change from chunk to chunk: the decoder's edges or pairs, each type's atoms."""
 
     molecule: Molecule
-    graph: Graph
     groups: TypeGroups
+    graph: Graph | None = None
+    pairs: Pairs | None = None
 
 
 class Painet(Surrogate):
@@ -69,7 +72,11 @@ class Painet(Surrogate):
             )
             for _ in range(n_attention)
         )
-        self.decoder = Egnn(c.width, c.n_decoder_layers)
+        self.decoder: Egnn | Leapfrog = Egnn(c.width, c.n_decoder_layers)
+        if c.decoder == "leapfrog":
+            self.decoder = Leapfrog(c.width, c.n_decoder_layers, c.n_radial, c.n_scalars, c.n_vectors)
+            self.float32_layers = ("decoder.",)  # type: ignore[misc]
+        self._known: Structure | None = None
         self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
         self.register_buffer("reach", torch.ones(2))
 
@@ -101,7 +108,16 @@ class Painet(Surrogate):
             raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
         present = torch.unique(molecule.elements)
         groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
-        return Structure(molecule, molecular_graph(molecule, all_pairs=self.config.edges == "all"), groups)
+        all_pairs = self.config.edges == "all"
+        if isinstance(self.decoder, Leapfrog):
+            return Structure(molecule, groups, pairs=molecular_pairs(molecule, all_pairs=all_pairs))
+        return Structure(molecule, groups, graph=molecular_graph(molecule, all_pairs=all_pairs))
+
+    def _structure_of(self, molecule: Molecule) -> Structure:
+        """`structure`, made once for chunk after chunk of one molecule."""
+        if self._known is None or self._known.molecule is not molecule:
+            self._known = self.structure(molecule)
+        return self._known
 
     def embed(self, x: Tensor, v: Tensor, elements: Tensor) -> Tensor:
         """H(0) `(b, n, width)` from scaled, centred positions and velocities `(b, n, 3)`."""
@@ -116,33 +132,64 @@ class Painet(Surrogate):
         centre, drift = ((share * s).sum(-2, keepdim=True) for s in (positions_nm, velocities_nm_ps))
         x = (positions_nm - centre) / scale
         v = (velocities_nm_ps - drift) / self.velocity_scale_nm_ps
-        h = self.embed(x, v, structure.molecule.elements)
+        decoder = self.decoder
+        # Leapfrog's forces know positions alone.
+        seen = torch.zeros_like(v) if isinstance(decoder, Leapfrog) else v
+        h = self.embed(x, seen, structure.molecule.elements)
         latents = []
         for t in range(self.n_new):
             if self.steps:
                 h = self.steps[t](h, structure.molecule.elements, structure.groups)
             latents.append(h + self.embed_frame[t])
-        frames = torch.stack(latents, dim=1).flatten(0, 1)
-        over_frames = lambda s: s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1)  # noqa: E731
-        x_new, v_new = self._decode(frames, over_frames(x), over_frames(v), structure.graph)
-        x_new, v_new = (s.unflatten(0, (-1, self.n_new)) for s in (x_new, v_new))
+        frames = torch.stack(latents, dim=1)
+        if isinstance(decoder, Leapfrog):
+            x_new, v_new = self._integrate(decoder, frames, x, v, structure)
+        else:
+            x_new, v_new = self._decode(decoder, frames, x, v, structure)
         x_new, v_new = (s - (share * s).sum(-2, keepdim=True) for s in (x_new, v_new))
         times = self.config.lag_ps * torch.arange(1, self.n_new + 1, device=x.device)[:, None, None]
         centres = centre[:, None] + times * drift[:, None]
         return x_new * scale + centres, v_new * self.velocity_scale_nm_ps + drift[:, None]
 
-    def _decode(self, h: Tensor, x: Tensor, v: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
-        """The decoder on rows `(b * n_new, n, ...)`, so many at once as keep its messages in the cache."""
+    def _decode(
+        self, decoder: Egnn, frames: Tensor, x: Tensor, v: Tensor, structure: Structure
+    ) -> tuple[Tensor, Tensor]:
+        """EGNN on latents `(b, n_new, n, width)` and states `(b, n, 3)` -> both `(b, n_new, n, 3)`: so many rows at
+        once as keep its messages in the cache."""
+        graph = structure.graph
+        assert graph is not None
         rows = max(1, MESSAGE_NUMBERS // (self.config.width * max(1, len(graph.receiver))))
-        parts = zip(h.split(rows), x.split(rows), v.split(rows), strict=True)
-        found = [self.decoder(*part, graph, self.reach) for part in parts]
-        return torch.cat([part[0] for part in found]), torch.cat([part[1] for part in found])
+        x, v = (s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1) for s in (x, v))
+        parts = zip(frames.flatten(0, 1).split(rows), x.split(rows), v.split(rows), strict=True)
+        found = [decoder(*part, graph, self.reach) for part in parts]
+        x_new, v_new = (torch.cat([part[k] for part in found]) for k in range(2))
+        return x_new.unflatten(0, (-1, self.n_new)), v_new.unflatten(0, (-1, self.n_new))
+
+    def _integrate(
+        self, decoder: Leapfrog, frames: Tensor, x: Tensor, v: Tensor, structure: Structure
+    ) -> tuple[Tensor, Tensor]:
+        """The same by the leapfrog decoder, always in the precision of the states: bf16 would round positions."""
+        c, pairs, masses = self.config, structure.pairs, structure.molecule.masses_da.to(x.dtype)
+        assert pairs is not None
+        with torch.autocast(x.device.type, enabled=False):
+            frames = frames.to(x.dtype)
+            z = decoder.encode.types(self.embed_type(structure.molecule.elements), pairs)
+            of = decoder.encode(z, self.embed_frame, pairs)
+            # Atoms first, then frames, then the batch.
+            h = (frames + z).permute(2, 1, 0, 3).flatten(1, 2)
+            x, v = (s.transpose(0, 1)[:, None].expand(-1, c.n_new, -1, -1).flatten(1, 2) for s in (x, v))
+            share = torch.arange(1, c.n_new + 1, device=x.device, dtype=x.dtype) / c.n_new
+            share = share.repeat_interleave(len(frames))[:, None]
+            times = share * (c.chunk_ps * self.velocity_scale_nm_ps / c.length_scale_nm)
+            x, v = decoder(h, x, v, times, share * self.reach[1] / masses[:, None, None], pairs, of)
+        x, v = (s.unflatten(1, (c.n_new, -1)).permute(2, 1, 0, 3) for s in (x, v))
+        return x, v
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Surrogate.next_chunk`: one evaluation from velocities that the bath has refreshed."""
         start = self.refreshed(last_velocities_nm_ps, molecule, noise)
-        x, v = self(last_frames_nm[:, -1], start, self.structure(molecule))
+        x, v = self(last_frames_nm[:, -1], start, self._structure_of(molecule))
         return Chunk(x, v[:, -1])
 
     def refreshed(self, velocities: Tensor | None, molecule: Molecule, noise: Tensor) -> Tensor:

@@ -363,6 +363,18 @@ def test_md_depends_on_start_and_seed_alone(domain: TrainingDomain, md: np.ndarr
     coupling.close()
 
 
+def test_help_has_flexible_bonds_where_the_reference_had(domain: TrainingDomain, md: np.ndarray) -> None:
+    flexible = {**CONDITIONS, "timestep_ps": 0.0005, "hydrogen_mass_da": None, "constrain_hydrogens": False}
+    spread = []
+    for conditions in (CONDITIONS, flexible):
+        coupling = Coupling(weights_of(replace(domain, conditions=conditions)))
+        frames = coupling.simulate(md[0], 8, seed=1).frames_nm
+        coupling.close()
+        to_hydrogen = [pair for pair in domain.scene.bonds.tolist() if "H" in (domain.scene.elements[k] for k in pair)]
+        spread.append(max(float(np.linalg.norm(frames[:, i] - frames[:, j], axis=-1).std()) for i, j in to_hydrogen))
+    assert spread[0] < 1e-5 < 1e-3 < spread[1]
+
+
 def test_weights_that_name_no_force_field_cannot_be_coupled(
     tmp_path: Path, scene: Scene, domain: TrainingDomain
 ) -> None:
