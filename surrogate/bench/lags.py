@@ -1,0 +1,158 @@
+"""Error against lag of a LaM-SLidE that takes it: `python -m surrogate.bench.lags FOLDER --train REF... --test REF...`.
+
+One model is trained on alanine dipeptide (or another peptide with phi and psi) for all spacings of frames up to
+`--longest-lag-ps`. At each of some lags it is started from frames of a trajectory that it never saw, which are in
+equilibrium, so that all it makes should be, too, and should forget where it started as fast as MD does. Beside it: MD
+itself, continued from the same frames, which is the floor of every figure, and the model told the shortest lag whatever
+is asked, which shows what the lag is worth to it. What is finished in FOLDER is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.bench.many_molecules import model_config
+from systems.validity import INVALID, Geometry, check_frames
+
+if TYPE_CHECKING:
+    from surrogate.data.frames import TrainingFrames
+    from surrogate.data.weights import Weights
+    from systems.scene import Scene
+
+FloatArray = npt.NDArray[np.float64]
+LAGS_PS = (1, 3, 10, 30, 100, 300, 1000)
+_BINS = 24
+
+
+@dataclass(frozen=True)
+class Row:
+    """One source at one lag: the share of `valid` frames, the Jensen-Shannon distance of their joint phi/psi to the
+    test trajectories', and the correlation of cos psi and cos phi with the start one lag later."""
+
+    lag_ps: float
+    source: str
+    valid: float
+    jsd: float
+    psi: float
+    phi: float
+
+
+def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, steps: int) -> None:
+    """Train one model for all lags; what is there stays."""
+    from surrogate.bench.many_molecules import STAGE_ONE_STEPS
+    from surrogate.data.frames import collect_frames
+    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+
+    if out.exists():
+        return
+    first = round(steps * STAGE_ONE_STEPS)
+    settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
+                              time_reversal=True, validate_every_s=300.0, longest_lag_ps=longest_lag_ps)  # fmt: skip
+    train_lam_slide(collect_frames(list(references)), out, model_config(graph=False, turn=False), settings)
+
+
+def torsions(scene: Scene, frames_nm: FloatArray) -> FloatArray:
+    """Return the first phi and psi `(..., 2)` of frames `(..., n_atoms, 3)`."""
+    from systems.chemistry import backbone_torsions
+    from systems.geometry import torsion
+
+    of = backbone_torsions(scene)
+    flat = frames_nm.reshape(-1, *frames_nm.shape[-2:])
+    found: FloatArray = np.asarray(torsion(flat, [of["phi"][0], of["psi"][0]]), dtype=np.float64)
+    return found.reshape(*frames_nm.shape[:-2], 2)
+
+
+def measure(weights: Weights, test: TrainingFrames, lag_ps: float, n_starts: int) -> list[Row]:
+    """Return the rows of one lag: MD, the model, and the model told the shortest lag."""
+    from surrogate.sampling.chunks import ChunkSampler
+    from surrogate.sampling.domain import fit_weights
+
+    geometry, stride = Geometry.from_dict(weights.domain.geometry), round(lag_ps / test.lag_ps)
+    length = weights.model.n_new + 1
+    starts = test.window_starts((length - 1) * stride + 1, validation=False)
+    starts = starts[np.linspace(0, len(starts) - 1, n_starts).astype(int)]
+    known = test.positions_nm(starts[:, None] + np.arange(length) * stride).astype(np.float64)
+    everything = torsions(test.scene, test.positions_nm(np.arange(0, test.n_frames, 5)).astype(np.float64))
+    sources = {"MD": known[:, 1:]}
+    for name, told_ps in (("model", lag_ps), ("model, told the shortest", weights.domain.lag_ps)):
+        fitted, _ = fit_weights(weights.domain.scene, weights, lag_ps=told_ps)
+        drawn = ChunkSampler(fitted).draw(known[:, :1], list(range(n_starts)))
+        sources[name] = np.asarray(drawn.frames_nm, dtype=np.float64)
+    first = torsions(test.scene, known[:, 0])
+    rows = []
+    for name, frames in sources.items():
+        found = torsions(test.scene, frames)
+        flags = check_frames(frames.reshape(-1, *frames.shape[2:]), geometry)
+        phi, psi = (_correlation(np.cos(first[:, k]), np.cos(found[:, 0, k])) for k in (0, 1))
+        valid = float(((flags & INVALID) == 0).mean())
+        rows.append(Row(lag_ps, name, valid, _joint_distance(found.reshape(-1, 2), everything), psi, phi))
+    return rows
+
+
+def _correlation(x: FloatArray, y: FloatArray) -> float:
+    """Of two draws from one equilibrium, whose mean and variance they share."""
+    both = np.concatenate([x, y])
+    return float(((x - both.mean()) * (y - both.mean())).mean() / both.var())
+
+
+def _joint_distance(x: FloatArray, y: FloatArray) -> float:
+    from surrogate.judge.distributions import distance
+
+    edges = np.linspace(-np.pi, np.pi, _BINS + 1)
+    counts = [np.histogram2d(a[:, 0], a[:, 1], bins=(edges, edges))[0].ravel() for a in (x, y)]
+    return float(distance(*counts))
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the rows as Markdown."""
+    lines = [
+        "| lag, ps | frames of | valid | joint φ/ψ JSD | cos ψ one lag later | cos φ one lag later |",
+        "|---|---|---|---|---|---|",
+        *(
+            f"| {r.lag_ps:g} | {r.source} | {100 * r.valid:.2f} % | {r.jsd:.3f} | {r.psi:.2f} | {r.phi:.2f} |"
+            for r in rows
+        ),
+    ]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse, train, measure, print the table and keep it in FOLDER."""
+    from surrogate.data.frames import collect_frames
+    from surrogate.data.weights import load_weights
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--train", type=Path, nargs="+", required=True, help="references of one molecule")
+    parser.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
+    parser.add_argument("--longest-lag-ps", type=float, default=1000.0)
+    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps of the training")
+    parser.add_argument("--starts", type=int, default=512, help="frames that each lag is started from")
+    a = parser.parse_args(arguments)
+    a.folder.mkdir(parents=True, exist_ok=True)
+    out = a.folder / "lags.safetensors"
+    train(a.train, out, longest_lag_ps=a.longest_lag_ps, steps=a.steps)
+    weights, test = load_weights(out), collect_frames(list(a.test))
+    rows = []
+    for lag_ps in LAGS_PS:
+        if weights.domain.lag_ps <= lag_ps <= weights.domain.longest_lag_ps:
+            rows += measure(weights, test, lag_ps, a.starts)
+            sys.stderr.write(f"{lag_ps} ps measured\n")
+    record: dict[str, Any] = {"domain": weights.domain.describe(), "provenance": weights.provenance,
+                              "rows": [asdict(row) for row in rows]}  # fmt: skip
+    (a.folder / "lags.json").write_text(json.dumps(record, indent=1))
+    (a.folder / "lags.md").write_text(table(rows) + "\n")
+    sys.stdout.write(table(rows) + "\n")
+
+
+if __name__ == "__main__":
+    main()

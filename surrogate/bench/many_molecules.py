@@ -1,0 +1,222 @@
+"""One LaM-SLidE for many molecules against one for each: `python -m surrogate.bench.many_molecules FOLDER`.
+
+References of small alcohols and alkanes are simulated (GAFF2 in vacuum, 300 K, frames 1 ps apart), one model is trained
+on most of them, with `graph` on, and rolled on molecules that it has seen and on ones that it has not; models of one
+molecule alone, trained on that molecule's own reference for a quarter of the steps (over twice as many as each molecule
+gets of the one for all), stand beside it. What is finished in FOLDER is not done again. Frames are held against that
+molecule's own reference, which of an unseen one the model never saw.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.scene import Scene
+from systems.validity import BOND_20_PERCENT, INVALID, check_frames, geometry_from_frames
+
+if TYPE_CHECKING:
+    from surrogate.models.lam_slide.config import LamSlideConfig
+
+FloatArray = npt.NDArray[np.float64]
+TRAINED = ("CC", "CCC", "CCCC", "CCCCC", "CCCCCC", "CC(C)C", "CCCO", "CCCCO", "CC(C)O")
+UNSEEN = ("CCO", "CCCCCO")
+# Of these, models of their own are trained as well.
+ALONE = ("CCCO", "CCO")
+OWN_SHARE = 1 / 4
+# Of all steps, those of the autoencoder.
+STAGE_ONE_STEPS = 0.35
+_BINS = 30
+_REPLICAS = 4
+
+
+@dataclass(frozen=True)
+class Row:
+    """How a rollout compares with its molecule's reference.
+
+    `valid`, `loose`: shares of frames that pass `systems.validity`, and of those with a bond more than 20 % off.
+    `bond_pm`: root mean square error of mean bond lengths; `spread`: the standard deviation of bond lengths over the
+    reference's, mean. `torsion_jsd`: mean over all torsions that turn. `step`: root mean square change of interatomic
+    distances from frame to frame, over the reference's.
+    """
+
+    molecule: str
+    model: str
+    frames: int
+    valid: float
+    loose: float
+    bond_pm: float
+    spread: float
+    torsion_jsd: float
+    step: float
+
+
+def measure(scene: Scene, reference_nm: FloatArray, replicas_nm: Sequence[FloatArray], model: str) -> Row:
+    """Hold replicas' frames `(n, n_atoms, 3)` nm each against the reference's."""
+    from surrogate.judge.distributions import distance
+    from systems.chemistry import rotatable_torsions
+    from systems.geometry import torsion
+
+    frames_nm = np.concatenate(replicas_nm)
+    flags = check_frames(frames_nm, geometry_from_frames(scene, reference_nm))
+    i, j = scene.bonds.T
+    bonds = [np.linalg.norm(x[:, i] - x[:, j], axis=-1) for x in (reference_nm, frames_nm)]
+    quads = rotatable_torsions(scene, rotors=True)
+    edges = np.linspace(-np.pi, np.pi, _BINS + 1)
+    jsd = []
+    for k in range(len(quads)):
+        counts = [np.histogram(torsion(x, quads[k : k + 1]), edges)[0].astype(float) for x in (reference_nm, frames_nm)]
+        jsd.append(float(distance(*counts)))
+    return Row(
+        molecule=scene.name,
+        model=model,
+        frames=len(frames_nm),
+        valid=float(((flags & INVALID) == 0).mean()),
+        loose=float(((flags & BOND_20_PERCENT) > 0).mean()),
+        bond_pm=1e3 * float(np.sqrt(np.square(bonds[1].mean(0) - bonds[0].mean(0)).mean())),
+        spread=float((bonds[1].std(0) / bonds[0].std(0)).mean()),
+        torsion_jsd=float(np.mean(jsd)) if jsd else float("nan"),
+        step=float(np.mean([change_per_frame(x) for x in replicas_nm])) / change_per_frame(reference_nm),
+    )
+
+
+def change_per_frame(frames_nm: FloatArray, lag: int = 1) -> float:
+    """Return the root mean square change in nm of interatomic distances over `lag` frames."""
+    i, j = np.triu_indices(frames_nm.shape[1], 1)
+    distances = np.linalg.norm(frames_nm[:, i] - frames_nm[:, j], axis=-1)
+    return float(np.sqrt(np.square(distances[lag:] - distances[:-lag]).mean()))
+
+
+def model_config(*, graph: bool, turn: bool) -> LamSlideConfig:
+    """Return a network that a few minutes of one core train."""
+    from surrogate.models.lam_slide.config import ApproximatorConfig, GraphConfig, LamSlideConfig
+
+    return LamSlideConfig(
+        graph=graph,
+        atoms=GraphConfig(turn=turn),
+        approximator=ApproximatorConfig(chunk_frames=16, width=128, n_layers=4, auxiliary_frames=2),
+    )
+
+
+def simulate(smiles: Sequence[str], folder: Path, time_ps: float) -> dict[str, Path]:
+    """Simulate each molecule with OpenMM, if that is not done yet, and return the trajectories."""
+    from surrogate import api
+
+    found = {}
+    for k, text in enumerate(smiles):
+        path = folder / f"{text}.h5"
+        if not path.exists():
+            api.reference(f"smiles:{text}", path, time_ps=time_ps, save_every_ps=1.0, temperature_k=300.0, seed=k,
+                          quiet=True)  # fmt: skip
+        found[text] = path
+    return found
+
+
+def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: LamSlideConfig, steps: int) -> None:
+    """Train on references, one model for all; what is there stays."""
+    from surrogate.data.frames import collect_frames
+    from surrogate.data.molecules import FrameSets, collect_sets
+    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+
+    if out.exists():
+        return
+    first = round(steps * STAGE_ONE_STEPS)
+    sets = collect_sets(list(references), held=list(held)) if config.graph else FrameSets(
+        (collect_frames(list(references)),))  # fmt: skip
+    started = time.monotonic()
+
+    def tell(stage: str, share: float, metrics: dict[str, float]) -> None:
+        if metrics:
+            shown = ", ".join(
+                f"{key} {value:.4g}" for key, value in metrics.items() if "validation" in key or "unseen" in key
+            )
+            sys.stderr.write(f"{out.stem} {stage} {100 * share:.0f} % {time.monotonic() - started:.0f} s: {shown}\n")
+
+    settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
+                              time_reversal=True, validate_every_s=300.0)  # fmt: skip
+    train_lam_slide(sets, out, config, settings, progress=tell)
+
+
+def roll(reference: Path, weights: Path, n_frames: int) -> tuple[Scene, FloatArray, list[FloatArray]]:
+    """Roll a reference's molecule from its structure; return the scene, the reference's frames and each replica's."""
+    from surrogate.data.weights import load_weights
+    from surrogate.sampling.rollout import RolloutConfig, rollout
+    from systems.trajectory import open_trajectory
+
+    with open_trajectory(reference) as reader:
+        assert reader.scene is not None
+        scene, truth = reader.scene, reader.read().astype(np.float64)
+    config = RolloutConfig(time_ps=float(n_frames // _REPLICAS), guard="off")
+    outs = [weights.with_name(f"{reference.stem}.{weights.stem}_r{k}.h5") for k in range(_REPLICAS)]
+    rollout(scene, load_weights(weights), outs, config, overwrite=True)
+    frames = []
+    for out in outs:
+        with open_trajectory(out) as reader:
+            frames.append(reader.read().astype(np.float64))
+    return scene, truth, frames
+
+
+def run(folder: Path, *, steps: int, time_ps: float, n_frames: int, turn: bool) -> list[Row]:
+    """Simulate, train, roll and measure."""
+    folder.mkdir(parents=True, exist_ok=True)
+    references = simulate([*TRAINED, *UNSEEN], folder, time_ps)
+    many = folder / ("many-turned.safetensors" if turn else "many.safetensors")
+    train([references[m] for m in TRAINED], [references[m] for m in UNSEEN], many, model_config(graph=True, turn=turn),
+          steps)  # fmt: skip
+    rows = []
+    for text, reference in references.items():
+        seen = "seen" if text in TRAINED else "unseen"
+        scene, truth, frames = roll(reference, many, n_frames)
+        half = len(truth) // 2
+        rows.append(replace(measure(scene, truth[:half], [truth[half:]], "reference, other half"), molecule=text))
+        rows.append(replace(measure(scene, truth, frames, f"one for all, {seen}"), molecule=text))
+        if text in ALONE:
+            own = folder / f"own-{text}.safetensors"
+            train([reference], [], own, model_config(graph=False, turn=False), round(steps * OWN_SHARE))
+            scene, truth, frames = roll(reference, own, n_frames)
+            rows.append(replace(measure(scene, truth, frames, "its own"), molecule=text))
+    return rows
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the rows as Markdown."""
+    lines = [
+        "| molecule | model | frames | valid | bond > 20 % off | bonds off, pm | bond spread | torsion JSD | step |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        lines.append(
+            f"| {r.molecule} | {r.model} | {r.frames} | {100 * r.valid:.2f} % | {100 * r.loose:.2f} % "
+            f"| {r.bond_pm:.2f} | {r.spread:.2f} | {r.torsion_jsd:.3f} | {r.step:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse, run, print the table and keep it in FOLDER."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps of each training")
+    parser.add_argument("--time-ps", type=float, default=3000.0, help="of each reference")
+    parser.add_argument("--frames", type=int, default=2000, help="of each rollout")
+    parser.add_argument("--turn", action="store_true", help="train with windows turned at random")
+    a = parser.parse_args(arguments)
+    rows = run(a.folder, steps=a.steps, time_ps=a.time_ps, n_frames=a.frames, turn=a.turn)
+    record: dict[str, Any] = {"settings": {**vars(a), "folder": str(a.folder)}, "rows": [asdict(row) for row in rows]}
+    name = "many-turned" if a.turn else "many"
+    (a.folder / f"{name}.json").write_text(json.dumps(record, indent=1))
+    (a.folder / f"{name}.md").write_text(table(rows) + "\n")
+    sys.stdout.write(table(rows) + "\n")
+
+
+if __name__ == "__main__":
+    main()
