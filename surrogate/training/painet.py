@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.weights import save_weights
+from surrogate.data.weights import Weights, save_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
@@ -70,12 +70,14 @@ def train_painet(
     *,
     model_class: type[Painet] = Painet,
     typical: TrainingFrames | None = None,
+    start: Weights | None = None,
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
     """Train on `frames`, which carry velocities, and write `out` (.safetensors) with a CSV of the curves beside it.
 
     `typical`: frames that the weights' domain is measured on, where `frames` hold others as well, hotter ones say.
+    `start`: weights of the same configuration that the training begins from, with their scales.
 
     Raises InputError when the frames carry none or are too short, SimulationError when training diverges.
     """
@@ -89,6 +91,10 @@ def train_painet(
     structure = model.structure(Molecule.of(frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
+    if start is not None:
+        if start.model.config != model_config:
+            raise InputError(f"{start.path} is of another configuration, {start.model.config}, than {model_config}.")
+        model.load_state_dict(start.model.state_dict())
     log_path, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.forecast.train.safetensors")
     if not resume and is_first_process():
         for path in (log_path, state):
@@ -107,7 +113,7 @@ def train_painet(
     def write(spent_s: float) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
                     "every_frame": config.every_frame}  # fmt: skip
-        save_weights(out, model, domain, provenance_of(frames, {**settings, "training_s": round(spent_s, 1)}))
+        save_weights(out, model, domain, provenance_of(frames, {**settings, "training_s": round(spent_s, 1)}, start))
 
     spent = run_stage(model, stage, loss_fn, validate, state_path=state, log_path=log_path, resume=resume,
                       device=device, progress=progress, on_save=write)  # fmt: skip
