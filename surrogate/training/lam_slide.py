@@ -151,10 +151,11 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
     if not model_config.graph:
         if len(sets.trained) > 1 or sets.unseen:
             raise InputError(f"{sets.names}: a model of several molecules knows atoms by their bonds; add --graph.")
-        if first.scene.n_atoms > model_config.autoencoder.identifier_pool:
+        residues = model_config.residues
+        n, what = (first.scene.n_atoms, "atoms") if residues is None else (len(residues.types), "residues")
+        if n > model_config.autoencoder.identifier_pool:
             raise InputError(
-                f"{first.scene.n_atoms} atoms need autoencoder.identifier_pool >= {first.scene.n_atoms}, not "
-                f"{model_config.autoencoder.identifier_pool}."
+                f"{n} {what} need autoencoder.identifier_pool >= {n}, not {model_config.autoencoder.identifier_pool}."
             )
     told = model_config.approximator
     if config.longest_lag_ps is not None:

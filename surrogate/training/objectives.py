@@ -35,12 +35,12 @@ def autoencoder_loss(
     c = model.config.autoencoder
     batch, n_atoms, _ = frames_nm.shape
     x = frames_nm / model.config.position_scale_nm
-    identifiers, rest = model.identifiers(n_atoms).expand(batch, n_atoms), torch.zeros((), device=x.device)
+    identifiers, rest = model.identifiers(n_atoms).expand(batch, -1), torch.zeros((), device=x.device)
     if atoms is not None:
         each = atoms.spread(x.shape[:1])
         identifiers, rest = each.tags, each.template
     elif c.random_identifiers > 0:
-        drawn = draw_identifiers(n_atoms, c.identifier_pool, batch, generator).to(x.device)
+        drawn = draw_identifiers(identifiers.shape[1], c.identifier_pool, batch, generator).to(x.device)
         pick = torch.rand(batch, 1, generator=generator).to(x.device) < c.random_identifiers
         identifiers = torch.where(pick, drawn, identifiers)
     numbers = elements.expand(batch, n_atoms)

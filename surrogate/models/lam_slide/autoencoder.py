@@ -64,6 +64,10 @@ class Autoencoder(nn.Module):
         tags: Tensor = identifiers if identifiers.is_floating_point() else self.identifiers(identifiers)
         return tags
 
+    def n_entities(self, n_atoms: int) -> int:
+        """Return how many identifiers so many atoms take: one each."""
+        return n_atoms
+
     def types(self, elements: Tensor) -> Tensor:
         """Return what the type logits are to name, given elements `(b, n_atoms)`: these themselves."""
         return elements

@@ -67,9 +67,9 @@ class LamSlide(Surrogate):
         return self.config.approximator.chunk_frames - self.n_conditioning
 
     def identifiers(self, n_atoms: int) -> Tensor:
-        """The canonical assignment `(n_atoms,)`: identifier k for the template's atom k. Permuting a scene's atoms
-        permutes identifiers with them, because scenes are matched to the template before they get here."""
-        return torch.arange(n_atoms, device=self.latent_mean.device)
+        """The canonical assignment `(n_entities,)`: identifier k for the template's atom (or residue) k. Permuting a
+        scene's atoms permutes identifiers with them: scenes are matched to the template before they get here."""
+        return torch.arange(self.autoencoder.n_entities(n_atoms), device=self.latent_mean.device)
 
     @property
     def first_stage(self) -> nn.Module:
@@ -119,7 +119,7 @@ class LamSlide(Surrogate):
         lead, n_atoms = frames_nm.shape[:-2], frames_nm.shape[-2]
         x = frames_nm.reshape(-1, n_atoms, 3).float() / self.config.position_scale_nm
         rows = x.shape[0]
-        tags = self.identifiers(n_atoms).expand(rows, n_atoms)
+        tags = self.identifiers(n_atoms).expand(rows, -1)
         if atoms is not None:
             each = atoms.spread(lead)
             x, tags = x - each.template, each.tags
@@ -131,7 +131,7 @@ class LamSlide(Surrogate):
         lead = latents.shape[:-2]
         z = latents.reshape(-1, *latents.shape[-2:]) * self.latent_scale + self.latent_mean
         if atoms is None:
-            x = self.autoencoder.decode(z, self.identifiers(n_atoms).expand(z.shape[0], n_atoms)).positions
+            x = self.autoencoder.decode(z, self.identifiers(n_atoms).expand(z.shape[0], -1)).positions
         else:
             each = atoms.spread(lead)
             x = self.autoencoder.decode(z, each.tags).positions + each.template

@@ -34,20 +34,22 @@ class ResidueAutoencoder(Autoencoder):
         self.to_position = nn.Sequential(nn.LayerNorm(config.width), nn.Linear(config.width, n_numbers))
         self.to_element = nn.Sequential(nn.LayerNorm(config.width), nn.Linear(config.width, len(RESIDUE_TYPES)))
 
+    def n_entities(self, n_atoms: int) -> int:
+        """Return how many identifiers the atoms take: one for each residue."""
+        return len(self.residues.types)
+
     def types(self, elements: Tensor) -> Tensor:
         """Return the residue types `(b, n_residues)` that stand for elements `(b, n_atoms)`."""
         return self.residues.types.expand(len(elements), -1)
 
     def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Atoms `(b, n_atoms, 3)` (scaled) -> latents `(b, n_latents, dim)`; of the identifiers `(b, n_atoms)`, the
-        first are those of the residues."""
-        own = identifiers[:, : len(self.residues.types)]
-        return super().encode(self.residues.to_residues(x), self.types(elements), own, mask)
+        """Atoms `(b, n_atoms, 3)` (scaled), identifiers `(b, n_residues)` -> latents `(b, n_latents, dim)`."""
+        return super().encode(self.residues.to_residues(x), self.types(elements), identifiers, mask)
 
     def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
-        """Latents -> atoms `(b, n_atoms, 3)` (scaled), type logits `(b, n_residues, types)`."""
-        own = identifiers[:, : len(self.residues.types)]
-        decoded = super().decode(latents, own, with_elements=with_elements)
+        """Latents, identifiers `(b, n_residues)` -> atoms `(b, n_atoms, 3)` (scaled), type logits `(b, n_residues,
+        types)`."""
+        decoded = super().decode(latents, identifiers, with_elements=with_elements)
         return Decoded(self.residues.to_atoms(decoded.positions), decoded.element_logits)
 
     def frame_loss(self, x: Tensor, decoded: Tensor, weight: Tensor | float = 1.0) -> Tensor:

@@ -172,6 +172,7 @@ def test_residue_losses_add_up_by_their_weights(harmonic_frames: TrainingFrames)
     # The same as of the untrained decoder's own atoms (eq. 13 and 14): position and distance see atoms, not places.
     scaled = x / model.config.position_scale_nm
     ids = model.identifiers(heavy.scene.n_atoms).expand(16, -1)
+    assert ids.shape == (16, 3), "one identifier for each residue"
     with torch.no_grad():
         latents = model.autoencoder.encode(scaled, elements.expand(16, -1), ids)
         decoded = model.autoencoder.decode(latents, ids).positions
@@ -225,6 +226,24 @@ def test_a_minute_lowers_every_loss_of_both_stages(
             assert last < first, f"{stage}, {name}: {first:.4g} -> {last:.4g}"
 
 
+def test_identifiers_belong_to_residues(harmonic_frames: TrainingFrames) -> None:
+    """Three of them suffice, drawn at random as well (Algorithm 1); two do not. Residues are told apart by nothing
+    else: with those of two exchanged, each decodes to the other's place."""
+    model, heavy = residue_model(harmonic_frames)
+    x = torch.from_numpy(heavy.positions_nm(np.arange(8)))
+    elements = torch.full((heavy.scene.n_atoms,), 6)
+    drawn = LamSlide(replace(model.config, autoencoder=replace(model.config.autoencoder, identifier_pool=3,
+                                                               random_identifiers=1.0)))  # fmt: skip
+    loss, _ = autoencoder_loss(drawn, x, elements, torch.Generator().manual_seed(0))
+    assert torch.isfinite(loss)
+    latents = model.autoencoder.encode(x, elements.expand(8, -1), model.identifiers(10).expand(8, -1))
+    decode = super(ResidueAutoencoder, model.autoencoder).decode
+    ids = torch.arange(3).expand(8, -1)
+    torch.testing.assert_close(
+        decode(latents, ids).positions[:, [1, 0, 2]], decode(latents, ids[:, [1, 0, 2]]).positions
+    )
+
+
 def test_what_heavy_atoms_cannot_do_is_refused_in_one_line(
     tmp_path: Path, harmonic_frames: TrainingFrames, placed_config: LamSlideConfig, residue_config: LamSlideConfig
 ) -> None:
@@ -234,6 +253,9 @@ def test_what_heavy_atoms_cannot_do_is_refused_in_one_line(
         train_lam_slide(sets, out, placed_config, QUICK)
     with pytest.raises(InputError, match="at one lag"):
         train_lam_slide(harmonic_frames, out, placed_config, replace(QUICK, longest_lag_ps=8.0))
+    pool = replace(residue_config, autoencoder=replace(residue_config.autoencoder, identifier_pool=2))
+    with pytest.raises(InputError, match=r"3 residues need autoencoder.identifier_pool >= 3, not 2"):
+        train_lam_slide(harmonic_frames, out, pool, QUICK)
     ethanol = load("ethanol")
     frames = replace(harmonic_frames, scene=ethanol, coordinates=harmonic_frames.coordinates[:, : ethanol.n_atoms])
     with pytest.raises(InputError, match="none of the twenty amino acids"):
