@@ -57,10 +57,15 @@ class ResidueAutoencoder(Autoencoder):
         `weight` (..., 1, 1) of each row."""
         with torch.autocast(x.device.type, enabled=False):
             errors = frame_errors(x.float(), decoded.float(), self.residues.frames, self.frame_clamp)
-            return (errors * weight).mean()
+            return _mean(errors * weight)
 
     def torsion_loss(self, x: Tensor, decoded: Tensor) -> Tensor:
         """Return the torsion loss of atoms `(..., n_atoms, 3)`, a mean over torsions; zero where there is none."""
         with torch.autocast(x.device.type, enabled=False):
             errors = torsion_errors(x.float(), decoded.float(), self.residues.torsions)
-            return errors.mean() if errors.numel() else errors.sum()
+            return _mean(errors)
+
+
+def _mean(errors: Tensor) -> Tensor:
+    """The mean; zero of nothing, where there is no frame or torsion."""
+    return errors.mean() if errors.numel() else errors.sum()

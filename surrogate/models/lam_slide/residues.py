@@ -67,8 +67,8 @@ class ResidueAtoms(nn.Module):
             "slots": slots.clamp(min=0),
             "filled": filled,
             "places": places,
-            "frames": torch.tensor(layout.frames).reshape(-1, 3),
-            "torsions": torch.tensor(layout.torsions).reshape(-1, 4),
+            "frames": torch.tensor(layout.frames, dtype=torch.long).reshape(-1, 3),
+            "torsions": torch.tensor(layout.torsions, dtype=torch.long).reshape(-1, 4),
         }
         for name, tensor in fixed.items():
             self.register_buffer(name, tensor, persistent=False)

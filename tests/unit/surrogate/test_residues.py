@@ -11,6 +11,9 @@ import pytest
 import torch
 
 from surrogate.data.residues import residue_layout
+from surrogate.models.lam_slide.autoencoder import reconstruction_losses
+from surrogate.models.lam_slide.config import AutoencoderConfig
+from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from surrogate.models.lam_slide.residues import (
     N_SLOTS,
     RESIDUE_TYPES,
@@ -175,6 +178,31 @@ def test_torsion_errors_by_hand() -> None:
     assert error(179.0, -179.0) == pytest.approx(2.0 - 2.0 * math.cos(math.radians(2.0)), abs=1e-5)
     # In degrees or without the square, a degree would be 1 or 0.017.
     assert error(0.0, 1.0) == pytest.approx(math.radians(1.0) ** 2, rel=1e-3)
+
+
+def test_position_and_distance_losses_by_hand() -> None:
+    """Equations 13 and 14 of two atoms 3 apart, of which one is decoded 4 to the side: 16 / 2, and (5 - 3)^2 twice of
+    four pairs."""
+    x = torch.tensor([[[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]])
+    decoded = torch.tensor([[[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]])
+    position, distance = reconstruction_losses(x, decoded)
+    assert float(position) == pytest.approx(8.0, abs=1e-5)
+    assert float(distance) == pytest.approx(2.0, abs=1e-4)
+
+
+def test_the_autoencoder_clamps_at_a_nanometre() -> None:
+    """One atom of four off by 0.06 nm, 0.3 in units of 0.2 nm, in one frame; and off by a metre, 5 of them."""
+    layout = ResidueLayout(4, (0,), ((0, 1, 2, 3, *[-1] * 10),), ((0, 1, 2),), ())
+    autoencoder = ResidueAutoencoder(AutoencoderConfig(width=32, head_dim=8), layout, 0.2)
+    for shift, loss in ((0.3, 0.075), (5e9, 1.25)):
+        decoded = SQUARE.clone()
+        decoded[3, 2] += shift
+        assert float(autoencoder.frame_loss(SQUARE[None], decoded[None])) == pytest.approx(loss, abs=2e-5)
+    assert float(autoencoder.torsion_loss(SQUARE[None], decoded[None])) == 0.0, "no torsion, no loss"
+    bent_layout = ResidueLayout(4, (0,), ((0, 1, 2, 3, *[-1] * 10),), (), ((0, 1, 2, 3),))
+    turning = ResidueAutoencoder(AutoencoderConfig(width=32, head_dim=8), bent_layout, 0.2)
+    assert float(turning.frame_loss(SQUARE[None], decoded[None])) == 0.0
+    assert float(turning.torsion_loss(bent(0.0)[None], bent(90.0)[None])) == pytest.approx(2.0, abs=1e-5)
 
 
 def test_frame_and_torsion_losses_do_not_see_the_pose() -> None:
