@@ -37,6 +37,7 @@ from surrogate.cli_options import (
     ValidationOpt,
     VelocitiesOpt,
     WantedTemperatureOpt,
+    literal,
     spread_options,
 )
 from surrogate.cli_printing import print_comparison, print_json, print_library, print_pairs, print_written
@@ -169,7 +170,7 @@ def reference(
     time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
     save_every: Annotated[
-        str | None, typer.Option("--save-every", help="Interval between saved frames. [default: 1ps]")
+        str | None, typer.Option("--save-every", help=literal("Interval between saved frames. [default: 1ps]"))
     ] = None,
     options: MDOptions,
     save_velocities: SaveVelocitiesOpt = False,

@@ -13,6 +13,12 @@ import typer
 from surrogate.md_options import Flag, flags_of
 
 
+def literal(text: str) -> str:
+    """Return a help text in which brackets are what they look like: typer and rich take `[default: 4fs]` for markup and
+    show nothing of it."""
+    return text.replace("[", "\\[")
+
+
 class Solver(StrEnum):
     multistep = "multistep"
     euler = "euler"
@@ -78,11 +84,13 @@ SelectOpt = Annotated[str | None, typer.Option("--select", help="Atoms to write,
 AtomsOpt = Annotated[Atoms, typer.Option("--atoms", help="Write all atoms or no hydrogens.")]
 HydrogensOpt = Annotated[
     Hydrogens | None,
-    typer.Option("--hydrogens", help="placed: learn heavy atoms alone; rollouts get hydrogens. [default: modelled]"),
+    typer.Option(
+        "--hydrogens", help=literal("placed: learn heavy atoms alone; rollouts get hydrogens. [default: modelled]")
+    ),
 ]
 EntitiesOpt = Annotated[
     Entities | None,
-    typer.Option("--entities", help="residue: of peptides, as units; hydrogens are placed. [default: atom]"),
+    typer.Option("--entities", help=literal("residue: of peptides, as units; hydrogens are placed. [default: atom]")),
 ]
 ForceOpt = Annotated[bool, typer.Option("--force", help="Roll a scene that leaves the training domain, marked.")]
 WantedTemperatureOpt = Annotated[
@@ -132,6 +140,6 @@ def _parameter(name: str, kind: Any, flag: Flag) -> inspect.Parameter:
         kind, default = str | None, None
     else:
         default = flag.default
-    option = typer.Option(flag.flag, help=flag.help, min=flag.least, max=flag.most)
+    option = typer.Option(flag.flag, help=literal(flag.help), min=flag.least, max=flag.most)
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

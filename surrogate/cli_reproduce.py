@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from surrogate.cli_options import JsonOpt, QuietOpt, ResumeOpt, SeedOpt
+from surrogate.cli_options import JsonOpt, QuietOpt, ResumeOpt, SeedOpt, literal
 from surrogate.cli_printing import print_json
 from systems.units import parse_time_ps, parse_wall_s
 
@@ -24,7 +24,8 @@ def reproduce(
     train: Annotated[int | None, typer.Option("--train", **_SIZE)] = None,
     test: Annotated[int | None, typer.Option("--test", **_SIZE)] = None,
     validation: Annotated[
-        int | None, typer.Option("--validation", min=2, help="The same. [default: a tenth of --test; md17: as --test]")
+        int | None,
+        typer.Option("--validation", min=2, help=literal("The same. [default: a tenth of --test; md17: as --test]")),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="Leave out what goes beyond the papers; the same as every --without.")
@@ -34,7 +35,8 @@ def reproduce(
         typer.Option("--without", help="Leave out: extrapolate, any-start, from-velocity, canonical. Repeatable."),
     ] = None,
     molecule: Annotated[
-        list[str] | None, typer.Option("--molecule", help="md17: only this; may be repeated. [default: all eight]")
+        list[str] | None,
+        typer.Option("--molecule", help=literal("md17: only this; may be repeated. [default: all eight]")),
     ] = None,
     simulated: Annotated[str, typer.Option("--time", help="md17: trajectory of each molecule.")] = "200ps",
     md17_ethanol: Annotated[
@@ -50,7 +52,7 @@ def reproduce(
     ] = None,
     device: Annotated[str, typer.Option("--device", help="Where to train: auto, cpu or cuda.")] = "auto",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder of data and results. [default: surromd-NAME]")
+        Path | None, typer.Option("--out", "-o", help=literal("Folder of data and results. [default: surromd-NAME]"))
     ] = None,
     seed: SeedOpt = 0,
     resume: ResumeOpt = False,

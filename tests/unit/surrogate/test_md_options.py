@@ -119,3 +119,27 @@ def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.Monkey
     monkeypatch.setattr(f"{__name__}.defaults", lambda: wrong)
     with pytest.raises(AssertionError, match="timestep_ps"):
         test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults()
+
+
+def test_help_shows_the_defaults() -> None:
+    """In brackets, which the library that prints help takes for markup and swallows unless they are escaped."""
+    wide = {"COLUMNS": "200", "TERM": "dumb"}
+    shown = " ".join(CliRunner().invoke(cli.app, ["reference", "--help"], env=wide).output.split())
+    for text in ("Integration step. [default: 4fs]", "Of the bath. [default: 300K]", "saved frames. [default: 1ps]"):
+        assert text in shown
+    assert "\\[" not in shown
+
+
+def test_no_help_text_loses_its_brackets() -> None:
+    from rich.text import Text
+    from typer.main import get_command
+
+    def helps(command: Any) -> list[str]:
+        own = [p.help for p in command.params if getattr(p, "help", None)]
+        return own + [text for sub in getattr(command, "commands", {}).values() for text in helps(sub)]
+
+    found = helps(get_command(cli.app))
+    lost = [text for text in found if Text.from_markup(text).plain != text.replace("\\[", "[")]
+    assert len(found) > 100 and not lost, lost
+    # Negative control: what an unescaped default comes to.
+    assert Text.from_markup("Step. [default: 4fs]").plain == "Step. "
