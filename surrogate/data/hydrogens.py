@@ -157,9 +157,9 @@ def _fit_moves(group: SiteGroup, frames: TrainingFrames) -> None:
     totals = counts.sum(2, keepdims=True)
     shares = totals[..., 0] / totals.sum(1)
     # A state that was never visited is only ever met in a start of the user's; it is left as if for the first time.
-    moves = np.where(totals > 0, counts / np.maximum(totals, 1.0), shares[:, None, :])
-    group.shares.copy_(torch.from_numpy(shares.cumsum(-1)))
-    group.moves.copy_(torch.from_numpy(moves.cumsum(-1)))
+    moves = np.where(totals > 0, counts / np.where(totals > 0, totals, 1.0), shares[:, None, :])
+    group.shares.copy_(torch.from_numpy(shares))
+    group.moves.copy_(torch.from_numpy(moves))
 
 
 def _fold(group: SiteGroup, k: int) -> int:

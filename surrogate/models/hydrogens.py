@@ -80,7 +80,7 @@ class SiteGroup(nn.Module):
     `shape`: of a rotor `(n, hands, k, 2)`, the angle at the parent and that about the bond relative to the site's; else
     `(n, hands, k, 12)`, the weights of the features that place it. `lengths_nm`, `length_spread_nm (n, k)`; `swing
     (n, hands, d, d)` a root of the covariance of what is left, d = 2k angles (rad) or 3k coordinates (nm); `shares
-    (n, S)` of the states and `moves (n, S, S)` the probabilities of the next one, both cumulative.
+    (n, S)` of the states and `moves (n, S, S)` the probabilities of the next one, from row to column.
     """
 
     parent: Tensor
@@ -114,9 +114,8 @@ class SiteGroup(nn.Module):
         self.register_buffer("lengths_nm", torch.full((n, self.k), 0.1))
         self.register_buffer("length_spread_nm", torch.zeros(n, self.k))
         self.register_buffer("swing", torch.zeros(n, self.hands, self.n_coordinates, self.n_coordinates))
-        even = torch.arange(1, self.n_states + 1) / self.n_states
-        self.register_buffer("shares", even.repeat(n, 1))
-        self.register_buffer("moves", even.repeat(n, self.n_states, 1))
+        self.register_buffer("shares", torch.full((n, self.n_states), 1.0 / self.n_states))
+        self.register_buffer("moves", torch.full((n, self.n_states, self.n_states), 1.0 / self.n_states))
 
     # ---- reading frames --------------------------------------------------------------------------------------------
 
@@ -224,11 +223,12 @@ class SiteGroup(nn.Module):
             return torch.zeros(uniform.shape, dtype=torch.long, device=uniform.device)
         if still:
             if known is None:
-                known = self.shares.diff(dim=-1, prepend=self.shares.new_zeros(n, 1)).argmax(-1).expand(b, n)
+                known = self.shares.argmax(-1).expand(b, n)
             return known[:, None].expand(uniform.shape)
+        shares, moves = _cumulative(self.shares), _cumulative(self.moves)
         found = []
         for t in range(uniform.shape[1]):
-            upper = self.shares.expand(b, n, -1) if known is None else self.moves[sites, known]
+            upper = shares.expand(b, n, -1) if known is None else moves[sites, known]
             known = (uniform[:, t, :, None] >= upper).sum(-1).clamp(max=self.n_states - 1)
             found.append(known)
         return torch.stack(found, dim=1)
@@ -287,6 +287,12 @@ class HydrogenPlacer(nn.Module):
         for group in self.groups:
             assert isinstance(group, SiteGroup)
             yield group
+
+
+def _cumulative(probabilities: Tensor) -> Tensor:
+    """Running sums along the last axis, of which the last is one: tables may have been rounded to float16."""
+    sums = probabilities.double().cumsum(-1)
+    return sums / sums[..., -1:]
 
 
 def _unit(x: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ def filled(config: LamSlideConfig) -> HeavyLamSlide:
             group.shape.copy_(torch.rand(group.shape.shape) + 0.5)
             group.swing.copy_(0.01 * torch.rand(group.swing.shape))
             mostly_stays = 0.9 * torch.eye(group.n_states) + 0.1 / group.n_states
-            group.moves.copy_(mostly_stays.cumsum(-1))
+            group.moves.copy_(mostly_stays.expand(group.moves.shape))
     return model.eval().requires_grad_(False)
 
 
