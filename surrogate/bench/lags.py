@@ -57,7 +57,8 @@ def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, steps
     first = round(steps * STAGE_ONE_STEPS)
     settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
                               time_reversal=True, validate_every_s=300.0, longest_lag_ps=longest_lag_ps)  # fmt: skip
-    train_lam_slide(collect_frames(list(references)), out, model_config(graph=False, turn=False), settings)
+    config = model_config(graph=False, turn=False)
+    train_lam_slide(collect_frames(list(references)), out, config, settings, resume=True)
 
 
 def torsions(scene: Scene, frames_nm: FloatArray) -> FloatArray:
@@ -135,8 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--train", type=Path, nargs="+", required=True, help="references of one molecule")
     parser.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
     parser.add_argument("--longest-lag-ps", type=float, default=1000.0)
-    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps of the training")
-    parser.add_argument("--starts", type=int, default=512, help="frames that each lag is started from")
+    parser.add_argument("--steps", type=int, default=1600, help="optimiser steps of the training")
+    parser.add_argument("--starts", type=int, default=128, help="frames that each lag is started from")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
     out = a.folder / "lags.safetensors"

@@ -34,7 +34,7 @@ UNSEEN = ("CCO", "CCCCCO")
 ALONE = ("CCCO", "CCO")
 OWN_SHARE = 1 / 4
 # Of all steps, those of the autoencoder.
-STAGE_ONE_STEPS = 0.35
+STAGE_ONE_STEPS = 0.5
 _BINS = 30
 _REPLICAS = 4
 
@@ -143,7 +143,7 @@ def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: L
 
     settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
                               time_reversal=True, validate_every_s=300.0)  # fmt: skip
-    train_lam_slide(sets, out, config, settings, progress=tell)
+    train_lam_slide(sets, out, config, settings, resume=True, progress=tell)
 
 
 def roll(reference: Path, weights: Path, n_frames: int) -> tuple[Scene, FloatArray, list[FloatArray]]:
@@ -205,9 +205,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse, run, print the table and keep it in FOLDER."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=4000, help="optimiser steps of each training")
+    parser.add_argument("--steps", type=int, default=2520, help="optimiser steps of the model for all")
     parser.add_argument("--time-ps", type=float, default=3000.0, help="of each reference")
-    parser.add_argument("--frames", type=int, default=2000, help="of each rollout")
+    parser.add_argument("--frames", type=int, default=1200, help="of each molecule, in four replicas")
     parser.add_argument("--turn", action="store_true", help="train with windows turned at random")
     a = parser.parse_args(arguments)
     rows = run(a.folder, steps=a.steps, time_ps=a.time_ps, n_frames=a.frames, turn=a.turn)

@@ -152,7 +152,8 @@ class Simulation:
         raise SimulationError("a surrogate has no energy to minimise; prepare the scene, or minimise it with OpenMM.")
 
     def _settings(self) -> dict[str, Any]:
-        return {
+        lag_ps = self.weights.model.lag_ps
+        return ({} if lag_ps is None else {"lag_ps": lag_ps}) | {
             "weights_hash": self.weights.hash,
             "topology_hash": self.scene.topology_hash,
             "seed": self._seed,
