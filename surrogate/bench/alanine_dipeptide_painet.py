@@ -39,8 +39,8 @@ FloatArray = npt.NDArray[np.float64]
 SCENE = "alanine-dipeptide"
 NAME = "alanine-dipeptide-painet"
 RUN_PS, SAVE_EVERY_PS, TIMESTEP_PS, SETTLE_PS = 10.0, 0.001, 0.0005, 40.0
-# Of the bath that settles the runs and, in rollouts, refreshes velocities between chunks.
-FRICTION_PER_PS = 5.0
+# Of the bath that settles the runs, and of the one that refreshes velocities between a rollout's chunks.
+FRICTION_PER_PS, BATH_PER_PS = 5.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ N_SHAKEN, SHAKEN_NM, SHAKEN_K, SHAKEN_SEED = 12_000, 0.006, (300.0, 600.0), 3000
 N_VISITED, VISITING, VISITS, VISITED_SEED = 12_000, 48, 125, 4000
 # Frames of a run from such a state, two chunks and the first; and the total energy up to which it is one.
 SHORT_FRAMES, HIGHEST_KJ_MOL = 9, 500.0
-FURTHER_RATE = 2e-3
+FURTHER_RATE = 7e-4
 # Frames of each piece that is taken from the long runs, and from one to the next: so that the shaken ones count.
 PIECE, EVERY = 30, 400
 
@@ -223,7 +223,7 @@ def train(folder: Path, cold: list[Path], hot: list[Path], budgets_s: tuple[floa
     visited = short_runs(folder / "visited.h5", typical, visited_states(first, hotter),
                          {"visited_by": first.name, "seed": VISITED_SEED})  # fmt: skip
     further = replace(training_config(budgets_s[1]), learning_rate=FURTHER_RATE, seed=1)
-    return _train(folder / f"{NAME}.safetensors", join(frames, visited), typical, further, load_weights(first))
+    return _train(folder / "further.safetensors", join(frames, visited), typical, further, load_weights(first))
 
 
 def _train(out: Path, frames: TrainingFrames, typical: TrainingFrames, config: PainetTraining,
@@ -241,6 +241,16 @@ def _train(out: Path, frames: TrainingFrames, typical: TrainingFrames, config: P
 
         return train_painet(frames, out, model_config(), config, typical=typical, start=start, resume=True,
                             progress=report)  # fmt: skip
+
+
+def ship(source: Path, target: Path) -> Path:
+    """Write the weights with the bath of rollouts: strong enough to take away the heat of the model's errors."""
+    from surrogate.data.weights import load_weights, save_weights
+
+    weights = load_weights(source)
+    weights.model.config = replace(weights.model.config, friction_per_ps=BATH_PER_PS)
+    save_weights(target, weights.model, weights.domain, weights.provenance)
+    return target
 
 
 def judge(weights: Path, held: Path) -> IntegratorReport:
@@ -278,7 +288,8 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
     cold, hot = (make_reference(args.out, name, runs) for name, runs in (("cold", COLD), ("hot", HOT)))
-    weights = train(args.out, cold, hot, (parse_wall_s(args.budget), parse_wall_s(args.further)))
+    trained = train(args.out, cold, hot, (parse_wall_s(args.budget), parse_wall_s(args.further)))
+    weights = ship(trained, args.out / f"{NAME}.safetensors")
     report = asdict(judge(weights, cold[-1]))
     (args.out / "integrator.json").write_text(json.dumps(report, indent=1))
     for key, value in report.items():

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from surrogate.bench import alanine_dipeptide_painet as recipe
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.data.splits import Split
+from surrogate.data.weights import load_weights, save_weights
+from surrogate.models.painet.model import Painet
+from surrogate.training.provenance import training_domain
 from systems.scene import Scene
 
 
@@ -48,3 +53,13 @@ def test_joined_frames_hold_out_what_the_first_do(frames: TrainingFrames) -> Non
     held = joined.window_starts(9, validation=True)
     assert (held >= 2000).all() and (held < 3000).all()
     assert numbers(joined, np.array([4321])) == [1321]
+
+
+def test_what_is_shipped_differs_by_its_bath_alone(tmp_path: Path, frames: TrainingFrames) -> None:
+    torch.manual_seed(0)
+    model = Painet(replace(recipe.model_config(), width=8, n_heads=1, head_dim=4, n_radial=3))
+    save_weights(tmp_path / "a.safetensors", model, training_domain(frames), {"seed": 0})
+    shipped = load_weights(recipe.ship(tmp_path / "a.safetensors", tmp_path / "b.safetensors"))
+    assert shipped.model.config == replace(model.config, friction_per_ps=recipe.BATH_PER_PS)
+    assert shipped.provenance == {"seed": 0}
+    assert all(torch.equal(p, shipped.model.state_dict()[name]) for name, p in model.state_dict().items())
