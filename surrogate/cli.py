@@ -331,7 +331,9 @@ def rollout(
         str | None, typer.Option("--lag", help="Of one step, of weights for several. Default: --save-every if it fits.")
     ] = None,
     replicas: Replicas = 1,
-    solver: Annotated[Solver | None, typer.Option("--solver", help="Default: the one that suits the weights.")] = None,
+    solver: Annotated[
+        Solver | None, typer.Option("--solver", help="fitted: for 2 to 10 steps. Default: the one that suits.")
+    ] = None,
     solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
     precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
     compile_: Annotated[

@@ -21,6 +21,7 @@ def literal(text: str) -> str:
 
 class Solver(StrEnum):
     multistep = "multistep"
+    fitted = "fitted"
     euler = "euler"
     dopri5 = "dopri5"
 

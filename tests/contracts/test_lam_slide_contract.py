@@ -84,8 +84,8 @@ def test_adaptive_evaluations_are_counted() -> None:
     frames, molecule = random_state(5, 2, 1)[0], branched_chain(5)
     noise = torch.randn(2, *model.noise_shape(5), generator=torch.Generator().manual_seed(0))
     counts = [model.next_chunk(frames, molecule, noise, solver=s, solver_steps=9).evaluations for s in model.solvers]
-    assert counts[:2] == [9.0, 9.0]
-    assert (counts[2] or 0.0) > 9.0
+    assert counts[:-1] == [9.0] * (len(model.solvers) - 1)
+    assert (counts[-1] or 0.0) > 9.0
 
 
 def test_permuting_atoms_with_their_identifiers_permutes_the_frames() -> None:

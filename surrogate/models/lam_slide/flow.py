@@ -9,6 +9,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+# Of the solver `fitted`: its steps are fitted to widths of 1 - FITTED_BELOW / n_steps times noise over signal. Exact
+# predictions of Gaussian data want about 0.6, 0.75, 0.85 and 0.95 of it at 2, 3, 4 and 6 steps; a trained network,
+# which leaves narrow directions too narrow, a little less.
+FITTED_BELOW = 0.8
 # Where adaptive steps end.
 ADAPTIVE_END = 0.999
 # (o_tau (b, ...), tau (b,)) -> prediction of the data o_1 (b, ...)
@@ -91,6 +95,48 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
     return o
 
 
+def fitted(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
+    """Integrate the linear interpolant in very few steps: 2 to 10 evaluations, one a step.
+
+    Between two grid points the prediction is a constant, that of the step's start and `fitted_share` of its change
+    since the grid point before: so much that the step is exact for Gaussian data (exponential fitting: Lyche, Numer.
+    Math. 19, 65, 1972) of a width a little below the ratio of noise to signal there, which is what the step decides
+    about. The grid 1 - tau = cos^2(pi k / 2 n) is fine at both ends; that of `multistep` is coarse near the noise,
+    where it is decided which state a chunk goes to. Second order; from about 10 steps on `multistep` is the better.
+    """
+    if interpolant != "linear":
+        raise ValueError(f"the fitted solver integrates the linear interpolant, not {interpolant!r}")
+    o = noise
+    levels = [math.cos(0.5 * math.pi * k / n_steps) ** 2 for k in range(n_steps)] + [0.0]
+    before: Tensor | None = None
+    for k, (left, right) in enumerate(pairwise(levels)):
+        prediction = predict(o, torch.full((o.shape[0],), 1.0 - left, device=o.device, dtype=torch.float32))
+        ahead = prediction
+        if before is not None:
+            width = (1.0 - FITTED_BELOW / n_steps) * left / (1.0 - left)
+            ahead = prediction + fitted_share(levels[k - 1], left, right, width) * (prediction - before)
+        o, before = ahead + (right / left) * (o - ahead), prediction
+    return o
+
+
+def fitted_share(before: float, left: float, right: float, width: float) -> float:
+    """Return by how much of the prediction's last change, from noise level 1 - tau = `before` to `left`, the step from
+    `left` to `right` has to look ahead to be exact for Gaussian data of this width.
+
+    For data of width w and unit noise, x(s) = sqrt((1 - s)^2 w^2 + s^2) from x(1) = 1, and the data prediction along it
+    is (1 - s) w^2 / x(s).
+    """
+
+    def path(level: float) -> float:
+        return math.hypot((1.0 - level) * width, level)
+
+    def prediction(level: float) -> float:
+        return (1.0 - level) * width**2 / path(level)
+
+    wanted = (path(right) - right / left * path(left)) / (1.0 - right / left)
+    return (wanted - prediction(left)) / (prediction(left) - prediction(before))
+
+
 def dopri5(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
     """Integrate from noise to data with adaptive steps (Dormand-Prince 5(4) of torchdiffeq; Table 12).
 
@@ -112,6 +158,7 @@ def dopri5(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: st
 
 SOLVERS: dict[str, Callable[[DataPrediction, Tensor, int, str], Tensor]] = {
     "multistep": multistep,
+    "fitted": fitted,
     "euler": euler,
     "dopri5": dopri5,
 }
@@ -121,4 +168,4 @@ ADAPTIVE = ("dopri5",)
 
 def solvers_for(interpolant: str) -> tuple[str, ...]:
     """Return the solvers that integrate this interpolant, the better one first."""
-    return ("multistep", "euler", "dopri5") if interpolant == "linear" else ("euler", "dopri5")
+    return ("multistep", "fitted", "euler", "dopri5") if interpolant == "linear" else ("euler", "dopri5")

@@ -131,6 +131,62 @@ def test_one_multistep_lands_on_the_prediction_as_eulers_does() -> None:
         flow.multistep(predict, noise, 4, "gvp")
 
 
+def relative_width(solver: str, width: float, n_steps: int) -> float:
+    """Return how wide Gaussian data of this width come out, over that: linear in the noise, so exact."""
+    noise = torch.randn(50, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sample = flow.SOLVERS[solver](gaussian_posterior("linear", width), noise, n_steps, "linear")
+    assert abs(float(sample.mean()) - MEAN - float(sample.std() / noise.std()) * float(noise.mean())) < 1e-6
+    return float(sample.std() / noise.std()) / width
+
+
+def test_fitted_steps_are_exact_for_the_width_they_are_fitted_to() -> None:
+    """A step from exact states, and for data of no other width."""
+
+    def step_error(width: float, before: float, left: float, right: float, fitted_to: float) -> float:
+        def x(level: float) -> float:
+            return math.sqrt(((1 - level) * width) ** 2 + level**2)
+
+        def predicted(level: float) -> float:
+            return (1 - level) * width**2 / x(level)
+
+        share = flow.fitted_share(before, left, right, fitted_to)
+        ahead = predicted(left) + share * (predicted(left) - predicted(before))
+        return abs(ahead + right / left * (x(left) - ahead) - x(right)) / x(right)
+
+    for before, left, right, width in ((1.0, 0.75, 0.25, 2.4), (0.75, 0.25, 0.0, 0.27), (0.6, 0.2, 0.05, 0.2)):
+        assert step_error(width, before, left, right, width) < 1e-12
+        assert step_error(2 * width, before, left, right, width) > 1e-3
+        assert step_error(width / 2, before, left, right, width) > 1e-3
+
+
+@pytest.mark.parametrize(("n_steps", "within"), [(2, 0.23), (3, 0.05), (4, 0.1)])
+def test_few_fitted_steps_keep_wide_directions(n_steps: int, within: float) -> None:
+    """Directions as wide as the data or wider, in which states differ; multistep and euler lose many times as much."""
+    errors = {
+        solver: max(abs(relative_width(solver, width, n_steps) - 1) for width in (0.7, 1.0, 1.5, 2.0))
+        for solver in ("fitted", "multistep", "euler")
+    }
+    assert errors["fitted"] < within, errors
+    # Negative controls.
+    assert errors["multistep"] > 2.5 * errors["fitted"] and errors["euler"] > 2.5 * errors["fitted"], errors
+
+
+@pytest.mark.parametrize("width", [2.0, 0.4, 0.2])
+def test_fitted_is_of_second_order(width: float) -> None:
+    errors = [abs(relative_width("fitted", width, n) - 1) for n in (40, 80, 160)]
+    assert all(0.15 < fine / coarse < 0.42 for coarse, fine in pairwise(errors)), errors
+    assert errors[-1] < 0.01
+
+
+def test_one_fitted_step_lands_on_the_prediction() -> None:
+    noise = torch.randn(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    predict = gaussian_posterior("linear")
+    torch.testing.assert_close(flow.fitted(predict, noise, 1, "linear"), flow.euler(predict, noise, 1, "linear"))
+    with pytest.raises(ValueError, match="gvp"):
+        flow.fitted(predict, noise, 4, "gvp")
+    assert "fitted" not in flow.solvers_for("gvp") and flow.solvers_for("linear")[0] == "multistep"
+
+
 @pytest.mark.parametrize("interpolant", ["linear", "gvp"])
 def test_adaptive_steps_carry_noise_to_the_data_distribution(interpolant: str) -> None:
     """Linear in the noise: the ratio of the widths is exact but for the tolerance."""
