@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogate.cli_options import JsonOpt, QuietOpt, SeedOpt
+from surrogate.cli_options import JsonOpt, Precision, QuietOpt, SeedOpt
 from surrogate.cli_printing import print_json
-from systems.units import parse_wall_s
+from systems.units import parse_time_ps, parse_wall_s
 
 if TYPE_CHECKING:
     from surrogate.bench.reference import Row
@@ -67,6 +67,51 @@ def reference(
     if not result["rows"] or not all(row["equal_energies"] for row in result["rows"]):
         typer.echo("error: no case ran, or energies differ: see above.", err=True)
         raise typer.Exit(1)
+
+
+@bench.command(name="cost-error")
+def cost_error(
+    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Held-out run: a file, folder or glob.")],
+    replicate: Annotated[str, typer.Argument(metavar="REPLICATE", help="Another one, as long.")],
+    weights: Annotated[list[str], typer.Option("--weights", "-w", help="Name or .safetensors file; repeatable.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the tables and the plot.")] = Path("cost-error"),
+    time: Annotated[str, typer.Option("--time", help="Rolled at each setting, all replicas together.")] = "20ns",
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Parts, by turns with OpenMM.")] = 4,
+    solver: Annotated[list[str] | None, typer.Option("--solver", help="Only this; repeatable.")] = None,
+    steps: Annotated[list[int] | None, typer.Option("--steps", min=1, help="2, 3, 4, 6, 10, 20; repeatable.")] = None,
+    precision: Annotated[list[Precision] | None, typer.Option("--precision", help="Repeatable.")] = None,
+    batch: Annotated[list[int] | None, typer.Option("--batch", min=1, help="Replicas: 32; repeatable.")] = None,
+    compile: Annotated[bool, typer.Option("--compile", help="The usual setting compiled, too.")] = False,
+    seed: SeedOpt = 0,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Run time against error of a surrogate at many settings, beside OpenMM, on one core. Goes on where it stopped.
+
+    REFERENCE and REPLICATE: two runs that the weights were not trained on.
+    """
+    from surrogate.bench.cost_error import cost_error as run
+    from surrogate.bench.cost_error_report import markdown
+    from surrogate.bench.cost_error_settings import CostErrorConfig
+
+    result = run(
+        reference,
+        replicate,
+        weights,
+        out,
+        CostErrorConfig(time_ps=parse_time_ps(time, "--time"), rounds=rounds, seed=seed),
+        solvers=solver,
+        steps=steps,
+        precisions=None if precision is None else [one.value for one in precision],
+        batches=batch,
+        compiled=compile,
+        report=lambda line: None if quiet or as_json else typer.echo(f"running: {line}", err=True),
+    )
+    if as_json:
+        print_json(result)
+    elif not quiet:
+        typer.echo(markdown(result))
+        typer.echo(f"{out}: cost_error.json, cost_error.md, cost_error.svg")
 
 
 def stress(

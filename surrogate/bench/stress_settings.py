@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from surrogate.bench.rolling import Roller
 from surrogate.bench.stress_measures import measure_bonds, measure_validity
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule, Surrogate, draw_noise
@@ -20,7 +21,8 @@ from systems.errors import SurromdError
 from systems.validity import Geometry
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from md_reference.engine import Engine
+    from surrogate.data.weights import TrainingDomain, Weights
 
 SOLVER_STEPS = (2, 5, 10, 20, 40)
 BATCHES = (1, 8, 64, 512)
@@ -116,7 +118,7 @@ def measure_solvers(weights: Weights, *, chunks: int, seed: int = 0) -> list[dic
     for solver, steps, kept in cases:
         sampler = ChunkSampler(weights, solver=solver, solver_steps=steps)
         started = time.process_time()
-        frames = _roll(weights, sampler, kept, n_frames=chunks * whole, seed=seed)
+        frames = Roller(weights, sampler, rows=_ROWS, seed=seed).advance(chunks * whole, kept)
         spent = max(time.process_time() - started, 1e-9)
         rows.append(
             {
@@ -131,11 +133,25 @@ def measure_solvers(weights: Weights, *, chunks: int, seed: int = 0) -> list[dic
     return rows
 
 
-def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Return the same criteria of OpenMM itself at 1, 2, 4 and 5 fs, under the conditions of training."""
+@contextmanager
+def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
+    """OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain does not
+    say one of these, and what `Engine` raises."""
     from md_reference.engine import Engine
     from md_reference.forcefield import ForceFieldSpec, resolve
 
+    conditions = domain.conditions
+    asked = ForceFieldSpec(conditions["force_field"], conditions["solvent"], conditions.get("hydrogen_mass_da"))
+    with Engine(domain.scene, resolve(domain.scene, asked), temperature_k=conditions["temperature_k"],
+                friction_per_ps=conditions.get("friction_per_ps") or 1.0, timestep_ps=timestep_ps,
+                seed=seed) as engine:  # fmt: skip
+        engine.minimise()
+        engine.thermalise()
+        yield engine
+
+
+def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[dict[str, Any]]:
+    """Return the same criteria of OpenMM itself at 1, 2, 4 and 5 fs, under the conditions of training."""
     domain = weights.domain
     geometry, lag_ps = Geometry.from_dict(domain.geometry), domain.lag_ps
     rows: list[dict[str, Any]] = []
@@ -144,14 +160,8 @@ def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[di
         frames = np.empty((n_frames, domain.scene.n_atoms, 3))
         energies, temperatures = np.empty(n_frames), np.empty(n_frames)
         try:
-            conditions = domain.conditions
-            asked = ForceFieldSpec(conditions["force_field"], conditions["solvent"], conditions.get("hydrogen_mass_da"))
             started = time.process_time()
-            with Engine(domain.scene, resolve(domain.scene, asked), temperature_k=conditions["temperature_k"],
-                        friction_per_ps=conditions.get("friction_per_ps") or 1.0, timestep_ps=timestep_ps,
-                        seed=seed) as engine:  # fmt: skip
-                engine.minimise()
-                engine.thermalise()
+            with openmm_of(domain, timestep_ps, seed) as engine:
                 for k in range(n_frames):
                     engine.step(round(lag_ps / timestep_ps))
                     state = engine.state()
@@ -212,19 +222,6 @@ def _in_double() -> Iterator[None]:
         yield
     finally:
         torch.Tensor.float = single  # type: ignore[method-assign]
-
-
-def _roll(weights: Weights, sampler: ChunkSampler, kept: int, *, n_frames: int, seed: int) -> Frames:
-    """Return `(8, n_frames, n_atoms, 3)` nm, of each chunk the first `kept` frames."""
-    start = weights.domain.scene.positions_nm
-    last = np.repeat(start[None, None], sampler.n_conditioning, axis=1).repeat(_ROWS, axis=0)
-    parts: list[Frames] = []
-    for number in range(-(-n_frames // kept)):
-        # Velocities belong to a chunk's end; where it is cut, the model draws new ones.
-        drawn = sampler.draw(last, [noise_seed(seed, row, number) for row in range(_ROWS)])
-        parts.append(drawn.frames_nm[:, :kept].astype(np.float64))
-        last = np.concatenate([last, parts[-1]], axis=1)[:, -sampler.n_conditioning :]
-    return np.concatenate(parts, axis=1)[:, :n_frames]
 
 
 def _valid(frames: Frames, geometry: Geometry) -> dict[str, float]:

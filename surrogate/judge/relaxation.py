@@ -106,6 +106,19 @@ def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: 
     )
 
 
+def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
+    """Return the autocorrelation of cos psi (torsion `k`) after one frame, and its relaxation time in ps."""
+    series = [np.cos(x[:, k].astype(np.float64)) for x in sample.features.psi]
+    longest = min(max(sample.features.segment_lengths), kinetics.MAX_LAG_FRAMES)
+    n_lags = min(3 * kinetics.zero_crossing(series)[0] + 2, longest)
+    found = _correlate(series, sample, n_lags, np.array([min(1, n_lags - 1)]))
+    lag_ps, n_blocks = sample.features.lag_ps, sample.blocks.n_blocks
+    return (
+        estimate(float(found.curve[found.kept[0]]), found.draws[:, 0], n_blocks),
+        estimate(found.time * lag_ps, found.draws_time * lag_ps, n_blocks, log=True),
+    )
+
+
 def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, label: str) -> Row:
     at = int(np.searchsorted(results[0].kept, lag))
     time = format_time_ps(lag * trio.reference.features.lag_ps)

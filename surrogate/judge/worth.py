@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.charts import Line, LineChart
-from surrogate.judge.statistics import bootstrap_weights
+from surrogate.judge.statistics import Estimate, bootstrap_weights, estimate
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -81,6 +81,34 @@ class Measure:
     squared: Callable[[FloatArray, FloatArray], FloatArray]
 
 
+def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, FloatArray]:
+    """Return how far parts of the candidate of every length are from the truth: lengths in ps and distances, both
+    `(n,)`, ascending; the candidate is `length_ps` long. As for MD in `worth_by`: geometric means over the parts.
+    """
+    first, own, second = measure.sums
+    lengths, found = [], []
+    n_each = 1
+    while n_each <= len(own):
+        parts = _pieces(own, n_each)
+        errors = np.mean([measure.squared(parts, truth.sum(0)) for truth in (first, second)], axis=0)
+        logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
+        if len(logs):
+            lengths.append(length_ps * n_each / len(own))
+            found.append(math.exp(0.5 * float(logs.mean())))
+        n_each = 2 * n_each if 2 * n_each <= len(own) or n_each == len(own) else len(own)
+    return np.asarray(lengths), np.asarray(found)
+
+
+def distance_to_truth(measure: Measure, seed: int = 0, n_draws: int = 400) -> Estimate:
+    """Return the candidate's distance to the truth (the root mean square of those to reference and replicate) with its
+    95 % interval: block bootstrap of the candidate alone, of the squared distance."""
+    own, truths = measure.sums[1], (measure.sums[0].sum(0), measure.sums[2].sum(0))
+    value = float(np.mean([measure.squared(own.sum(0)[None], truth)[0] for truth in truths]))
+    squared = estimate(value, _own_draws(measure, truths, seed, n_draws), len(own))
+    low, high = (math.sqrt(max(x, 0.0)) if math.isfinite(x) else math.nan for x in (squared.low, squared.high))
+    return Estimate(math.sqrt(value), low, high, (high - low) / (2 * _NORMAL_95), n_blocks=len(own))
+
+
 def worth_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 400) -> Worth | None:
     """Return the worth by one measure; `length_ps` is that of reference and of replicate. None when it has no value.
 
@@ -95,11 +123,9 @@ def worth_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 4
     lengths, means, scatter, spans, counts = [], [], [], [], []
     n_each = 1
     while n_each <= n_blocks:
-        n_pieces = n_blocks // n_each
         found = []
         for blocks, truth in ((second, truths[0]), (first, truths[1])):
-            pieces = blocks[: n_pieces * n_each].reshape(n_pieces, n_each, -1).sum(1)
-            found.append(measure.squared(pieces, truth))
+            found.append(measure.squared(_pieces(blocks, n_each), truth))
         errors = np.concatenate(found)
         logs = np.log(errors[np.isfinite(errors) & (errors > 0)])
         if len(logs):
@@ -145,13 +171,24 @@ def worth_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 4
 
 def _own_error(measure: Measure, truths: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> float:
     """Return the standard error of the logarithm of the candidate's squared distance (block bootstrap)."""
-    own = measure.sums[1]
-    drawn = bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own
-    draws = np.mean([measure.squared(drawn, truth) for truth in truths], axis=0)
+    own, draws = measure.sums[1], _own_draws(measure, truths, seed, n_draws)
     draws = draws[np.isfinite(draws) & (draws > 0)]
     if len(draws) < 2 or len(own) < 2:
         return math.inf
     return float(np.log(draws).std()) * math.sqrt(len(own) / (len(own) - 1))
+
+
+def _own_draws(measure: Measure, truths: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> FloatArray:
+    """Return the candidate's squared distance in every draw of its blocks, `(n_draws,)`."""
+    own = measure.sums[1]
+    drawn = bootstrap_weights(len(own), n_draws, np.random.default_rng([seed, 7])) @ own
+    return np.asarray(np.mean([measure.squared(drawn, truth) for truth in truths], axis=0))
+
+
+def _pieces(blocks: FloatArray, n_each: int) -> FloatArray:
+    """Return the sums over every `n_each` blocks that follow each other, `(n_pieces, n_sums)`."""
+    n_pieces = len(blocks) // n_each
+    return np.asarray(blocks[: n_pieces * n_each].reshape(n_pieces, n_each, -1).sum(1))
 
 
 def _falling(values: FloatArray, weights: FloatArray) -> FloatArray:

@@ -36,10 +36,32 @@ def worths(
 
     The candidate enters with all its frames; reference and replicate are cut to one length.
     """
+    parts = _equal_parts(reference, candidate, replicate)
+    if parts is None:
+        return ()
+    three, blocks = parts
+    truth = three[0]
+    found = [worth_by(m, truth.total_ps, options.seed) for m in _measures(three, blocks, torsions, options)]
+    return tuple(w for w in found if w is not None)
+
+
+def joint_measure(
+    reference: Features, candidate: Features, replicate: Features, torsions: Backbone
+) -> tuple[Measure, float] | None:
+    """Return the φ/ψ map alone as a measure, and the length in ps of reference and replicate; None where there is no
+    residue with φ and ψ, or too few frames."""
+    parts = _equal_parts(reference, candidate, replicate)
+    if parts is None or not torsions.residues:
+        return None
+    return _joint_measure(*parts, torsions), parts[0][0].total_ps
+
+
+def _equal_parts(reference: Features, candidate: Features, replicate: Features) -> tuple[Three, ThreeBlocks] | None:
+    """Cut reference and replicate to one length and divide all three into blocks; None where frames are too few."""
     n = min(reference.n_frames, replicate.n_frames)
     n_blocks = 1 << int(math.log2(max(min(SHORTEST_SHARE, n // _LEAST_FRAMES), 1)))
     if n_blocks < 8:
-        return ()
+        return None
     truth, other = reference.frames(0, n), replicate.frames(0, n)
     slowest = longest_correlation(truth)
     blocks = (
@@ -47,9 +69,7 @@ def worths(
         make_blocks(candidate.segment_lengths, block_length(candidate.n_frames, slowest)),
         even_blocks(other.segment_lengths, n_blocks),
     )
-    three = (truth, candidate, other)
-    found = [worth_by(m, truth.total_ps, options.seed) for m in _measures(three, blocks, torsions, options)]
-    return tuple(w for w in found if w is not None)
+    return (truth, candidate, other), blocks
 
 
 def even_blocks(segment_lengths: Sequence[int], n_blocks: int) -> Blocks:
@@ -68,16 +88,7 @@ def even_blocks(segment_lengths: Sequence[int], n_blocks: int) -> Blocks:
 def _measures(three: Three, blocks: ThreeBlocks, torsions: Backbone, options: Options) -> list[Measure]:
     out = []
     if torsions.residues:
-        per_residue = [
-            [
-                distributions.block_counts_joint(
-                    [x[:, r.phi] for x in f.phi], [x[:, r.psi] for x in f.psi], RAMACHANDRAN_BINS, b
-                )
-                for f, b in zip(three, blocks, strict=True)
-            ]
-            for r in torsions.residues
-        ]
-        out.append(_histogram_measure("joint_jsd", "φ/ψ map", per_residue))
+        out.append(_joint_measure(three, blocks, torsions))
     singles = [
         [_counts(pick(f), k, b) for f, b in zip(three, blocks, strict=True)]
         for pick, n in ((_phi, len(torsions.phi)), (_psi, len(torsions.psi)))
@@ -91,6 +102,19 @@ def _measures(three: Three, blocks: ThreeBlocks, torsions: Backbone, options: Op
     elif three[0].bonds_nm[0].shape[1]:
         out.append(_bond_measure(three, blocks))
     return out
+
+
+def _joint_measure(three: Three, blocks: ThreeBlocks, torsions: Backbone) -> Measure:
+    per_residue = [
+        [
+            distributions.block_counts_joint(
+                [x[:, r.phi] for x in f.phi], [x[:, r.psi] for x in f.psi], RAMACHANDRAN_BINS, b
+            )
+            for f, b in zip(three, blocks, strict=True)
+        ]
+        for r in torsions.residues
+    ]
+    return _histogram_measure("joint_jsd", "φ/ψ map", per_residue)
 
 
 def _phi(features: Features) -> Segments:

@@ -13,7 +13,7 @@ from surrogate.judge import distributions, worth_measures
 from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.ensemble import Ensemble
 from surrogate.judge.rows import Options
-from surrogate.judge.worth import Measure, Worth, headline, worth_by
+from surrogate.judge.worth import Measure, Worth, distance_to_truth, errors_by_length, headline, worth_by
 
 N_BLOCKS, PER_BLOCK = 128, 20
 
@@ -78,6 +78,25 @@ def test_rising_errors_are_made_monotone() -> None:
     assert list(found.lengths_ps) == [1000.0 * 2**k for k in range(8)]
     assert found.error_at(0.1) == pytest.approx(math.sqrt(29 / 8 / PER_BLOCK * (1 / 12.8 + 1 / 128)), rel=0.15)
     assert found.error_at(0.01) > found.error_at(0.1) > found.error_at(1.0)
+
+
+def test_parts_of_a_candidate_err_as_md_of_their_length_does_and_a_bias_stays() -> None:
+    rng = np.random.default_rng(4)
+    truths = draw_counts(STATES, N_BLOCKS, rng), draw_counts(STATES, N_BLOCKS, rng)
+    tilted = STATES * (1 + 0.5 * np.where(np.arange(30) % 2, 1, -1))
+    found = {}
+    for name, states in (("fair", STATES), ("biased", tilted)):
+        measure = Measure("x", "distribution", "x", (truths[0], draw_counts(states, 64, rng), truths[1]), squared)
+        lengths, errors = errors_by_length(measure, 64_000.0)
+        whole = distance_to_truth(measure)
+        assert lengths.tolist() == [1000.0 * 2**k for k in range(7)]
+        assert errors[-1] == pytest.approx(whole.value, rel=1e-12) and whole.low < whole.value < whole.high
+        found[name] = errors
+    n_frames = PER_BLOCK * 2.0 ** np.arange(3, 7)
+    expected = np.sqrt(29 / 8 * (1 / n_frames + 1 / (PER_BLOCK * N_BLOCKS)))
+    np.testing.assert_allclose(found["fair"][3:], expected, rtol=0.12)
+    # Divergence eps^2 / 8 of the bias, which no length takes away.
+    np.testing.assert_allclose(found["biased"][3:], np.sqrt(expected**2 + 0.25 / 8), rtol=0.12)
 
 
 def test_even_blocks_cover_every_frame_once() -> None:

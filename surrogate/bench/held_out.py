@@ -1,0 +1,53 @@
+"""Refuses trajectories that weights were trained on, where they are to be the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+
+def refuse_trained_on(weights: Weights, reference: Sequence[Path], replicate: Sequence[Path]) -> list[str]:
+    """Raise InputError unless weights never saw these trajectories; return the fingerprints of their frames.
+
+    Refused are: frames that stand in the provenance of the weights, of those they began from and so on; a run of the
+    same conditions and seed as one of these (a part of it, or saved otherwise); conditions or a save interval other
+    than those of training; and motion that reference and replicate have in common (`data.splits.refuse_leaks`).
+    """
+    from surrogate.data.frames import collect_frames
+
+    domain, name = weights.domain, weights.path.name
+    frames = collect_frames(list(reference), canonical=weights.model.canonical, held=list(replicate))
+    try:
+        frames.refuse_leaks()
+    except InputError as error:
+        raise InputError(f"reference and replicate must be runs of their own, and share motion: {error}") from error
+    known = {key: domain.conditions.get(key) for key in frames.conditions}
+    if frames.conditions != known or abs(frames.lag_ps - domain.lag_ps) > 1e-6 * domain.lag_ps:
+        raise InputError(
+            f"{reference[0]} was made under {frames.conditions}, frames {frames.lag_ps:g} ps apart; {name} was trained "
+            f"for {known}, {domain.lag_ps:g} ps: no truth to judge it by."
+        )
+    trained = list(_sources(weights.provenance))
+    for path, source in zip([*reference, *replicate], frames.sources, strict=True):
+        for other in trained:
+            same_frames = other.get("sha256") == source["sha256"]
+            same_run = not domain.further and source["seed"] is not None and other.get("seed") == source["seed"]
+            if same_frames or same_run:
+                raise InputError(
+                    f"{path}: {name} was trained on this run (seed {other.get('seed')}, then called "
+                    f"{other.get('file')}); give runs that training never saw."
+                )
+    return [str(source["sha256"]) for source in frames.sources]
+
+
+def _sources(provenance: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """All trajectories of a training and of those that it began from."""
+    yield from provenance.get("sources", ())
+    if isinstance(provenance.get("from"), dict):
+        yield from _sources(provenance["from"])

@@ -1,0 +1,184 @@
+"""Run time against error: errors of rollouts whose worth is known, what it refuses, the whole on tiny weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from surrogate import cli
+from surrogate.bench.compare_speed import pose, torsion_path
+from surrogate.bench.cost_error import run_cost_error
+from surrogate.bench.cost_error_measures import Truth, judge_frames, judge_truth, read_truth, worth_row
+from surrogate.bench.cost_error_report import crossings, markdown
+from surrogate.bench.cost_error_settings import CostErrorConfig, Setting, choose_settings
+from surrogate.bench.held_out import refuse_trained_on
+from surrogate.data.weights import Weights, load_weights, save_weights
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.trajectory import open_writer
+
+CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0, "friction_per_ps": 1.0,
+              "hydrogen_mass_da": 3.0}  # fmt: skip
+N_FRAMES = 6_000
+
+
+def toy_frames(scene: Scene, seed: int, n_frames: int = N_FRAMES) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return pose(scene, torsion_path(n_frames, rng), rng)
+
+
+def write(path: Path, scene: Scene, frames: np.ndarray, **record: Any) -> Path:
+    with open_writer(path, scene, {**CONDITIONS, **record}) as writer:
+        writer.append(frames, 1.0 + np.arange(len(frames), dtype=np.float64))
+    return path
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Scene) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("held")
+    first, second = (write(folder / f"held_r{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k), seed=40 + k)
+                     for k in range(2))  # fmt: skip
+    return first, second
+
+
+@pytest.fixture(scope="module")
+def truth(held: tuple[Path, Path], alanine_dipeptide: Scene) -> Truth:
+    return read_truth(alanine_dipeptide, held[:1], held[1:])
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory, small_weights: Weights) -> Weights:
+    """The small ones, for the conditions of the toy's files."""
+    out = tmp_path_factory.mktemp("cost") / "tiny.safetensors"
+    domain = replace(small_weights.domain, conditions=CONDITIONS)
+    save_weights(out, small_weights.model, domain, {"sources": [], "from": {"sources": [{"file": "a.h5", "seed": 7}]}})
+    return load_weights(out)
+
+
+def test_a_true_rollout_is_worth_its_length_and_a_wrong_one_little(truth: Truth, alanine_dipeptide: Scene) -> None:
+    frames = toy_frames(alanine_dipeptide, 9, 3_000).astype(np.float64)
+    right, worth = judge_frames(frames.reshape(3, 1_000, 22, 3), truth)
+    assert worth.worth_ps == pytest.approx(3_000, rel=0.4)
+    assert right["jsd"]["low"] < right["jsd"]["value"] < right["jsd"]["high"]
+    assert right["jsd"]["value"] == pytest.approx(right["curve"][-1][1], rel=1e-9)
+    assert [ps for ps, _ in right["curve"]][-1] == 3_000 and right["curve"][0][1] > 1.5 * right["curve"][-1][1]
+    assert right["valid_half_angstrom_%"]["value"] == 100.0
+    of_md = judge_truth(truth)
+    for key in ("correlation", "relaxation_ps"):
+        assert right[key]["value"] == pytest.approx(of_md[key][0]["value"], rel=0.15), key
+    assert of_md["floor"] == of_md["errors"][-1] < of_md["errors"][0] and of_md["lengths_ps"][-1] == N_FRAMES
+    # Negative controls: one state alone; frames in another order; a tenth of the frames torn.
+    stuck, worth = judge_frames(np.repeat(frames[None, :10], 300, axis=1), truth)
+    assert stuck["jsd"]["value"] > 3 * right["jsd"]["value"] and worth.bound == "less than"
+    shuffled, _ = judge_frames(np.random.default_rng(0).permutation(frames)[None], truth)
+    assert shuffled["jsd"]["value"] == pytest.approx(right["jsd"]["value"], abs=1e-9)
+    assert shuffled["relaxation_ps"]["value"] < 0.2 * right["relaxation_ps"]["value"]
+    torn = frames.copy()
+    torn[::10, 0] += 0.2
+    broken, _ = judge_frames(torn[None], truth)
+    assert broken["valid_half_angstrom_%"]["value"] == pytest.approx(90.0)
+    assert broken["bond_variance_%"] > 2 * right["bond_variance_%"]
+
+
+def test_worth_is_turned_into_seconds_and_never_beyond_the_floor(truth: Truth, alanine_dipeptide: Scene) -> None:
+    _, worth = judge_frames(toy_frames(alanine_dipeptide, 5, 3_000)[None].astype(np.float64), truth)
+    row = worth_row(worth, spent_s=2.0, md_s_per_ns=8.0)
+    assert row["times_faster"] == pytest.approx(1e-3 * worth.worth_ps * 8.0 / 2.0)
+    # 2 s are a quarter of a ns of MD.
+    assert row["md_of_same_seconds"] == pytest.approx(worth.error_at(250 / N_FRAMES))
+    assert worth_row(worth, 2e-4, 8.0)["md_of_same_seconds"] is None
+    perfect = replace(worth, worth_ps=worth.lengths_ps[-1], bound="at least", low_ps=None, high_ps=None)
+    row = worth_row(perfect, 2.0, 8.0)
+    assert row["times_faster"] == pytest.approx(1e-3 * N_FRAMES * 8.0 / 2.0) and row["times_faster_high"] is None
+    assert row["worth"]["words"].startswith("at least")
+
+
+def test_runs_that_were_trained_on_are_refused(
+    tmp_path: Path, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
+) -> None:
+    first, second = held
+    prints = refuse_trained_on(weights, [first], [second])
+    assert len(set(prints)) == 2
+    # A part of a run that the weights began from, under another name: its seed tells.
+    part = write(tmp_path / "part.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, 3, 500), seed=7)
+    with pytest.raises(InputError, match=r"trained on this run \(seed 7, then called a.h5\)"):
+        refuse_trained_on(weights, [first], [part])
+    # The same frames, whatever the file says of its seed.
+    known = replace(weights, provenance={"sources": [{"file": "b.h5", "sha256": prints[1]}]})
+    with pytest.raises(InputError, match=r"then called b\.h5"):
+        refuse_trained_on(known, [first], [second])
+    copy = write(tmp_path / "copy.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, 0)[1_000:2_000], seed=99)
+    with pytest.raises(InputError, match="share motion"):
+        refuse_trained_on(weights, [first], [copy])
+    hot = [
+        write(tmp_path / f"hot{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k, 200), temperature_k=350.0)
+        for k in (5, 6)
+    ]
+    with pytest.raises(InputError, match="no truth to judge it by"):
+        refuse_trained_on(weights, hot[:1], hot[1:])
+
+
+def test_settings_are_combinations_of_what_is_asked(weights: Weights) -> None:
+    usual = choose_settings(weights)
+    assert Setting("fitted", 4) in usual and Setting("multistep", 20, batch=1) in usual
+    assert not any(s.solver == "dopri5" or s.compile for s in usual) and len(set(usual)) == len(usual)
+    one = choose_settings(weights, solvers=["dopri5"], steps=[2], precisions=["fp32"], batches=[1, 4], compiled=True)
+    assert [s.label for s in one] == ["dopri5 2, fp32, batch 1", "dopri5 2, fp32, batch 4", "dopri5 2, compiled"]
+    with pytest.raises(InputError, match="knows no solver 'rk4'"):
+        choose_settings(weights, solvers=["rk4"])
+
+
+def test_a_whole_benchmark_is_written_and_gone_on_with(
+    tmp_path: Path, held: tuple[Path, Path], weights: Weights
+) -> None:
+    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1)
+    told: list[str] = []
+
+    def run(*settings: Setting) -> dict[str, Any]:
+        return run_cost_error([(weights, settings)], held[:1], held[1:], tmp_path, config, report=told.append)
+
+    one, alone = Setting("fitted", 2, "fp32"), Setting("fitted", 2, "fp32", batch=1)
+    first = run(one, alone)
+    assert told == ["reading the references", "OpenMM", f"tiny: {one.label}", f"tiny: {alone.label}"]
+    row, timed = first["rows"]
+    assert row["ns"] >= 0.9 and row["evaluations"] == 2.0 and row["bf16"] is False
+    assert row["cpu_s_per_ns"]["least"] <= row["cpu_s_per_ns"]["median"] <= row["cpu_s_per_ns"]["greatest"]
+    assert row["spent_s"] == pytest.approx(row["ns"] * row["cpu_s_per_ns"]["median"])
+    assert timed["timed_only"] and "jsd" not in timed
+    fast, slow = (first["md"]["cost"][k]["cpu_s_per_ns"]["median"] for k in (2, 0))
+    assert slow > 2 * fast, "1 fs takes four times as many steps as 4 fs"
+    # Gone on with: what is there is kept, word for word.
+    told.clear()
+    again = run(one, alone, Setting("euler", 2, "fp32"))
+    assert told == ["reading the references", "tiny: euler 2, fp32"] and again["rows"][:2] == first["rows"]
+    assert json.loads((tmp_path / "cost_error.json").read_text()) == json.loads(json.dumps(again))
+    text = (tmp_path / "cost_error.md").read_text()
+    assert text == markdown(again) and "| fitted 2, fp32 |" in text and "(timed)" in text and "4 fs" in text
+    assert (tmp_path / "cost_error.svg").read_text().rstrip().endswith("</svg>")
+    with pytest.raises(InputError, match="other references, times or rounds"):
+        run_cost_error([(weights, [one])], held[1:], held[:1], tmp_path, config)
+    # Where molecules break, nothing is said of crossings.
+    torn = json.loads(json.dumps(again))
+    for row in torn["rows"]:
+        row |= {"valid_half_angstrom_%": {"value": 50.0}} if "jsd" in row else {}
+    assert not crossings(torn)
+
+
+def test_the_verb_says_in_one_line_what_it_cannot_use(
+    tmp_path: Path, held: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for arguments, said in (
+        (["-w", "alanine-dipeptyde"], "Did you mean 'alanine-dipeptide'"),
+        (["-w", "alanine-dipeptide", "--solver", "rk4"], "knows no solver 'rk4'"),
+    ):
+        result = CliRunner().invoke(cli.app, ["bench", "cost-error", *map(str, held), *arguments, "-o", "x"])
+        assert result.exit_code == 1 and said in result.stderr, result.output
+        assert len(result.stderr.strip().splitlines()) == 1
+        assert not list(tmp_path.iterdir())
