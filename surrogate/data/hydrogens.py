@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames
+from surrogate.data.frames import QUANTUM_NM, TrainingFrames
 from surrogate.models.hydrogens import N_PHASES, HydrogenPlacer, HydrogenPlan, Site, SiteGroup
 from systems.errors import InputError
 from systems.scene import Scene
@@ -102,7 +102,8 @@ def _fit_shapes(group: SiteGroup, x: Tensor) -> None:
     vectors, hand, axes = wide.bonds(x), wide.hand(x), wide.axes(x)
     lengths = vectors.norm(dim=-1)
     group.lengths_nm.copy_(lengths.mean(0))
-    group.length_spread_nm.copy_(lengths.std(0, correction=0))
+    # Less what the rounding of training frames adds to it: constrained bonds have no spread.
+    group.length_spread_nm.copy_((lengths.var(0, correction=0) - QUANTUM_NM**2 / 6).clamp(min=0.0).sqrt())
     told = torch.stack(wide.angles(x), dim=-1) if group.turns else wide.features(x)
     for k in range(len(group.parent)):
         for side in range(group.hands):

@@ -236,6 +236,26 @@ def test_swings_have_the_size_of_the_reference() -> None:
     assert still.std(0).max() < 1e-6, "without noise nothing swings"
 
 
+def test_constrained_bonds_have_no_spread() -> None:
+    """Rounding to 0.0002 nm spreads a length by 0.00008 nm, which is no motion; 0.001 nm of the reference's is."""
+    scene = load("ethanol")
+    rng = np.random.default_rng(0)
+    turns = np.stack([rotation(seed) for seed in range(2000)])
+    frames = np.einsum("tij,nj->tni", turns, scene.positions_nm)
+    parents = {h: site.parent for site in hydrogen_sites(scene).sites for h in site.hydrogens}
+    first = min(parents)
+    arm = frames[:, first] - frames[:, parents[first]]
+    frames[:, first] += arm / np.linalg.norm(arm, axis=1, keepdims=True) * 0.001 * rng.normal(size=(2000, 1))
+    placer = fitted(scene, frames)
+    spread = {
+        int(h): float(s)
+        for group in placer.groups
+        for h, s in zip(group.hydrogens.flatten(), group.length_spread_nm.flatten(), strict=True)
+    }
+    assert spread.pop(first) == pytest.approx(0.001, rel=0.05)
+    assert max(spread.values()) < 2.5e-5
+
+
 def test_rows_do_not_depend_on_each_other() -> None:
     scene = load("ACE-SER-NME")
     placer = fitted(scene, shaken(scene, 300, 0.003))
