@@ -136,8 +136,8 @@ def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: Co
         total_ps = min(config.time_ps, chunk_ps(weights, sampler, setting) * config.rounds * 2) if only_timed \
             else config.time_ps  # fmt: skip
         parts, costs = roll_in_turns(weights, roller, sampler, setting, replace(config, time_ps=total_ps))
-    except SurromdError as error:
-        return row | {"outcome": str(error)}
+    except (SurromdError, np.linalg.LinAlgError) as error:  # the latter where frames are no longer finite
+        return row | {"outcome": f"not run: {error}"}
     frames = np.concatenate(parts, axis=1)
     ns = 1e-3 * frames.shape[0] * frames.shape[1] * weights.domain.lag_ps
     row |= {"bf16": sampler.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}

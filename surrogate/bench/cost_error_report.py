@@ -174,9 +174,9 @@ def _row(row: dict[str, Any], varies: list[str], shortest: float) -> dict[str, A
         "MD, same seconds": f"> {shortest:.3f}" if same is None else f"{same:.3f}",
         "worth": worth["words"],
         "faster": f"{bound}{faster[0]:.2g}{ends}",
-        "C1": f"{row['correlation']['value']:.3f}",
+        "C1": _number(row["correlation"]["value"], 3),
         "τ / ps": _interval(row["relaxation_ps"], 1),
-        "bond variance %": f"{row.get('bond_variance_%', float('nan')):.0f}",
+        "bond variance %": _number(row.get("bond_variance_%"), 0),
     }
 
 
@@ -195,8 +195,12 @@ def _range(spread: dict[str, float]) -> str:
 
 def _interval(found: dict[str, Any], digits: int) -> str:
     if found["low"] is None or found["high"] is None:
-        return f"{found['value']:.{digits}f}" if found["value"] is not None else "none"
+        return _number(found["value"], digits)
     return f"{found['value']:.{digits}f} [{found['low']:.{digits}f}, {found['high']:.{digits}f}]"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"
 
 
 def _mean(found: list[dict[str, Any]]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,9 @@ def test_a_true_rollout_is_worth_its_length_and_a_wrong_one_little(truth: Truth,
     assert shuffled["relaxation_ps"]["value"] < 0.2 * right["relaxation_ps"]["value"]
     torn = frames.copy()
     torn[::10, 0] += 0.2
+    lost, worth = judge_frames(np.full_like(frames[None], np.nan), truth)
+    assert worth.bound == "less than" and lost["correlation"]["value"] is None
+    assert lost["jsd"]["value"] == pytest.approx(math.sqrt(math.log(2)), abs=1e-6)
     broken, _ = judge_frames(torn[None], truth)
     assert broken["valid_half_angstrom_%"]["value"] == pytest.approx(90.0)
     assert broken["bond_variance_%"] > 2 * right["bond_variance_%"]
