@@ -40,7 +40,7 @@ SCENE = "alanine-dipeptide"
 NAME = "alanine-dipeptide-painet"
 RUN_PS, SAVE_EVERY_PS, TIMESTEP_PS, SETTLE_PS = 10.0, 0.001, 0.0005, 40.0
 # Of the bath that settles the runs, and of the one that refreshes velocities between a rollout's chunks.
-FRICTION_PER_PS, BATH_PER_PS = 5.0, 20.0
+FRICTION_PER_PS, BATH_PER_PS = 5.0, 50.0
 
 
 @dataclass(frozen=True)
