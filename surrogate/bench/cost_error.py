@@ -144,8 +144,8 @@ def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: Co
     if only_timed:
         return row | {"timed_only": True}
     errors, worth = judge_frames(frames, truth, seed=config.seed)
-    spent = ns * row["cpu_s_per_ns"]["median"]
-    return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["median"])
+    spent = ns * row["cpu_s_per_ns"]["mean"]
+    return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["mean"])
 
 
 def _is(row: dict[str, Any], setting: Setting) -> bool:

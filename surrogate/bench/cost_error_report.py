@@ -35,7 +35,7 @@ def markdown(result: dict[str, Any]) -> str:
         f"# Run time against error: {result['scene']}",
         "",
         f"Rollouts of {1e-3 * config['time_ps']:g} ns in all replicas, against two held-out runs of "
-        f"{1e-3 * md['length_ps']:g} ns; processor seconds on {config['threads']} thread(s), median of "
+        f"{1e-3 * md['length_ps']:g} ns; processor seconds on {config['threads']} thread(s), mean of "
         f"{config['rounds']} parts [least, greatest]; 95 % intervals in brackets elsewhere.",
         "",
         "## OpenMM",
@@ -74,7 +74,7 @@ def crossings(result: dict[str, Any]) -> list[str]:
     for row in _judged(result):
         if row["valid_half_angstrom_%"]["value"] < SOUND_PERCENT:
             continue
-        md_s = row["md_s_per_ns"]["median"] * 1e-3 * row["worth"]["worth_ps"]
+        md_s = row["md_s_per_ns"]["mean"] * 1e-3 * row["worth"]["worth_ps"]
         words = {"at least": "at least ", "less than": "less than "}.get(row["worth"]["bound"], "")
         lines.append(
             f"- {_name(row, result['rows'])}: after {row['spent_s']:.3g} s at {row['jsd']['value']:.3f}; OpenMM (4 fs) "
@@ -93,7 +93,7 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
     axes = figure.add_subplot()
     md = result["md"]
     for cost, style in zip(md["cost"], _MD_STYLES, strict=False):
-        x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["median"]
+        x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["mean"]
         label = f"OpenMM, {cost['timestep_fs']:g} fs"
         axes.plot(x, md["errors"], style, color="black", lw=1.4 if style == "-" else 0.9, label=label)
         if style == "-":
@@ -117,7 +117,7 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
         axes.annotate(text, (x, y), xytext=(5, 3), textcoords="offset points", fontsize=7.5, color=colour)
         if plain and row["steps"] in _DRAWN_STEPS:
             ps, errors = np.asarray(row["curve"]).T
-            axes.plot(1e-3 * ps * row["cpu_s_per_ns"]["median"], errors, "-", color=colour, lw=0.8, alpha=0.6)
+            axes.plot(1e-3 * ps * row["cpu_s_per_ns"]["mean"], errors, "-", color=colour, lw=0.8, alpha=0.6)
     axes.set(xscale="log", yscale="log", xlabel="processor time / s (one core)",
              ylabel="Jensen-Shannon distance of the φ/ψ map to held-out MD",
              title=f"{result['scene']}: run time against error")  # fmt: skip
@@ -157,7 +157,7 @@ def _row(row: dict[str, Any], varies: list[str], shortest: float) -> dict[str, A
     out |= {
         "evaluations": f"{row['evaluations']:.3g}",
         "s/ns": _range(row["cpu_s_per_ns"]),
-        "wall s/ns": f"{row['wall_s_per_ns']['median']:.3g}",
+        "wall s/ns": f"{row['wall_s_per_ns']['mean']:.3g}",
         "x MD 4 fs": _range(row["speed_over_md"]),
     }
     if "jsd" not in row:
@@ -184,13 +184,13 @@ def _md_row(row: dict[str, Any], md: dict[str, Any]) -> dict[str, Any]:
     return {
         "time step": f"{row['timestep_fs']:g} fs",
         "s/ns": _range(row["cpu_s_per_ns"]),
-        "wall s/ns": f"{row['wall_s_per_ns']['median']:.3g}",
-        f"s to {md['floor']:.3f}": f"{1e-3 * md['length_ps'] * row['cpu_s_per_ns']['median']:.3g}",
+        "wall s/ns": f"{row['wall_s_per_ns']['mean']:.3g}",
+        f"s to {md['floor']:.3f}": f"{1e-3 * md['length_ps'] * row['cpu_s_per_ns']['mean']:.3g}",
     }
 
 
 def _range(spread: dict[str, float]) -> str:
-    return f"{spread['median']:.3g} [{spread['least']:.3g}, {spread['greatest']:.3g}]"
+    return f"{spread['mean']:.3g} [{spread['least']:.3g}, {spread['greatest']:.3g}]"
 
 
 def _interval(found: dict[str, Any], digits: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -30,7 +29,7 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
     """Return the frames of each part, and what a ns of the surrogate and of MD at 4 fs took beside each other."""
     n_chunks = max(config.rounds, math.ceil(config.time_ps / chunk_ps(weights, sampler, setting)))
     shares = [n_chunks * k // config.rounds for k in range(config.rounds + 1)]
-    parts, cpu, wall, md = [], [], [], []
+    parts, cpu, wall, md, sizes = [], [], [], [], []
     with openmm_of(weights.domain, TIMESTEPS_PS[-1], config.seed) as engine:
         n_steps = _steps(config.slice_ps, TIMESTEPS_PS[-1])
         for k in range(config.rounds):
@@ -40,12 +39,13 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
             found: list[Frames] = []
             seconds = _seconds_per_ns(ps, lambda n=n, found=found: found.append(roller.advance(n)))  # type: ignore[misc]
             parts += found
+            sizes.append(ps)
             cpu.append(seconds[0])
             wall.append(seconds[1])
     ratios = [m / c for m, c in zip(md, cpu, strict=True)]
     return parts, {
-        "cpu_s_per_ns": _spread(cpu),
-        "wall_s_per_ns": _spread(wall),
+        "cpu_s_per_ns": _spread(cpu, sizes),
+        "wall_s_per_ns": _spread(wall, sizes),
         "md_s_per_ns": _spread(md),
         "speed_over_md": _spread(ratios),
     }
@@ -80,5 +80,8 @@ def _seconds_per_ns(simulated_ps: float, run: Callable[[], object]) -> tuple[flo
     return 1e3 * cpu / simulated_ps, 1e3 * wall / simulated_ps
 
 
-def _spread(values: Sequence[float]) -> dict[str, float]:
-    return {"median": statistics.median(values), "least": min(values), "greatest": max(values)}
+def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> dict[str, float]:
+    """Return the mean of all parts together, and the extremes: what a chunk takes depends on what happens in it."""
+    weights = [1.0] * len(values) if shares is None else shares
+    mean = sum(x * w for x, w in zip(values, weights, strict=True)) / sum(weights)
+    return {"mean": mean, "least": min(values), "greatest": max(values)}
