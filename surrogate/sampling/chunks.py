@@ -44,7 +44,7 @@ class ChunkSampler:
     """
 
     def __init__(
-        self, weights: Weights, *, solver_steps: int = 20, solver: str | None = None, precision: str = "auto",
+        self, weights: Weights, *, solver_steps: int = 10, solver: str | None = None, precision: str = "auto",
         compile: bool = False,
     ) -> None:  # fmt: skip
         if precision not in ("auto", "fp32", "bf16"):

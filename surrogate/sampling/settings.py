@@ -28,7 +28,7 @@ class RolloutConfig:
     save_every_ps: float | None = None
     lag_ps: float | None = None
     seed: int = 0
-    solver_steps: int = 20
+    solver_steps: int = 10
     solver: str | None = None
     precision: str = "auto"
     compile: bool = False

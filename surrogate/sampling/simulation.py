@@ -47,7 +47,7 @@ class Simulation:
         weights: str | Path | Weights,
         *,
         seed: int = 0,
-        solver_steps: int = 20,
+        solver_steps: int = 10,
         solver: str | None = None,
         precision: str = "auto",
         energy_fn: EnergyFn | None = None,

@@ -52,7 +52,7 @@ class HeavyLamSlide(Surrogate):
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return self.model.noise_shape(len(self.hydrogens.plan.heavy))
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 20,
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Surrogate.next_chunk`. Velocities play no part. Raises InputError for another number of atoms."""
         n_atoms = self.hydrogens.plan.n_atoms

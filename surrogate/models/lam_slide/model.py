@@ -19,8 +19,8 @@ from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from systems.errors import InputError
 
-# Of a chunk that is not of the kind that was drawn.
-MAX_REDRAWS = 40
+# Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all others.
+MAX_REDRAWS = 12
 
 
 class LamSlide(Surrogate):
@@ -141,7 +141,7 @@ class LamSlide(Surrogate):
         ae = self.config.autoencoder
         return (self.config.approximator.chunk_frames, ae.n_latents, ae.latent_dim)
 
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 20,
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
         """See `Surrogate.next_chunk`. Velocities play no part."""
         solver = solver or self.solvers[0]
