@@ -12,7 +12,7 @@ from systems.errors import InputError
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
 
-FEW_STEPS, USUAL_STEPS = (2, 3, 4, 6, 10, 20), 20
+STEPS = (2, 3, 4, 6, 10, 20)
 USUAL_BATCH = 32
 
 
@@ -62,23 +62,25 @@ def choose_settings(
 ) -> list[Setting]:
     """Return the settings to run: all combinations of what is given. Without solvers those that take a batch at once.
 
-    Where neither precisions nor batches are given, the usual solver at the most steps is run in both precisions, alone
+    Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
     and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
     """
     from surrogate.models.lam_slide.flow import ADAPTIVE
     from surrogate.sampling.chunks import bf16_in_hardware
+    from surrogate.sampling.settings import RolloutConfig
 
     known = weights.model.solvers
     unknown = [name for name in solvers or () if name not in known]
     if unknown:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
     chosen: list[str | None] = [*(solvers or [name for name in known if name not in ADAPTIVE])] or [None]
-    numbers = (steps or FEW_STEPS) if known else (USUAL_STEPS,)
+    own = RolloutConfig.solver_steps
+    numbers = (steps or STEPS) if known else (own,)
     found = [
         Setting(solver, n, precision, batch)
         for solver, n, precision, batch in product(chosen, numbers, precisions or ("auto",), batches or (USUAL_BATCH,))
     ]
-    usual = Setting(chosen[0], max(numbers))
+    usual = Setting(chosen[0], own if own in numbers else max(numbers))
     if not (precisions or batches):
         with_bf16 = weights.model.bf16_by_default and bf16_in_hardware()
         found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
