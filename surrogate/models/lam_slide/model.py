@@ -19,7 +19,8 @@ from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from systems.errors import InputError
 
-# Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all others.
+# Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all
+# others.
 MAX_REDRAWS = 12
 
 
