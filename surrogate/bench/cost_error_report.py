@@ -13,7 +13,7 @@ from systems.whole_file import create_whole
 SOUND_PERCENT = 99.0
 _COLOURS = {"multistep": "#1f77b4", "fitted": "#d62728", "euler": "#7f7f7f", "dopri5": "#9467bd"}
 # Of these the shorter parts of a rollout are drawn, too.
-_DRAWN_STEPS = (4, 20)
+_DRAWN_STEPS = (4, 10)
 _MD_STYLES = (":", "--", "-")
 
 
