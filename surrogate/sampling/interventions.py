@@ -5,9 +5,9 @@ from the last valid frame; after four draws, from where the chunk began. repair:
 relaxes caught frames under restraints; what is not valid then is drawn again. fallback: real MD runs from the last
 valid frame to the end of the chunk, and the surrogate takes over again.
 
-A model that gives a chunk without one frame that passes, and another in a second draw, is not unlucky but wrong: the
-rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken (validity.INVALID) or
-stands still.
+A model that has got no chunk through yet, gives one without a frame that passes, and another in a second draw, is not
+unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken
+(validity.INVALID) or stands still.
 """
 
 from __future__ import annotations
@@ -124,11 +124,11 @@ class _Advance:
         for attempt in range(MOST_DRAWS + 1):
             if attempt:
                 self._draw_again(pending, attempt)
-            wrong = [row for row in pending if attempt == 1 and row in none_passed and self._none_passes(row)]
+            wrong = [row for row in pending if attempt == 1 and row in none_passed and self._is_wrong(row)]
             if wrong:
                 self.chunk.failure = (wrong[0], f"two draws gave no frame that passes ({self._reasons(wrong[0])})")
                 return
-            pending = [row for row in pending if not self._settle(row)]
+            pending = [row for row in pending if not self._settle(row, attempt)]
             if not pending:
                 return
         first = pending[0]
@@ -170,13 +170,14 @@ class _Advance:
         chunk.marks = np.concatenate([chunk.marks, marks], axis=1)
         chunk.energies_kj_mol = np.concatenate([chunk.energies_kj_mol, np.full(flags.shape, np.nan)], axis=1)
 
-    def _settle(self, row: int) -> bool:
-        """Do what the guard says about a row that was just drawn; return whether it can stay as it is then."""
+    def _settle(self, row: int, attempt: int) -> bool:
+        """Do what the guard says about a row that was just drawn; return whether it can stay as it is then. A first
+        draw without a frame that passes is not worth it: there is another."""
         bad = np.flatnonzero(caught(self.chunk.flags[row]))
         if not len(bad):
             self.tallies[row].md_in_a_row = 0
             return True
-        if self._none_passes(row):
+        if attempt == 0 and self._none_passes(row):
             return False
         if self.plan.guard == "repair":
             return self._repair(row)
@@ -286,6 +287,11 @@ class _Advance:
             if row not in rows:
                 tally.md_in_a_row = 0
         return rows
+
+    def _is_wrong(self, row: int) -> bool:
+        """Whether no frame of this caught row passes, and no earlier chunk of it has got through without help."""
+        tally = self.tallies[row]
+        return self._none_passes(row) and tally.chunks == tally.chunks_caught - 1
 
     def _none_passes(self, row: int) -> bool:
         return bool(caught(self.chunk.flags[row]).all())

@@ -256,6 +256,28 @@ def test_a_wrong_model_is_stopped_within_one_chunk(
     assert list(tmp_path.glob("*.checkpoint")) == []
 
 
+@pytest.mark.parametrize(("guard", "mark"), [("resample", DRAWN_AGAIN), ("fallback", MD_AFTER_FAILURE)])
+def test_a_proven_model_is_helped_through_a_chunk_without_a_valid_frame(
+    tmp_path: Path, scene: Scene, domain: TrainingDomain, guard: str, mark: int
+) -> None:
+    """Chunks of two frames may well have none that passes, twice; the same in the first chunk says more."""
+    drawn = 0
+
+    def scatter_some(frames: Tensor, noise: Tensor) -> Tensor:
+        nonlocal drawn
+        drawn += 1
+        return scatter(frames, noise) if first <= drawn < first + 2 else frames
+
+    first = 2
+    found = roll(tmp_path / "a.h5", scene, weights_of(domain, scatter_some), guard)
+    assert not (found.flags & np.uint16(INVALID)).any()
+    assert found.marks.tolist() == [0] * N_NEW + [mark] * N_NEW + [0] * 2 * N_NEW
+    assert found.account["chunks_caught"] == 1 and found.account["draws"] == (2 if guard == "resample" else 1)
+    drawn, first = 0, 1
+    with pytest.raises(SimulationError, match=r"in its first chunk: two draws gave no frame that passes"):
+        roll(tmp_path / "b.h5", scene, weights_of(domain, scatter_some), guard)
+
+
 @pytest.mark.parametrize("arch", ["lam-slide", "painet"])
 def test_random_weights_of_a_real_architecture_are_stopped(
     tmp_path: Path, scene: Scene, domain: TrainingDomain, md: np.ndarray, small_model_config: Any, arch: str
