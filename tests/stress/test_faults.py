@@ -69,14 +69,18 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Sce
 
 def fork(work: Callable[[], object], note: Path) -> int:
     """Run `work` in a process of its own; return its id. It exits with 0, 130 (Ctrl-C) or 1, its error in `note`."""
-    # A shell starts background jobs with SIGINT ignored; the child must heed it from its first moment on.
+    # A shell starts background jobs with SIGINT ignored; the child must heed it from its first moment on, but no sooner
+    # than where it is caught.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     child = os.fork()
     if child:
         signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         return child
     status = FAILED
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         work()
         status = 0
     except KeyboardInterrupt:
