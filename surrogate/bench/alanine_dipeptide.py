@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from md_reference.replicas import replica_paths
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from surrogate.data.weights import Weights
     from surrogate.training.lam_slide import TrainingConfig
 
+Angles = npt.NDArray[np.floating[Any]]
 SCENE = "alanine-dipeptide"
 # Kind of run: first seed and number of replicas. `more` was added when the first 400 ns turned out to hold a single
 # crossing to phi > 0, `later` and `last` for the further training; the held-out runs are those of the first version.
@@ -34,6 +36,7 @@ HELD = {"held": (104, 2)}
 REPLICA_PS = 100_000.0
 ROLLOUT_SEED = 1
 ROLLOUT_REPLICAS = 16
+LONG_PS, LONG_SEED = 1_000_000.0, 5
 CURVE_PS = 20_000.0
 FIGURES = ("joint_jsd", "correlation:1", "correlation_time", "valid:2", "valid:4")
 SNAPSHOT_S = 600.0
@@ -179,37 +182,90 @@ def judge(
     return rows
 
 
+class Maps:
+    """Joint phi/psi histograms of trajectories and the share of frames, in per cent, at phi > 0."""
+
+    def __init__(self) -> None:
+        from surrogate.judge.structure import backbone
+        from systems.library import load
+
+        self.scene = load(SCENE)
+        residue = backbone(self.scene)
+        self.quads = np.stack([residue.phi[0], residue.psi[0]])
+
+    def angles(self, paths: list[Path]) -> list[Angles]:
+        """Return phi and psi `(n_frames, 2)` of each continuous stretch, rad."""
+        from surrogate.judge.ensemble import load_ensemble
+        from systems.geometry import torsion
+
+        return [torsion(x, self.quads) for x in load_ensemble(paths, template=self.scene).segments]
+
+    def of(self, segments: list[Angles]) -> tuple[npt.NDArray[np.float64], float]:
+        """Return the histogram of stretches, flat, and the share."""
+        from surrogate.judge.distributions import RAMACHANDRAN_BINS, is_positive
+
+        angles, n = np.concatenate(segments), RAMACHANDRAN_BINS.n_total
+        phi, psi = (RAMACHANDRAN_BINS.index(angles[:, k]) for k in range(2))
+        counts = np.bincount(phi * n + psi, minlength=n * n).astype(np.float64)
+        return counts, 100.0 * float(is_positive(angles[:, 0]).mean())
+
+
 def noise_floor(references: list[Path], rollout: list[Path]) -> dict[str, Any]:
     """Return the joint phi/psi distance of every pair of reference runs and of the rollout to each, and phi > 0.
 
     One replicate is one draw of the floor: a state that is visited once in 200 ns makes pairs of 100 ns differ widely.
     """
-    from surrogate.judge.distributions import RAMACHANDRAN_BINS, distance, is_positive
-    from surrogate.judge.ensemble import load_ensemble
-    from surrogate.judge.structure import backbone
-    from systems.geometry import torsion
-    from systems.library import load
+    from surrogate.judge.distributions import distance
 
-    scene = load(SCENE)
-    residue = backbone(scene)
-    quads = np.stack([residue.phi[0], residue.psi[0]])
-    counts, positive = [], []
-    for paths in [*([p] for p in references), rollout]:
-        angles = np.concatenate([torsion(x, quads) for x in load_ensemble(paths, template=scene).segments])
-        phi, psi = (RAMACHANDRAN_BINS.index(angles[:, k]) for k in range(2))
-        n = RAMACHANDRAN_BINS.n_total
-        counts.append(np.bincount(phi * n + psi, minlength=n * n).astype(np.float64))
-        positive.append(float(is_positive(angles[:, 0]).mean()))
+    maps = Maps()
+    counts, share = zip(*(maps.of(maps.angles(paths)) for paths in [*([p] for p in references), rollout]), strict=True)
     to_each = [float(distance(counts[-1], c)) for c in counts[:-1]]
     pairs = [float(distance(a, b)) for k, a in enumerate(counts[:-1]) for b in counts[k + 1 : -1]]
-    share = [100.0 * x for x in positive]
     sys.stdout.write(
         f"{len(pairs)} pairs of reference runs: joint distance {min(pairs):.3f} to {max(pairs):.3f}, median "
         f"{np.median(pairs):.3f}; rollout to each: {min(to_each):.3f} to {max(to_each):.3f}, median "
         f"{np.median(to_each):.3f}\nphi > 0, %: references {' '.join(f'{x:.2f}' for x in share[:-1])}; "
         f"rollout {share[-1]:.2f}\n"
     )
-    return {"pairs": pairs, "rollout": to_each, "positive_phi_percent": share}
+    return {"pairs": pairs, "rollout": to_each, "positive_phi_percent": list(share)}
+
+
+def judge_long(weights: Path, others: list[Path], held: list[Path], folder: Path) -> dict[str, Any]:
+    """Roll a microsecond with `--guard repair`, cut it into pieces of 100 ns and compare each with the first held-out
+    run, beside what the `others` (runs of 100 ns) and the replicate score.
+
+    A state that is entered five times in a microsecond makes a single rollout of 100 ns a matter of luck.
+    """
+    from surrogate.judge.distributions import distance
+
+    n = 2 * ROLLOUT_REPLICAS
+    outs = api.rollout(
+        SCENE, weights, folder / "long.h5", time_ps=LONG_PS / n, replicas=n, seed=LONG_SEED, guard="repair", resume=True
+    )
+    maps = Maps()
+    truth, _ = maps.of(maps.angles(held[:1]))
+    rolled, length = maps.angles(outs), round(REPLICA_PS / ROLLOUT_REPLICAS)
+    groups = [
+        [angles[start : start + length] for angles in rolled[half::2]]
+        for half in range(2)
+        for start in range(0, len(rolled[0]) - length + 1, length)
+    ]
+    found: dict[str, Any] = {}
+    for name, each in (
+        ("pieces", groups),
+        ("replicate", [maps.angles(held[1:])]),
+        ("other runs", [maps.angles([path]) for path in others]),
+        ("whole", [rolled]),
+    ):
+        rows = [maps.of(segments) for segments in each]
+        found[name] = {"distance": [float(distance(truth, c)) for c, _ in rows], "positive_phi": [p for _, p in rows]}
+    limit = 2.0 * found["replicate"]["distance"][0]
+    for name, row in found.items():
+        within = f"{sum(d <= limit for d in row['distance'])} of {len(row['distance'])} within {limit:.3f}"
+        distances = " ".join(f"{d:.3f}" for d in row["distance"])
+        positive = " ".join(f"{p:.2f}" for p in row["positive_phi"])
+        sys.stdout.write(f"{name:12s} joint distance {distances}: {within}; phi > 0, % {positive}\n")
+    return found
 
 
 def main() -> None:
@@ -220,6 +276,7 @@ def main() -> None:
     parser.add_argument("--kinds", default="45min", help="of the last one, with rare kinds named (default 45min)")
     parser.add_argument("--compile", action="store_true", help="compile the network (needs a C++ compiler)")
     parser.add_argument("--solver-steps", type=int, default=None)
+    parser.add_argument("--long", action="store_true", help="also a microsecond, judged in pieces of 100 ns")
     parser.add_argument("--curve", action="store_true", help="also judge every snapshot of the training")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -235,6 +292,8 @@ def main() -> None:
     figures["rollout"] = judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)
     rolled = replica_paths(paths.folder / "rollout.h5", ROLLOUT_REPLICAS)
     figures["floor"] = noise_floor([*references, *further, *held], rolled)
+    if args.long:
+        figures["long"] = judge_long(paths.shipped, [*references, *further], held, paths.folder)
     if args.curve:
         snapshots = [p for stem in STAGES for p in sorted(paths.folder.glob(f"{stem}.at*min.safetensors"))]
         for weights in [*snapshots, *(paths.stage(name) for name in STAGES), paths.weights]:
