@@ -286,7 +286,8 @@ def main() -> None:
     held = make_reference(paths, HELD)
     budgets_s = (parse_wall_s(args.budget), parse_wall_s(args.further), parse_wall_s(args.kinds))
     train(paths, references, further, budgets_s, compile_=args.compile)
-    ship(paths.weights, paths.shipped)
+    if not paths.shipped.exists():
+        ship(paths.weights, paths.shipped)
     steps = args.solver_steps
     figures: dict[str, Any] = {}
     figures["rollout"] = judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)
