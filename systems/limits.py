@@ -99,7 +99,7 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
     if not finite.any():
         raise InputError("None of the reference frames is finite.")
     first, second = first[finite], second[finite]
-    near = _neighbours(scene)
+    near = scene.neighbours()
     angle_idx = _rows([(a, b, c) for b, around in enumerate(near) for a in around for c in around if a < c], 3)
     centres = _rows([(i, *around) for i, around in enumerate(near) if len(around) == 3], 4)
     angles = np.arccos(np.clip(_gather(first, angle_idx, _angle_cosine), -1.0, 1.0))
@@ -146,14 +146,6 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
                 moved = columns[:, atoms].mean(axis=1) - before[:, atoms].mean(axis=1)
                 part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= limits.jump_max_nm)
     return flags
-
-
-def _neighbours(scene: Scene) -> list[list[int]]:
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
-    return [sorted(around) for around in near]
 
 
 def _rows(rows: list[tuple[int, ...]], width: int) -> IntArray:

@@ -59,14 +59,6 @@ def _why_not(scene: Scene, template: Scene, theirs: AtomClasses) -> str:
     return f"{scene.name} is a stereoisomer of {template.name}: some stereocentres or double bonds differ."
 
 
-def _neighbours(scene: Scene) -> list[list[int]]:
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
-    return near
-
-
 def _is_leaf_hydrogen(scene: Scene, near: list[list[int]], i: int) -> bool:
     return scene.elements[i] == "H" and len(near[i]) == 1 and scene.elements[near[i][0]] != "H"
 
@@ -96,7 +88,7 @@ def _match_skeletons(
     Colours leave a choice only among equivalent atoms, and breadth-first order puts these side by side, so a wrong
     choice shows within a few atoms; `_PATIENCE` bounds what is left.
     """
-    near_t, near_s = _neighbours(template), _neighbours(scene)
+    near_t, near_s = template.neighbours(), scene.neighbours()
     atoms = _walk(template, near_t, theirs)
     rank = {i: k for k, (i, _) in enumerate(atoms)}
     checks: dict[int, list[_Check]] = {}
@@ -190,7 +182,7 @@ def _is_flat(x: npt.NDArray[np.float64], i: int, near: list[int]) -> bool:
 
 
 def _match_hydrogens(scene: Scene, template: Scene, image: dict[int, int]) -> npt.NDArray[np.int64]:
-    near_t, near_s = _neighbours(template), _neighbours(scene)
+    near_t, near_s = template.neighbours(), scene.neighbours()
     full = dict(image)
     for parent in image:
         ours = [j for j in near_s[image[parent]] if _is_leaf_hydrogen(scene, near_s, j)]

@@ -80,6 +80,14 @@ class Scene:
         """Indices of atoms that are not hydrogen, `(n_heavy,)`."""
         return np.array([i for i, e in enumerate(self.elements) if e != "H"], dtype=np.int64)
 
+    def neighbours(self) -> list[list[int]]:
+        """Return of each atom the atoms that it is bonded to, ascending."""
+        near: list[list[int]] = [[] for _ in range(self.n_atoms)]
+        for i, j in self.bonds.tolist():
+            near[i].append(j)
+            near[j].append(i)
+        return [sorted(around) for around in near]
+
     @property
     def topology_hash(self) -> str:
         """Hash of the ordered topology, names included, positions left out."""

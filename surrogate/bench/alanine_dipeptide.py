@@ -133,17 +133,12 @@ def average(before: Path, after: Path, share: float, out: Path) -> Path:
 def _train(out: Path, references: list[Path], config: TrainingConfig, start: Weights | None) -> Path:
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import LamSlideConfig
-    from surrogate.progress import progress_bar
+    from surrogate.progress import training_bar
     from surrogate.training.lam_slide import train_lam_slide
 
     if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
         return out
-    with progress_bar(f"training {out.stem}", quiet=False) as advance:
-
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            if advance is not None:
-                advance(round(1000 * share), 1000, stage)
-
+    with training_bar(f"training {out.stem}") as report:
         frames = collect_frames(references)
         return train_lam_slide(frames, out, LamSlideConfig(), config, start=start, resume=True, progress=report)
 

@@ -228,17 +228,12 @@ def train(folder: Path, cold: list[Path], hot: list[Path], budgets_s: tuple[floa
 
 def _train(out: Path, frames: TrainingFrames, typical: TrainingFrames, config: PainetTraining,
            start: Weights | None) -> Path:  # fmt: skip
-    from surrogate.progress import progress_bar
+    from surrogate.progress import training_bar
     from surrogate.training.painet import train_painet
 
     if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
         return out
-    with progress_bar(f"training {out.stem}", quiet=False) as advance:
-
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            if advance is not None:
-                advance(round(1000 * share), 1000, stage)
-
+    with training_bar(f"training {out.stem}") as report:
         return train_painet(frames, out, model_config(), config, typical=typical, start=start, resume=True,
                             progress=report)  # fmt: skip
 

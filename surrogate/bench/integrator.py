@@ -142,10 +142,7 @@ def bonds(scene: Scene, frames_nm: FloatArray) -> FloatArray:
 
 def angles(scene: Scene, frames_nm: FloatArray) -> FloatArray:
     """Bond angles `(n_frames, n_angles)` in radians."""
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
+    near = scene.neighbours()
     triples = np.array([(a, j, b) for j, row in enumerate(near) for a in row for b in row if a < b])
     first, second = (frames_nm[:, triples[:, k]] - frames_nm[:, triples[:, 1]] for k in (0, 2))
     lengths = np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1)

@@ -34,7 +34,7 @@ def hydrogen_sites(scene: Scene) -> HydrogenPlan:
     Raises InputError where a hydrogen has no heavy neighbour or several, or where its molecule has too few heavy atoms
     to say how it lies: three are needed.
     """
-    near = _neighbours(scene)
+    near = scene.neighbours()
     hydrogen = [element == "H" for element in scene.elements]
     sites = []
     for h in (i for i, is_one in enumerate(hydrogen) if is_one):
@@ -203,14 +203,6 @@ def _root(covariance: Tensor) -> Tensor:
 
 def _unit(x: Tensor) -> Tensor:
     return x / x.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-
-
-def _neighbours(scene: Scene) -> list[list[int]]:
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
-    return [sorted(around) for around in near]
 
 
 def _further_atom(

@@ -149,13 +149,9 @@ def _by_graph(scene: Scene, ours: IntArray, template: Scene, theirs: IntArray, h
 
 def _with_pseudo_hydrogens(scene: Scene) -> Scene:
     """Add a hydrogen to every atom with three neighbours that is not flat, so that its handedness can be compared."""
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
     x = scene.positions_nm
     centres, places = [], []
-    for i, around in enumerate(near):
+    for i, around in enumerate(scene.neighbours()):
         if len(around) != 3:
             continue
         arms = x[around] - x[i]

@@ -111,7 +111,7 @@ def bond_types(scene: Scene) -> set[str]:
 def atom_environments(scene: Scene) -> set[str]:
     """Return each atom with its neighbours: {'C(C,H,H,H)', ...}, those in a ring marked 'ring C(C,C,H)'."""
     in_ring = set(ring_bonds(scene).ravel().tolist())
-    near = _neighbours(scene)
+    near = scene.neighbours()
     return {
         ("ring " if i in in_ring else "")
         + f"{scene.elements[i]}({','.join(sorted(scene.elements[j] for j in around))})"
@@ -126,7 +126,7 @@ def charged_atoms(scene: Scene) -> set[str]:
 
 def stereo_environments(scene: Scene) -> set[str]:
     """Return the stereocentres with their neighbours and handedness, '+' or '-', '?' where neighbours look alike."""
-    near, hands = _neighbours(scene), {1: "+", -1: "-", 0: "?"}
+    near, hands = scene.neighbours(), {1: "+", -1: "-", 0: "?"}
     return {
         f"{scene.elements[i]}({','.join(sorted(scene.elements[j] for j in near[i]))}){hands[sign]}"
         for i, sign in local_handedness(scene).items()
@@ -138,21 +138,13 @@ def torsion_environments(scene: Scene) -> set[str]:
 
     'C(C,H,N)-C(N,O)' is psi of alanine. Names, order and positions play no part.
     """
-    near = _neighbours(scene)
+    near = scene.neighbours()
 
     def end(atom: int, other: int) -> str:
         rest = Counter(scene.elements[k] for k in near[atom] if k != other)
         return f"{scene.elements[atom]}({','.join(sorted(rest.elements()))})"
 
     return {"-".join(sorted((end(b, c), end(c, b)))) for _, b, c, _ in rotatable_torsions(scene).tolist()}
-
-
-def _neighbours(scene: Scene) -> list[list[int]]:
-    near: list[list[int]] = [[] for _ in range(scene.n_atoms)]
-    for i, j in scene.bonds.tolist():
-        near[i].append(j)
-        near[j].append(i)
-    return near
 
 
 def _compare_bonds(scene: Scene, domain: TrainingDomain) -> list[Deviation]:
