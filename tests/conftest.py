@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Platforms by size: nothing is timed, nothing in the user's cache is read or written. Tests of the timing switch it on.
 os.environ["SURROMD_TIMING"] = "off"
+
+# A shell starts background jobs with Ctrl-C ignored, and what tests start would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -93,7 +98,7 @@ def small_model_config():
 
 
 @pytest.fixture(scope="session")
-def small_weights(tmp_path_factory, harmonic_frames, small_model_config):
+def small_weights_file(tmp_path_factory, harmonic_frames, small_model_config) -> Path:
     """Weights trained for a second on the synthetic frames: good for plumbing, not for chemistry."""
     from dataclasses import replace
 
@@ -106,4 +111,12 @@ def small_weights(tmp_path_factory, harmonic_frames, small_model_config):
     # After a second of training it hardly moves, for which guards would stop it.
     domain = replace(trained.domain, limits={**trained.domain.limits, "jump_min_nm": 1e-9})
     save_weights(out, trained.model, domain, trained.provenance)
-    return load_weights(out)
+    return out
+
+
+@pytest.fixture(scope="session")
+def small_weights(small_weights_file):
+    """The same, read."""
+    from surrogate.data.weights import load_weights
+
+    return load_weights(small_weights_file)

@@ -6,11 +6,8 @@ import errno
 import os
 import pickle
 import random
-import resource
 import signal
 import time
-import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.data.weights import Weights, load_weights
 from surrogate.sampling.checkpoint import checkpoint_path, read_checkpoint
 from surrogate.sampling.rollout import RolloutConfig, rollout
@@ -27,7 +25,6 @@ from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
 
 N_CHUNKS = 180
-INTERRUPTED, FAILED = 130, 1
 
 
 @pytest.fixture(scope="module")
@@ -67,66 +64,25 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Sce
     return rollout(alanine_dipeptide, small_weights, outs, config)
 
 
-def fork(work: Callable[[], object], note: Path) -> int:
-    """Run `work` in a process of its own; return its id. It exits with 0, 130 (Ctrl-C) or 1, its error in `note`."""
-    # A shell starts background jobs with SIGINT ignored; the child must heed it from its first moment on, but no sooner
-    # than where it is caught.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    child = os.fork()
-    if child:
-        signal.signal(signal.SIGINT, before)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        return child
-    status = FAILED
-    try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        work()
-        status = 0
-    except KeyboardInterrupt:
-        status = INTERRUPTED
-    except BaseException as error:
-        note.write_text(f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
-    os._exit(status)
-
-
-def wait(child: int) -> int:
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-
-
 @pytest.mark.parametrize(("number", "times"), [(signal.SIGKILL, 20), (signal.SIGINT, 5), (signal.SIGTERM, 5)])
 def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
     number: signal.Signals, times: int, tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights,
-    config: RolloutConfig, undisturbed: list[Path],
+    small_weights_file: Path, config: RolloutConfig, undisturbed: list[Path],
 ) -> None:  # fmt: skip
-    outs, note, rng = outs_in(tmp_path / "run"), tmp_path / "note", random.Random(int(number))
+    outs, rng = outs_in(tmp_path / "run"), random.Random(int(number))
     state = checkpoint_path(outs[0])
-    stopped, promised, chunk = 0, 0, small_weights.model.n_new
-
-    def go_on() -> None:
-        seen = 0
-
-        def wait_for_signal(done: int, total: int, note: str) -> None:
-            # A parent that a busy machine has left waiting still comes in time.
-            nonlocal seen
-            seen += 1
-            time.sleep(0.01 if seen < 60 else 0.5)
-
-        rollout(alanine_dipeptide, small_weights, outs, config, resume=True,
-                progress=wait_for_signal, flush_every_s=0.0)  # fmt: skip
-
-    while stopped < times:
-        child = fork(go_on, note)
+    promised, chunk = 0, small_weights.model.n_new
+    # SIGTERM ends a process that has not come so far as to heed it.
+    expected = {signal.SIGKILL: [-9], signal.SIGINT: [INTERRUPTED], signal.SIGTERM: [INTERRUPTED, -15]}[number]
+    assert times * CHUNKS_UNTIL_STOPPED < N_CHUNKS
+    for stopped in range(times):
+        child = start(until_stopped, small_weights_file, outs, config)
         # In turn: at any moment from the first file on, and when there is something to go on from.
-        while not (state if stopped % 2 else outs[0]).exists():
-            time.sleep(0.002)
+        child.wait_for(state if stopped % 2 else outs[0])
         time.sleep(rng.uniform(0.0, 0.15))
-        os.kill(child, number)
-        code = wait(child)
-        # SIGTERM ends a process that has not come so far as to heed it.
-        expected = {signal.SIGKILL: [-9], signal.SIGINT: [INTERRUPTED], signal.SIGTERM: [INTERRUPTED, -15]}[number]
-        assert code in expected, note.read_text() if note.exists() else code
-        stopped += 1
+        child.stop(number)
+        status, said = child.end()
+        assert status in expected, said or status
         known = read_checkpoint(state, None).steps if state.exists() else 0
         assert known >= promised, "what a checkpoint has seen stays"
         # A kill between the append and its checkpoint leaves one chunk more, which is cut and computed again.
@@ -139,21 +95,18 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
     assert not state.exists()
 
 
-def test_a_full_disk_loses_nothing(tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights,
-                                   config: RolloutConfig, undisturbed: list[Path]) -> None:  # fmt: skip
-    outs, note = outs_in(tmp_path / "run"), tmp_path / "note"
-
-    def within(limit: int) -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        rollout(alanine_dipeptide, small_weights, outs, config, resume=True, flush_every_s=0.0)
-
+def test_a_full_disk_loses_nothing(
+    tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights, small_weights_file: Path, config: RolloutConfig,
+    undisturbed: list[Path],
+) -> None:  # fmt: skip
+    outs = outs_in(tmp_path / "run")
     whole = [frames_of(path) for path in undisturbed]
     reached = []
     for limit in (300_000, 420_000):
-        assert wait(fork(lambda limit=limit: within(limit), note)) == FAILED
-        said = note.read_text().splitlines()[0]
-        assert said.startswith("StorageError") and "is full" in said and "complete and readable" in said
+        status, said = start(within_file_size, small_weights_file, outs, config, limit).end()
+        assert status == FAILED
+        first = said.splitlines()[0]
+        assert first.startswith("StorageError") and "is full" in first and "complete and readable" in first
         reached.append([len(frames_of(path)) for path in outs])
         for path, expected in zip(outs, whole, strict=True):
             found = frames_of(path)
