@@ -6,8 +6,10 @@ processor time of one thread, and prints the exponent of a power law fitted to a
 `error` trains PAINET and EGNN (PAINET's decoder alone, wider, with at least as many parameters) on the same
 trajectories with velocities, for the same number of steps or the same time, and prints the mean square error over all
 predicted frames (A-MSE) on the last fifth of each trajectory, which neither has seen, beside the frozen frame's and
-constant velocity's. `--frames 1 --stride 300` is state-to-state at 1.5 ps of 5 fs frames, `--frames 8 --stride 37`
-state-to-trajectory. With `-o FOLDER` finished trainings stay and interrupted ones go on.
+constant velocity's. `--modes` and `--free-rotation` (which EGNN gets as well) are what this project adds to the paper's
+PAINET; `--attention none` leaves its attention out. `--frames 1 --stride 300` is state-to-state at 1.5 ps of 5 fs
+frames, `--frames 8 --stride 37` state-to-trajectory. With `-o FOLDER` finished trainings stay and interrupted ones go
+on.
 
 `surromd reproduce md17` leaves trajectories of the eight molecules that serve here.
 """
@@ -28,13 +30,14 @@ import numpy.typing as npt
 import torch
 
 from surrogate.bench.reproduce_errors import Estimate, block_means, ratio
+from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames, collect_frames
 from surrogate.data.weights import load_weights
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.interface import Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
-from surrogate.training.painet import PainetTraining, StateWindows, train_painet
+from surrogate.training.painet import PainetTraining, StateWindows, for_frames, train_painet
+from systems.errors import InputError
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10_000)
 # Pairs of 3,000 atoms in four heads are a quarter of a gigabyte for each of the products.
@@ -121,6 +124,8 @@ def compare_errors(
         if not out.exists() or any(folder.glob(f"{out.stem}.*.train.safetensors")):
             train_painet(known, out, settings, training, model_class=kind, resume=True)
         weights = load_weights(out)
+        if weights.model.config != kind(for_frames(settings, known)).config:
+            raise InputError(f"{out} is of other settings; name another folder.")
         spent[kind.arch] = float(weights.provenance["training_s"])
         assert isinstance(weights.model, Painet)
         found[kind.arch] = window_errors(weights.model, unseen, windows_at_most)
@@ -170,7 +175,7 @@ def window_errors(
 ) -> npt.NDArray[np.float64]:
     """Return the mean square error over all predicted frames of evenly spaced windows, Å^2 per coordinate, `(n,)`."""
     windows = StateWindows(frames, model.config, torch.device("cpu"))
-    structure = model.structure(Molecule.of(frames.scene))
+    structure = model.structure(describe(model, frames.scene))
     starts = thinned(windows.starts, at_most)
     found = []
     for begin in range(0, len(starts), block):
@@ -195,7 +200,8 @@ def run_cost(args: argparse.Namespace) -> list[Cost]:
 
 
 def run_error(args: argparse.Namespace) -> list[Errors]:
-    config = PainetConfig(n_new=args.frames, frame_stride=args.stride, width=args.width)
+    config = PainetConfig(n_new=args.frames, frame_stride=args.stride, width=args.width, attention=args.attention,
+                          n_modes=args.modes, free_rotation=args.free_rotation)  # fmt: skip
     training = PainetTraining(steps=args.steps, budget_s=args.seconds, batch=args.batch, noise=0.0, pushforward=0.0,
                               velocity_weight=0.0, seed=args.seed, device=args.device)  # fmt: skip
     rows = []
@@ -232,6 +238,9 @@ def main() -> None:
     error.add_argument("--frames", type=int, default=8)
     error.add_argument("--stride", type=int, default=4)
     error.add_argument("--width", type=int, default=32)
+    error.add_argument("--attention", choices=("linear", "dense", "none"), default="linear")
+    error.add_argument("--modes", type=int, default=0, help="of motion over the whole molecule; 0: the paper's PAINET")
+    error.add_argument("--free-rotation", action="store_true", help="leave the rotation of the whole to a rigid body")
     error.add_argument("--steps", type=int, default=None)
     error.add_argument("--seconds", type=float, default=None)
     error.add_argument("--batch", type=int, default=16)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import Weights, save_weights
-from surrogate.models.interface import Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
 from surrogate.training.devices import is_first_process, wait_for_all
@@ -88,7 +88,7 @@ def train_painet(
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = model_class(model_config).to(device)
-    structure = model.structure(Molecule.of(frames.scene).to(device))
+    structure = model.structure(describe(model, frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
     if start is not None:

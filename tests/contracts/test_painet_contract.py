@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from surrogate.models.atom_features import features_of_graph
 from surrogate.models.conformance import SurrogateContract, branched_chain, random_state
 from surrogate.models.graphs import BOND, SECOND_NEIGHBOUR, molecular_graph
 from surrogate.models.interface import Molecule, Surrogate
@@ -47,6 +49,28 @@ class TestPainetDense(TestPainet):
 class TestEgnnAlone(TestPainet):
     def make(self, n_atoms: int) -> Surrogate:
         return lively(SMALL, EgnnForecaster)
+
+
+class TestPainetWithModes(TestPainet):
+    """A frame of the molecule's own tells it from its mirror image."""
+
+    reflects = False
+    sizes = (1, 2, 40)
+
+    def make(self, n_atoms: int) -> Surrogate:
+        return lively(replace(SMALL, n_modes=6, free_rotation=True))
+
+    def molecule(self, n_atoms: int) -> Molecule:
+        molecule = branched_chain(n_atoms)
+        place = random_state(n_atoms, 1, 1, seed=8)[0][0, 0].numpy()
+        bonds, none = molecule.bonds.numpy(), np.zeros(n_atoms)
+        features = features_of_graph(n_atoms, bonds, np.ones(len(bonds)), bonds[:0], none, none, place)
+        return replace(molecule, atoms=features)
+
+
+class TestPainetWithFreeRotation(TestPainet):
+    def make(self, n_atoms: int) -> Surrogate:
+        return lively(replace(SMALL, free_rotation=True))
 
 
 class TestPainetAllPairs(TestPainet):

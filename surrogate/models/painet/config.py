@@ -19,6 +19,9 @@ class PainetConfig:
     predicted frames, `temperature_k` and `friction_per_ps` of the bath that refreshes velocities between chunks; a
     training takes the three from its reference.
 
+    Ours: `n_modes` modes of motion over the whole molecule beside attention and decoder (`painet.modes`), 0 for none;
+    `free_rotation` takes the rotation of the whole out of what is learned (`painet.rotation`).
+
     `decoder` 'egnn' (the paper's) or 'leapfrog' (ours: layers are steps of an integrator whose forces keep momentum,
     angular momentum and depend on positions alone), with `n_radial` functions of the distance per shell of pairs and
     `n_scalars` and `n_vectors` sums over an atom's neighbours.
@@ -32,6 +35,8 @@ class PainetConfig:
     n_decoder_layers: int = 4
     attention: str = "linear"
     edges: str = "bonds"
+    n_modes: int = 0
+    free_rotation: bool = False
     decoder: str = "egnn"
     n_radial: int = 12
     n_scalars: int = 8
@@ -52,6 +57,8 @@ class PainetConfig:
             raise InputError(f"edges = {self.edges!r} is unknown; choose bonds or all.")
         if self.decoder not in ("egnn", "leapfrog"):
             raise InputError(f"decoder = {self.decoder!r} is unknown; choose egnn or leapfrog.")
+        if self.n_modes < 0 or (self.decoder == "leapfrog" and (self.n_modes or self.free_rotation)):
+            raise InputError(f"n_modes = {self.n_modes} and free_rotation = {self.free_rotation} go with decoder egnn.")
         if self.n_radial < 2 or min(self.n_scalars, self.n_vectors, self.n_decoder_layers) < 1:
             raise InputError(
                 f"n_radial = {self.n_radial} must be at least 2, n_scalars = {self.n_scalars}, n_vectors = "

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from surrogate.models.painet.pairs import Pairs
+from surrogate.models.painet.surroundings import Surroundings
 
 # Distances (in the model's unit, 0.1 nm) over which a shell's radial functions are laid, evenly in the logarithm.
 SHELL_RANGES = ((0.8, 2.3), (1.3, 3.5), (1.8, 5.0), (1.5, 12.0))
@@ -59,13 +60,11 @@ class PairFeatures:
 
 
 class PairEncoder(nn.Module):
-    """Features of pairs from types of atoms, told from their surroundings by three rounds along bonds."""
+    """Features of pairs from types of atoms, told from their surroundings by rounds along bonds."""
 
     def __init__(self, width: int, n_radial: int) -> None:
         super().__init__()
-        self.rounds = nn.ModuleList(
-            nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width)) for _ in range(3)
-        )
+        self.rounds = Surroundings(width)
         self.of_shell = nn.Embedding(len(SHELL_RANGES), width)
         self.of_pair = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width))
         ranges = torch.tensor(SHELL_RANGES).log()
@@ -73,13 +72,6 @@ class PairEncoder(nn.Module):
         self.register_buffer("spacing", (ranges[:, 1] - ranges[:, 0]) / (n_radial - 1), persistent=False)
         self.start: Tensor
         self.spacing: Tensor
-
-    def types(self, of_element: Tensor, pairs: Pairs) -> Tensor:
-        """Embeddings of elements `(n_atoms, width)` -> those of elements in their surroundings."""
-        z = of_element
-        for round_ in self.rounds:
-            z = z + round_(torch.cat([z, torch.zeros_like(z).index_add(0, pairs.bonds[0], z[pairs.bonds[1]])], dim=-1))
-        return z
 
     def forward(self, z: Tensor, of_frame: Tensor, pairs: Pairs) -> PairFeatures:
         """`z` (n_atoms, width), `of_frame` (n_new, width)."""

@@ -15,7 +15,10 @@ from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.painet.attention import EnergyAttention, TypeGroups
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.leapfrog import Leapfrog
+from surrogate.models.painet.modes import Modes, centred_template
 from surrogate.models.painet.pairs import Pairs, molecular_pairs
+from surrogate.models.painet.rotation import angular_velocity, spun, turns
+from surrogate.models.painet.surroundings import Surroundings
 from systems.errors import InputError
 
 # Atomic numbers up to xenon; 0 is a particle of a model system.
@@ -28,10 +31,13 @@ BOLTZMANN_KJ_MOL_K = 0.00831446261815324
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What of a molecule does not change from chunk to chunk: the decoder's edges or pairs, each type's atoms."""
+    """What of a molecule does not change from chunk to chunk: each type's atoms, `bonds` (2, n) both ways, the template
+    of a model with modes, the decoder's edges or pairs."""
 
     molecule: Molecule
     groups: TypeGroups
+    bonds: Tensor
+    template: Tensor | None = None
     graph: Graph | None = None
     pairs: Pairs | None = None
 
@@ -43,7 +49,7 @@ class Painet(Surrogate):
     the two. A learned vector per frame tells the decoder which one it decodes. Velocities are learned in units of
     `velocity_scale_nm_ps`; `reach` (2,) is what positions and velocities change by over a chunk, in the model's units:
     both are measured on the training frames. The centre of mass moves on at its velocity, exactly: only
-    the motion about it is learned.
+    the motion about it is learned, with `free_rotation` that in the frame that turns on with the molecule.
     """
 
     arch: ClassVar[str] = "painet"
@@ -72,10 +78,14 @@ class Painet(Surrogate):
             )
             for _ in range(n_attention)
         )
+        if c.n_modes:
+            self.surroundings = Surroundings(c.width)
+            self.modes = Modes(c.width, c.n_modes, c.n_new)
+            self.float32_layers = ("surroundings.", "modes.")  # type: ignore[misc]
         self.decoder: Egnn | Leapfrog = Egnn(c.width, c.n_decoder_layers)
         if c.decoder == "leapfrog":
             self.decoder = Leapfrog(c.width, c.n_decoder_layers, c.n_radial, c.n_scalars, c.n_vectors)
-            self.float32_layers = ("decoder.",)  # type: ignore[misc]
+            self.float32_layers = (*self.float32_layers, "decoder.")  # type: ignore[misc]
         self._known: Structure | None = None
         self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
         self.register_buffer("reach", torch.ones(2))
@@ -83,6 +93,10 @@ class Painet(Surrogate):
     @property
     def canonical(self) -> bool:
         return False
+
+    @property
+    def knows_bonds(self) -> bool:
+        return self.config.n_modes > 0
 
     @property
     def n_conditioning(self) -> int:
@@ -108,10 +122,16 @@ class Painet(Surrogate):
             raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
         present = torch.unique(molecule.elements)
         groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
-        all_pairs = self.config.edges == "all"
+        all_pairs, template = self.config.edges == "all", None
+        if self.config.n_modes:
+            if molecule.atoms is None:
+                raise InputError("this model knows a template; make molecules by `data.descriptions.describe`.")
+            template = centred_template(molecule.atoms.template_nm, molecule.masses_da, self.config.length_scale_nm)
+        bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
         if isinstance(self.decoder, Leapfrog):
-            return Structure(molecule, groups, pairs=molecular_pairs(molecule, all_pairs=all_pairs))
-        return Structure(molecule, groups, graph=molecular_graph(molecule, all_pairs=all_pairs))
+            pairs = molecular_pairs(molecule, all_pairs=all_pairs)
+            return Structure(molecule, groups, bonds, template, pairs=pairs)
+        return Structure(molecule, groups, bonds, template, graph=molecular_graph(molecule, all_pairs=all_pairs))
 
     def _structure_of(self, molecule: Molecule) -> Structure:
         """`structure`, made once for chunk after chunk of one molecule."""
@@ -132,6 +152,10 @@ class Painet(Surrogate):
         centre, drift = ((share * s).sum(-2, keepdim=True) for s in (positions_nm, velocities_nm_ps))
         x = (positions_nm - centre) / scale
         v = (velocities_nm_ps - drift) / self.velocity_scale_nm_ps
+        spin = None
+        if self.config.free_rotation:
+            spin = angular_velocity(x, v, structure.molecule.masses_da)
+            v = v - spun(spin, x)
         decoder = self.decoder
         # Leapfrog's forces know positions alone.
         seen = torch.zeros_like(v) if isinstance(decoder, Leapfrog) else v
@@ -146,10 +170,23 @@ class Painet(Surrogate):
             x_new, v_new = self._integrate(decoder, frames, x, v, structure)
         else:
             x_new, v_new = self._decode(decoder, frames, x, v, structure)
+        if structure.template is not None:
+            moved, changed = self._carried(x, v, structure.template, structure)
+            x_new, v_new = x_new + self.reach[0] * moved, v_new + self.reach[1] * changed
         x_new, v_new = (s - (share * s).sum(-2, keepdim=True) for s in (x_new, v_new))
-        times = self.config.lag_ps * torch.arange(1, self.n_new + 1, device=x.device)[:, None, None]
-        centres = centre[:, None] + times * drift[:, None]
+        times = self.config.lag_ps * torch.arange(1, self.n_new + 1, device=x.device)
+        if spin is not None:
+            turn = turns(spin, times * (self.velocity_scale_nm_ps / scale))
+            v_new = (v_new + spun(spin, x_new)) @ turn
+            x_new = x_new @ turn
+        centres = centre[:, None] + times[:, None, None] * drift[:, None]
         return x_new * scale + centres, v_new * self.velocity_scale_nm_ps + drift[:, None]
+
+    def _carried(self, x: Tensor, v: Tensor, template: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
+        """What the modes do to states `(b, n, 3)`: two of `(b, n_new, n, 3)`, always in the precision of the states."""
+        with torch.autocast(x.device.type, enabled=False):
+            z = self.surroundings(self.embed_type(structure.molecule.elements), structure.bonds)
+            return self.modes(z, x, v, template, structure.molecule.masses_da)
 
     def _decode(
         self, decoder: Egnn, frames: Tensor, x: Tensor, v: Tensor, structure: Structure
@@ -173,7 +210,7 @@ class Painet(Surrogate):
         assert pairs is not None
         with torch.autocast(x.device.type, enabled=False):
             frames = frames.to(x.dtype)
-            z = decoder.encode.types(self.embed_type(structure.molecule.elements), pairs)
+            z = decoder.encode.rounds(self.embed_type(structure.molecule.elements), structure.bonds)
             of = decoder.encode(z, self.embed_frame, pairs)
             # Atoms first, then frames, then the batch.
             h = (frames + z).permute(2, 1, 0, 3).flatten(1, 2)
@@ -209,4 +246,4 @@ class EgnnForecaster(Painet):
     arch: ClassVar[str] = "egnn"
 
     def __init__(self, config: PainetConfig) -> None:
-        super().__init__(replace(config, attention="none"))
+        super().__init__(replace(config, attention="none", n_modes=0))

@@ -18,15 +18,14 @@ DENSE_NUMBERS = 2_000_000
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """`first`, `second`, `shell` (n_pairs,): the pairs of one molecule, `shell` 0 to 3 and ascending; of the first
-    `n_near` at most three bonds lie between. `bonds` (2, n_bonds) both ways. `signed` (n_atoms, n_pairs) holds +1 for a
-    pair's first atom and -1 for its second, `ends` (n_atoms, 2 n_near) a 1 where a near pair, seen from either end,
-    belongs to an atom; both None of large molecules."""
+    `n_near` at most three bonds lie between. `signed` (n_atoms, n_pairs) holds +1 for a pair's first atom and -1 for
+    its second, `ends` (n_atoms, 2 n_near) a 1 where a near pair, seen from either end, belongs to an atom; both None of
+    large molecules."""
 
     first: Tensor
     second: Tensor
     shell: Tensor
     n_near: int
-    bonds: Tensor
     signed: Tensor | None
     ends: Tensor | None
 
@@ -77,7 +76,6 @@ def molecular_pairs(molecule: Molecule, *, all_pairs: bool) -> Pairs:
         pairs = torch.cat([pairs, others])
         shells = torch.cat([shells, torch.full((len(others),), N_SHELLS - 1)])
     n_near = len(near)
-    both = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
     signed = ends = None
     if n_atoms * len(pairs) <= DENSE_NUMBERS:
         number = torch.arange(len(pairs))
@@ -87,4 +85,4 @@ def molecular_pairs(molecule: Molecule, *, all_pairs: bool) -> Pairs:
         ends[pairs[:n_near, 0], number[:n_near]] = 1.0
         ends[pairs[:n_near, 1], n_near + number[:n_near]] = 1.0
         signed, ends = signed.to(device), ends.to(device)
-    return Pairs(pairs[:, 0].to(device), pairs[:, 1].to(device), shells.to(device), n_near, both, signed, ends)
+    return Pairs(pairs[:, 0].to(device), pairs[:, 1].to(device), shells.to(device), n_near, signed, ends)

@@ -24,6 +24,7 @@ from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
 from surrogate.training.painet import PainetTraining
+from systems.errors import InputError
 from systems.scene import Scene
 
 SMALL = PainetConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=1, lag_ps=0.01)
@@ -90,13 +91,16 @@ def test_a_comparison_goes_on_from_what_is_there_and_says_how_sure_it_is(
     longer = _drifting(alanine_dipeptide, 500)
     monkeypatch.setattr(forecasters, "collect_frames", lambda *args, **kwargs: longer)
     training = PainetTraining(steps=3, batch=4, noise=0.0, pushforward=0.0, velocity_weight=0.0)
-    first = compare_errors(Path("drifting.h5"), SMALL, training, tmp_path)
+    settings = replace(SMALL, n_modes=4, free_rotation=True)
+    first = compare_errors(Path("drifting.h5"), settings, training, tmp_path)
     assert first.constant_velocity < 1e-4 < first.frozen
     assert first.spans == 50
     assert first.ratio.low <= first.ratio.value <= first.ratio.high
     assert first.ratio.value == pytest.approx(first.painet / first.egnn, rel=0.1)
     made = {path: path.stat().st_mtime_ns for path in tmp_path.glob("drifting.*.safetensors")}
     assert len(made) == 2
-    again = compare_errors(Path("drifting.h5"), SMALL, training, tmp_path)
+    again = compare_errors(Path("drifting.h5"), settings, training, tmp_path)
     assert again == first
     assert {path: path.stat().st_mtime_ns for path in made} == made
+    with pytest.raises(InputError, match="of other settings"):
+        compare_errors(Path("drifting.h5"), replace(settings, n_modes=5), training, tmp_path)
