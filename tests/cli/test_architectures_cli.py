@@ -8,16 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from surrogate.cli import app
+from command_line import run
 from systems.trajectory import open_trajectory
 
 TINY = "n_new = 4\nwidth = 16\nn_heads = 2\nhead_dim = 8\nn_decoder_layers = 1\n"
-
-
-def run(*arguments: str) -> Any:
-    return CliRunner().invoke(app, list(arguments))
 
 
 def done(*arguments: str) -> Any:

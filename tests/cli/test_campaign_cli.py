@@ -10,13 +10,11 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from surrogate.cli import app
+from command_line import run
 from systems.manifest import (
     COMPLETE,
     FAILED,
@@ -44,10 +42,6 @@ platform = "Reference"
 """
 
 
-def _invoke(*arguments: str) -> Any:
-    return CliRunner().invoke(app, list(arguments))
-
-
 @pytest.fixture
 def finished(alanine_dipeptide: Scene, tmp_path: Path) -> Path:
     """A campaign's folder as one leaves it: two complete runs of alanine dipeptide, and one that failed."""
@@ -70,17 +64,17 @@ def finished(alanine_dipeptide: Scene, tmp_path: Path) -> Path:
 
 
 def test_info_tells_what_is_complete_and_why_the_rest_is_not(finished: Path) -> None:
-    shown = _invoke("info", str(finished))
+    shown = run("info", str(finished))
     assert shown.exit_code == 0
     assert "2 of 3 runs complete, 1 failed, 120 ps simulated" in shown.stdout
     assert "ala_300K_r2  it blew up" in shown.stdout
-    record = json.loads(_invoke("info", str(finished), "--json").stdout)
+    record = json.loads(run("info", str(finished), "--json").stdout)
     assert record["n_frames"] == 120
     assert record["runs"] == {"complete": 2, "failed": 1}
 
 
 def test_training_data_are_the_complete_runs_with_the_right_hashes(finished: Path, tmp_path: Path) -> None:
-    made = _invoke("windows", str(finished), "-o", str(tmp_path / "w.h5"))
+    made = run("windows", str(finished), "-o", str(tmp_path / "w.h5"))
     assert made.exit_code == 0, made.output
     assert "120 frames" in made.stdout
     assert "from 2 trajectories" in made.stdout
@@ -91,7 +85,7 @@ def test_training_data_are_the_complete_runs_with_the_right_hashes(finished: Pat
     file.write_bytes(content)
     for verb in (["windows"], ["train", "--steps", "4"]):
         suffix = "h5" if verb == ["windows"] else "safetensors"
-        refused = _invoke(*verb, str(finished), "-o", str(tmp_path / f"x.{suffix}"))
+        refused = run(*verb, str(finished), "-o", str(tmp_path / f"x.{suffix}"))
         assert refused.exit_code == 1
         assert "ala_300K_r1.h5 is not the file that the campaign wrote" in refused.stderr
         assert not (tmp_path / f"x.{suffix}").exists()
@@ -104,9 +98,9 @@ def test_one_trains_on_a_campaign_s_folder(finished: Path, tmp_path: Path) -> No
         "[approximator]\nchunk_frames = 2\nwidth = 64\nn_layers = 1\nn_heads = 2\nauxiliary_frames = 1\n"
     )
     out = tmp_path / "w.safetensors"
-    trained = _invoke("train", str(finished), "-o", str(out), "--steps", "4", "--config", str(settings), "--quiet")
+    trained = run("train", str(finished), "-o", str(out), "--steps", "4", "--config", str(settings), "--quiet")
     assert trained.exit_code == 0, trained.output
-    sources = json.loads(_invoke("info", str(out), "--json").stdout)["provenance"]
+    sources = json.loads(run("info", str(out), "--json").stdout)["provenance"]
     assert "ala_300K_r0.h5" in json.dumps(sources)
     assert "ala_300K_r2.h5" not in json.dumps(sources)
 
@@ -122,7 +116,7 @@ def test_one_trains_on_a_campaign_s_folder(finished: Path, tmp_path: Path) -> No
 def test_a_file_that_cannot_be_meant_is_one_line(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "c.toml"
     file.write_text(text)
-    refused = _invoke("campaign", str(file))
+    refused = run("campaign", str(file))
     assert refused.exit_code == 1
     assert said in refused.stderr
     assert refused.stderr.count("\n") == 1
@@ -132,7 +126,7 @@ def test_a_file_that_cannot_be_meant_is_one_line(tmp_path: Path, text: str, said
 def test_a_dry_run_lists_the_runs_and_starts_nothing(tmp_path: Path) -> None:
     file = tmp_path / "c.toml"
     file.write_text(LONG)
-    shown = _invoke("campaign", str(file), "--dry-run")
+    shown = run("campaign", str(file), "--dry-run")
     assert shown.exit_code == 0, shown.output
     assert "3 runs of 1 scenes, 600 ps in all" in shown.stdout
     assert "alanine-dipeptide_300K_r2  200 ps, seed" in shown.stdout

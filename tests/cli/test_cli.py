@@ -14,19 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
+from command_line import run
 from surrogate import api
-from surrogate.cli import app
 from systems.errors import SurromdError
 
 COMMANDS = ["demo", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli"]
 HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib", "lightning_fabric"]
-
-
-def run(*arguments: str) -> Any:
-    return CliRunner().invoke(app, list(arguments))
 
 
 def refused(result: Any, *, code: int = 1) -> str:

@@ -7,35 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
-from surrogate.cli import app
+from command_line import SMALL_LAM_SLIDE, run
 from systems.library import load
 from systems.trajectory import open_trajectory, open_writer
-
-SMALL = """
-[autoencoder]
-latent_dim = 12
-width = 32
-head_dim = 8
-[approximator]
-chunk_frames = 4
-width = 32
-n_layers = 1
-n_heads = 2
-auxiliary_frames = 2
-"""
-
-
-def run(*args: str) -> Result:
-    return CliRunner().invoke(app, [*args])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A reference of alanine dipeptide that shakes, and a small configuration."""
     here = tmp_path_factory.mktemp("heavy")
-    (here / "small.toml").write_text(SMALL)
+    (here / "small.toml").write_text(SMALL_LAM_SLIDE)
     scene, rng = load("alanine-dipeptide"), np.random.default_rng(0)
     with open_writer(here / "ref.h5", scene, {"temperature_k": 300.0}) as writer:
         writer.append(scene.positions_nm + 0.003 * rng.normal(size=(160, scene.n_atoms, 3)), np.arange(1.0, 161.0))

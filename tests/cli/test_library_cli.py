@@ -6,15 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from surrogate.cli import app
+from command_line import run
 from systems import library
 from systems.trajectory import open_trajectory
-
-
-def run(*arguments: str) -> Result:
-    return CliRunner().invoke(app, list(arguments))
 
 
 def test_systems_lists_every_scene_in_its_group() -> None:

@@ -7,31 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
-from surrogate.cli import app
+from command_line import SMALL_LAM_SLIDE, run
 from systems.prepare import prepare
 from systems.trajectory import open_trajectory, open_writer
 
-SMALL = """
-[atoms]
-width = 24
-n_rounds = 1
-[autoencoder]
-latent_dim = 12
-width = 32
-head_dim = 8
-[approximator]
-chunk_frames = 4
-width = 32
-n_layers = 1
-n_heads = 2
-auxiliary_frames = 2
-"""
-
-
-def run(*args: str) -> Result:
-    return CliRunner().invoke(app, [*args])
+SMALL = "[atoms]\nwidth = 24\nn_rounds = 1\n" + SMALL_LAM_SLIDE
 
 
 @pytest.fixture(scope="module")

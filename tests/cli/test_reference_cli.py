@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from surrogate.cli import app
+from command_line import run
 from systems.trajectory import open_trajectory
 
 FAST = ("--time", "0.4ps", "--save-every", "0.02ps", "--timestep", "1fs", "--hydrogen-mass", "natural", "--solvent",
         "vacuum")  # fmt: skip
-
-
-def run(*arguments: str) -> Any:
-    return CliRunner().invoke(app, list(arguments))
 
 
 @pytest.fixture

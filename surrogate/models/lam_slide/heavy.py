@@ -11,6 +11,7 @@ from torch import Tensor
 from surrogate.models.hydrogens import HydrogenPlacer
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.further_noise import HYDROGENS, generators
 from surrogate.models.lam_slide.model import LamSlide
 from systems.errors import InputError
 
@@ -61,7 +62,8 @@ class HeavyLamSlide(Surrogate):
         heavy = self.hydrogens.heavy
         chunk = self.model.next_chunk(last_frames_nm[:, :, heavy], _part(molecule, heavy), noise,
                                       solver_steps=solver_steps, solver=solver)  # fmt: skip
-        drawn = _unused_noise(noise, self.n_new, self.hydrogens.n_noise)
+        size = (self.n_new, self.hydrogens.n_noise)
+        drawn = torch.stack([torch.randn(size, generator=g) for g in generators(noise, HYDROGENS)]).to(noise.device)
         frames: Tensor = self.hydrogens(chunk.frames_nm, last_frames_nm[:, -1], drawn)
         return replace(chunk, frames_nm=frames)
 
@@ -78,14 +80,3 @@ def _part(molecule: Molecule, atoms: Tensor) -> Molecule:
     place[atoms] = torch.arange(len(atoms), device=atoms.device)
     bonds = place[molecule.bonds]
     return Molecule(molecule.elements[atoms], molecule.masses_da[atoms], bonds[(bonds >= 0).all(dim=1)])
-
-
-def _unused_noise(noise: Tensor, n_frames: int, n_numbers: int) -> Tensor:
-    """Return standard normal numbers `(b, n_frames, n_numbers)`, each row's from numbers of `noise` (b, T, L, dim) that
-    nothing else uses: the conditioning frames' place is taken by their clean latents."""
-    drawn = []
-    for row in noise:
-        low, high = row[0].flatten()[3:5].float().cpu().view(torch.int32).tolist()
-        generator = torch.Generator().manual_seed(((low & 0xFFFFFFFF) << 31) ^ (high & 0xFFFFFFFF))
-        drawn.append(torch.randn(n_frames, n_numbers, generator=generator))
-    return torch.stack(drawn).to(noise.device)

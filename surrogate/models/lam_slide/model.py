@@ -15,6 +15,7 @@ from surrogate.models.lam_slide.approximator import Approximator
 from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.further_noise import REDRAWS, generators
 from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from systems.errors import InputError
@@ -192,15 +193,6 @@ class LamSlide(Surrogate):
             rows = rows[wrong]
             if attempt == MAX_REDRAWS or not len(rows):
                 return
-            frames[rows] = solve(rows, _further_noise(noise[rows], attempt)).to(frames.dtype)
-
-
-def _further_noise(noise: Tensor, attempt: int) -> Tensor:
-    """Return other noise of the shape of `noise` (b, T, L, dim), each row's from numbers of its own that nothing else
-    uses, so that a row does not depend on those beside it."""
-    fresh = []
-    for row in noise:
-        low, high = row[0].flatten()[1:3].float().cpu().view(torch.int32).tolist()
-        seed = ((low & 0xFFFFFFFF) << 31) ^ ((high & 0xFFFFFFFF) << 8) ^ attempt
-        fresh.append(torch.randn(row.shape, generator=torch.Generator().manual_seed(seed)))
-    return torch.stack(fresh).to(noise)
+            drawn = generators(noise[rows], REDRAWS, attempt)
+            fresh = torch.stack([torch.randn(noise.shape[1:], generator=g) for g in drawn]).to(noise)
+            frames[rows] = solve(rows, fresh).to(frames.dtype)

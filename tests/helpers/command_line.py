@@ -1,0 +1,26 @@
+"""surromd's command line inside the test's own process, and settings that train in a second."""
+
+from __future__ import annotations
+
+from typer.testing import CliRunner, Result
+
+# A LaM-SLidE for `train --config`.
+SMALL_LAM_SLIDE = """
+[autoencoder]
+latent_dim = 12
+width = 32
+head_dim = 8
+[approximator]
+chunk_frames = 4
+width = 32
+n_layers = 1
+n_heads = 2
+auxiliary_frames = 2
+"""
+
+
+def run(*arguments: str) -> Result:
+    """Return what `surromd ARGUMENTS` printed and its exit status."""
+    from surrogate.cli import app
+
+    return CliRunner().invoke(app, list(arguments))
