@@ -14,8 +14,9 @@ import torch
 
 from surrogate.bench.rolling import Roller
 from surrogate.bench.stress_measures import measure_bonds, measure_validity
+from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
-from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
 from systems.errors import SurromdError
 from systems.validity import Geometry
@@ -193,7 +194,7 @@ class _Inputs:
 
     def __init__(self, weights: Weights, rows: int, seed: int) -> None:
         template = weights.domain.scene
-        self._molecule = Molecule.of(template)
+        self._molecule = describe(weights.model, template)
         fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
         start = template.positions_nm - template.positions_nm[fit].mean(axis=0)
         model = weights.model

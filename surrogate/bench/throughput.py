@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from surrogate.bench.plain_network import plain_network
+from surrogate.data.descriptions import describe
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
@@ -189,7 +190,7 @@ def main() -> None:
         torch.set_num_threads(args.threads)
     weights = load_weights(weights_path(args.weights))
     assert isinstance(weights.model, LamSlide)
-    molecule = Molecule.of(weights.domain.scene)
+    molecule = describe(weights.model, weights.domain.scene)
     peaks, rates = {}, []
     for precision in ("fp32", "bf16") if args.repeats else ():
         peaks[precision] = peak = matrix_peak(precision)

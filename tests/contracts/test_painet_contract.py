@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
+from surrogate.models import compiling
 from surrogate.models.atom_features import features_of_graph
 from surrogate.models.conformance import SurrogateContract, branched_chain, random_state
 from surrogate.models.graphs import BOND, SECOND_NEIGHBOUR, molecular_graph
@@ -88,6 +90,17 @@ class TestPainetLeapfrog(TestPainet):
 
     def make(self, n_atoms: int) -> Surrogate:
         return lively(LEAPFROG)
+
+
+@pytest.mark.parametrize("kind", [TestPainet, TestPainetWithModes, TestPainetLeapfrog])
+def test_a_compiled_model_answers_alike(kind: type[TestPainet], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling.torch, "compile", partial(torch.compile, backend="eager"))
+    contract = kind()
+    model, frames, molecule, noise, velocities = contract.given()
+    plain, compiled = (
+        contract.call(m, frames, molecule, noise, velocities) for m in (model, compiling.with_compiled_parts(model))
+    )
+    torch.testing.assert_close(compiled.frames_nm, plain.frames_nm, rtol=0, atol=1e-6)
 
 
 def test_the_factored_attention_equals_the_dense_one() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -128,7 +128,7 @@ class Painet(Surrogate):
                 raise InputError("this model knows a template; make molecules by `data.descriptions.describe`.")
             template = centred_template(molecule.atoms.template_nm, molecule.masses_da, self.config.length_scale_nm)
         bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
-        if isinstance(self.decoder, Leapfrog):
+        if self._integrates:
             pairs = molecular_pairs(molecule, all_pairs=all_pairs)
             return Structure(molecule, groups, bonds, template, pairs=pairs)
         return Structure(molecule, groups, bonds, template, graph=molecular_graph(molecule, all_pairs=all_pairs))
@@ -156,9 +156,8 @@ class Painet(Surrogate):
         if self.config.free_rotation:
             spin = angular_velocity(x, v, structure.molecule.masses_da)
             v = v - spun(spin, x)
-        decoder = self.decoder
         # Leapfrog's forces know positions alone.
-        seen = torch.zeros_like(v) if isinstance(decoder, Leapfrog) else v
+        seen = torch.zeros_like(v) if self._integrates else v
         h = self.embed(x, seen, structure.molecule.elements)
         latents = []
         for t in range(self.n_new):
@@ -166,10 +165,8 @@ class Painet(Surrogate):
                 h = self.steps[t](h, structure.molecule.elements, structure.groups)
             latents.append(h + self.embed_frame[t])
         frames = torch.stack(latents, dim=1)
-        if isinstance(decoder, Leapfrog):
-            x_new, v_new = self._integrate(decoder, frames, x, v, structure)
-        else:
-            x_new, v_new = self._decode(decoder, frames, x, v, structure)
+        decode = self._integrate if self._integrates else self._decode
+        x_new, v_new = decode(frames, x, v, structure)
         if structure.template is not None:
             moved, changed = self._carried(x, v, structure.template, structure)
             x_new, v_new = x_new + self.reach[0] * moved, v_new + self.reach[1] * changed
@@ -188,9 +185,12 @@ class Painet(Surrogate):
             z = self.surroundings(self.embed_type(structure.molecule.elements), structure.bonds)
             return self.modes(z, x, v, template, structure.molecule.masses_da)
 
-    def _decode(
-        self, decoder: Egnn, frames: Tensor, x: Tensor, v: Tensor, structure: Structure
-    ) -> tuple[Tensor, Tensor]:
+    @property
+    def _integrates(self) -> bool:
+        # Not by the decoder's class: a compiled decoder is of another.
+        return self.config.decoder == "leapfrog"
+
+    def _decode(self, frames: Tensor, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
         """EGNN on latents `(b, n_new, n, width)` and states `(b, n, 3)` -> both `(b, n_new, n, 3)`: so many rows at
         once as keep its messages in the cache."""
         graph = structure.graph
@@ -198,16 +198,15 @@ class Painet(Surrogate):
         rows = max(1, MESSAGE_NUMBERS // (self.config.width * max(1, len(graph.receiver))))
         x, v = (s[:, None].expand(-1, self.n_new, -1, -1).flatten(0, 1) for s in (x, v))
         parts = zip(frames.flatten(0, 1).split(rows), x.split(rows), v.split(rows), strict=True)
-        found = [decoder(*part, graph, self.reach) for part in parts]
+        found = [self.decoder(*part, graph, self.reach) for part in parts]
         x_new, v_new = (torch.cat([part[k] for part in found]) for k in range(2))
         return x_new.unflatten(0, (-1, self.n_new)), v_new.unflatten(0, (-1, self.n_new))
 
-    def _integrate(
-        self, decoder: Leapfrog, frames: Tensor, x: Tensor, v: Tensor, structure: Structure
-    ) -> tuple[Tensor, Tensor]:
+    def _integrate(self, frames: Tensor, x: Tensor, v: Tensor, structure: Structure) -> tuple[Tensor, Tensor]:
         """The same by the leapfrog decoder, always in the precision of the states: bf16 would round positions."""
         c, pairs, masses = self.config, structure.pairs, structure.molecule.masses_da.to(x.dtype)
         assert pairs is not None
+        decoder = cast(Leapfrog, self.decoder)
         with torch.autocast(x.device.type, enabled=False):
             frames = frames.to(x.dtype)
             z = decoder.encode.rounds(self.embed_type(structure.molecule.elements), structure.bonds)
