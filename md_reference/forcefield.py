@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,6 +57,17 @@ class ForceFieldSpec:
             raise PreparationError(f"{self.force_field} has no solvent; leave --solvent out or give vacuum.")
         if self.force_field == "charmm36" and self.solvent == "opc":
             raise PreparationError("charmm36 has no parameters for OPC water and its ions; use --solvent tip3p.")
+
+    @staticmethod
+    def of(record: Mapping[str, Any]) -> ForceFieldSpec:
+        """Return what a trajectory's record, or the conditions of a training, say of the forces. Raises KeyError where
+        they name no force field or no solvent."""
+        return ForceFieldSpec(
+            record["force_field"],
+            record["solvent"],
+            record.get("hydrogen_mass_da"),
+            constrain_hydrogens=record.get("constrain_hydrogens", True),
+        )
 
     @property
     def is_explicit(self) -> bool:

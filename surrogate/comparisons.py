@@ -75,10 +75,9 @@ def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArr
     from md_reference.relaxation import Relaxer
     from systems.errors import SimulationError
 
-    name, solvent = record.get("force_field"), record.get("solvent")
-    if name is None or solvent is None:
+    if record.get("force_field") is None or record.get("solvent") is None:
         raise InputError("--energies: the reference's file does not say with which force field it was made.")
-    spec = resolve(scene, ForceFieldSpec(name, solvent, record.get("hydrogen_mass_da")))
+    spec = resolve(scene, ForceFieldSpec.of(record))
     relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
 
     def energy(positions_nm: npt.NDArray[np.float64]) -> float:

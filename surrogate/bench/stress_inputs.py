@@ -175,8 +175,8 @@ def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
 
     conditions, scene = weights.domain.conditions, weights.domain.scene
     try:
-        asked = ForceFieldSpec(conditions["force_field"], conditions["solvent"], conditions.get("hydrogen_mass_da"))
-        with Engine(scene, resolve(scene, asked), temperature_k=conditions["temperature_k"] + _HOT_K,
+        spec = resolve(scene, ForceFieldSpec.of(conditions))
+        with Engine(scene, spec, temperature_k=conditions["temperature_k"] + _HOT_K,
                     timestep_ps=conditions["timestep_ps"], seed=seed) as engine:  # fmt: skip
             engine.minimise()
             engine.thermalise()

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 SOLVER_STEPS = (2, 5, 10, 20, 40)
 BATCHES = (1, 8, 64, 512)
 TIMESTEPS_PS = (0.001, 0.002, 0.004, 0.005)
+# Before anything is counted OpenMM leaves the minimum that it starts from.
+SETTLE_PS = 10.0
 _ROWS = 8
 Frames = npt.NDArray[np.float64]
 
@@ -142,8 +144,8 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator
     from md_reference.forcefield import ForceFieldSpec, resolve
 
     conditions = domain.conditions
-    asked = ForceFieldSpec(conditions["force_field"], conditions["solvent"], conditions.get("hydrogen_mass_da"))
-    with Engine(domain.scene, resolve(domain.scene, asked), temperature_k=conditions["temperature_k"],
+    spec = resolve(domain.scene, ForceFieldSpec.of(conditions))
+    with Engine(domain.scene, spec, temperature_k=conditions["temperature_k"],
                 friction_per_ps=conditions.get("friction_per_ps") or 1.0, timestep_ps=timestep_ps,
                 seed=seed) as engine:  # fmt: skip
         engine.minimise()
@@ -161,10 +163,13 @@ def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[di
         frames = np.empty((n_frames, domain.scene.n_atoms, 3))
         energies, temperatures = np.empty(n_frames), np.empty(n_frames)
         try:
-            started = time.process_time()
             with openmm_of(domain, timestep_ps, seed) as engine:
+                engine.step(round(SETTLE_PS / timestep_ps))
+                started = time.process_time()
+                # Of a model with shorter frames than this step, every step is one.
+                steps = max(1, round(lag_ps / timestep_ps))
                 for k in range(n_frames):
-                    engine.step(round(lag_ps / timestep_ps))
+                    engine.step(steps)
                     state = engine.state()
                     frames[k] = state.positions_nm
                     energies[k], temperatures[k] = state.potential_kj_mol, state.temperature_k

@@ -15,7 +15,6 @@ from systems.limits import WIDENING
 from systems.units import whole_steps
 
 if TYPE_CHECKING:
-    from md_reference.forcefield import ForceFieldSpec
     from md_reference.relaxation import Relaxed
     from surrogate.data.weights import Weights
 
@@ -55,13 +54,7 @@ class Coupling:
                 f"{_cannot(weights)}: they do not say which {' and '.join(missing)} they were trained with."
             )
         try:
-            asked = ForceFieldSpec(
-                self._conditions["force_field"],
-                self._conditions["solvent"],
-                self._conditions.get("hydrogen_mass_da"),
-                constrain_hydrogens=self._conditions.get("constrain_hydrogens", True),
-            )
-            self._spec: ForceFieldSpec = resolve(self._scene, asked)
+            self._spec = resolve(self._scene, ForceFieldSpec.of(self._conditions))
             self._system = build_system(self._scene, self._spec)
             self._relaxer = Relaxer(self._scene, self._system, platform=platform, born=self._spec.is_born)
         except SurromdError as error:
