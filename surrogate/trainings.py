@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from systems.errors import InputError
 
 if TYPE_CHECKING:
     from surrogate.data.frames import TrainingFrames
 
+T = TypeVar("T")
 # (stage, share of all that is to be done) -> None
 AdvanceFn = Callable[[str, float], None]
 # Names on the command line, what each needs: checked before torch is imported.
@@ -95,13 +96,14 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
     from surrogate.training.lam_slide import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 
     start = None
+    record, training = _read_config(request)
     if request.start_from is not None:
         start = load_weights(request.start_from)
         if start.model.arch != request.arch:
             raise InputError(f"{request.start_from} holds {start.model.arch}, not {request.arch}.")
         model_config = start.model.config
     else:
-        model_config = LamSlideConfig() if request.config is None else LamSlideConfig.from_toml(request.config)
+        model_config = LamSlideConfig.from_dict(record)
     told: dict[str, Any] = {"graph": request.graph, "hydrogens": request.hydrogens, "entities": request.entities}
     model_config = replace(model_config, **{key: value for key, value in told.items() if value})
     if model_config.graph:
@@ -113,17 +115,18 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
             frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
     steps = request.steps
     first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
-    settings = TrainingConfig(
-        budget_s=request.budget_s,
-        stage_one_steps=first,
-        stage_two_steps=None if steps is None or first is None else steps - first,
-        seed=request.seed,
-        device=request.device,
-        time_reversal=request.time_reversal,
-        rare_draws=request.rare_draws,
-        rare_kinds=request.rare_kinds,
-        longest_lag_ps=request.longest_lag_ps,
-    )
+    asked = {
+        "budget_s": request.budget_s,
+        "stage_one_steps": first,
+        "stage_two_steps": None if steps is None or first is None else steps - first,
+        "seed": request.seed,
+        "device": request.device,
+        "time_reversal": request.time_reversal,
+        "rare_draws": request.rare_draws,
+        "rare_kinds": request.rare_kinds,
+        "longest_lag_ps": request.longest_lag_ps,
+    }
+    settings = _settings(TrainingConfig, request, training, asked)
     share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
     def run(advance: AdvanceFn) -> Path:
@@ -140,15 +143,16 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
 def _forecaster(request: TrainingRequest) -> Prepared:
     from surrogate.models.painet.config import PainetConfig
     from surrogate.models.painet.model import EgnnForecaster, Painet
-    from surrogate.models.settings import read_toml
     from surrogate.training.painet import PainetTraining, train_painet
 
-    model_config = PainetConfig() if request.config is None else PainetConfig.from_dict(read_toml(request.config))
+    record, training = _read_config(request)
+    model_config = PainetConfig.from_dict(record)
+    asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
+    settings = _settings(PainetTraining, request, training, asked)
     frames = read_frames(request, canonical=False, velocities=True)
     span = model_config.n_new * model_config.frame_stride
     frames.window_starts(2 * span + 1, validation=False)
     frames.window_starts(span + 1, validation=True)
-    settings = PainetTraining(budget_s=request.budget_s, steps=request.steps, seed=request.seed, device=request.device)
     kind = EgnnForecaster if request.arch == EgnnForecaster.arch else Painet
 
     def run(advance: AdvanceFn) -> Path:
@@ -160,6 +164,26 @@ def _forecaster(request: TrainingRequest) -> Prepared:
         )
 
     return Prepared(frames.scene.name, run)
+
+
+def _read_config(request: TrainingRequest) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the model's settings in the configuration file and its table `training`; both empty without a file."""
+    from surrogate.models.settings import read_toml
+
+    record = {} if request.config is None else read_toml(request.config)
+    training = record.pop("training", {})
+    if not isinstance(training, dict):
+        raise InputError(f"{request.config}: training is a table, [training], not {training!r}.")
+    return record, training
+
+
+def _settings(kind: type[T], request: TrainingRequest, training: dict[str, Any], asked: dict[str, Any]) -> T:
+    """Return a training's settings from the file's and those `asked` for, which the file may not hold as well."""
+    from surrogate.models.settings import build
+
+    if twice := sorted(asked.keys() & training):
+        raise InputError(f"{request.config}: training.{twice[0]} is set on the command line, not in this file.")
+    return build(kind, {**training, **asked}, "training.")
 
 
 def _fitted(request: TrainingRequest) -> Prepared:

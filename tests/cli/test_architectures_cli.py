@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,14 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("arch", ["painet", "egnn"])
 def test_a_forecaster_is_trained_and_rolls_out(tmp_path: Path, moving: Path, arch: str) -> None:
-    (tmp_path / "tiny.toml").write_text(TINY)
+    (tmp_path / "tiny.toml").write_text(TINY + "n_modes = 6\n[training]\nbatch = 4\nnoise = 0.125\n")
     windows, weights, out = (str(tmp_path / name) for name in ("w.h5", "m.safetensors", "roll.h5"))
     done("windows", str(moving), "--velocities", "-o", windows)
     done("train", windows, "--arch", arch, "--config", str(tmp_path / "tiny.toml"), "--steps", "3", "-o", weights)
     told = json.loads(run("info", weights, "--json").stdout)
     assert told["config"]["attention"] == ("none" if arch == "egnn" else "linear")
+    assert told["config"]["n_modes"] == (0 if arch == "egnn" else 6)
+    assert told["provenance"]["noise"] == 0.125
     assert told["config"]["temperature_k"] == 500.0
     assert told["lag_ps"] == pytest.approx(0.005)
     # Trained for a moment it hardly moves, for which guards would stop it.
@@ -55,6 +58,14 @@ def test_a_forecaster_is_trained_and_rolls_out(tmp_path: Path, moving: Path, arc
         assert np.isfinite(reader.read()).all()
     solver = refusal("rollout", "ethanol", "--weights", weights, "--time", "0.1ps", "--solver", "euler", "-o", "x.h5")
     assert "no solver" in solver
+    bad = tmp_path / "bad.toml"
+    for line, reason in {"steps = 4": "training.steps is set on the command line",
+                         "nois = 1": "unknown.*training.nois", "=": "not valid TOML"}.items():  # fmt: skip
+        bad.write_text(f"{TINY}[training]\n{line}\n")
+        said = refusal(
+            "train", windows, "--arch", arch, "--config", str(bad), "--steps", "3", "-o", weights + ".safetensors"
+        )
+        assert re.search(reason, said), said
 
 
 @pytest.mark.parametrize("arch", ["frozen", "normal-modes", "msm"])

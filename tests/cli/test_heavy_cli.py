@@ -17,7 +17,7 @@ from systems.trajectory import open_trajectory, open_writer
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A reference of alanine dipeptide that shakes, and a small configuration."""
     here = tmp_path_factory.mktemp("heavy")
-    (here / "small.toml").write_text(SMALL_LAM_SLIDE)
+    (here / "small.toml").write_text(SMALL_LAM_SLIDE + "[training]\nstage_two_batch = 16\n")
     scene, rng = load("alanine-dipeptide"), np.random.default_rng(0)
     with open_writer(here / "ref.h5", scene, {"temperature_k": 300.0}) as writer:
         writer.append(scene.positions_nm + 0.003 * rng.normal(size=(160, scene.n_atoms, 3)), np.arange(1.0, 161.0))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from surrogate.models.hydrogens import HydrogenPlan
 from surrogate.models.lam_slide.kinds import Kind
 from surrogate.models.lam_slide.residues import ResidueLayout
-from surrogate.models.settings import build, read_toml
+from surrogate.models.settings import build
 from systems.errors import InputError
 
 
@@ -145,8 +144,3 @@ class LamSlideConfig:
             "residues": ResidueLayout.of(record.pop("residues", None)),
         }
         return build(LamSlideConfig, {**record, **sub}, "")
-
-    @staticmethod
-    def from_toml(path: str | Path) -> LamSlideConfig:
-        """Read a TOML file. Raises InputError when it is missing, malformed or has unknown keys."""
-        return LamSlideConfig.from_dict(read_toml(path))

@@ -15,6 +15,7 @@ from surrogate.data.weights import Weights, load_weights, read_header, save_weig
 from surrogate.models.lam_slide.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.settings import read_toml
 from surrogate.training.lam_slide import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
@@ -211,9 +212,9 @@ def test_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text("[approximator]\nwidht = 128\n")
     with pytest.raises(InputError, match=r"widht.*width"):
-        LamSlideConfig.from_toml(path)
+        LamSlideConfig.from_dict(read_toml(path))
     path.write_text("canonical = false\n[approximator]\nwidth = 128\n")
-    config = LamSlideConfig.from_toml(path)
+    config = LamSlideConfig.from_dict(read_toml(path))
     assert not config.canonical
     assert config.approximator.width == 128
     assert LamSlideConfig.from_dict(config.to_dict()) == config
