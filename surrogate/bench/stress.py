@@ -178,7 +178,7 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
         chunks, caught = chunks + account["chunks"], caught + account["chunks_caught"]
         seconds = account["seconds"]
         draw_s, check_s = seconds.get("draw", 0.0), seconds.get("check", 0.0)
-        help_s = sum(seconds.values()) - draw_s - check_s
+        help_s = sum(spent for of, spent in seconds.items() if of not in ("draw", "check"))
         row["wall_s"] = cost.get("batch_wall_s")
     if min(map(len, replicas)) == 0:
         return row
