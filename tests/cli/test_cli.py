@@ -288,7 +288,7 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, stderr
     assert len(stderr.splitlines()) == 1, stderr
     assert "--resume" in stderr
     kept = _n_frames(here / "x.h5")

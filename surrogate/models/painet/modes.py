@@ -4,9 +4,9 @@ To first order in its excursions a molecule's future is linear in its state, x(t
 all pairs of atoms in A and B: normal modes. Attention between scalar embeddings cannot carry vectors, and EGNN's
 messages carry no neighbour's velocity. Here every atom has a row in each mode, told from its surroundings and its place
 in the template; amplitudes are sums over atoms, and what they do to each later frame is one number per mode and frame,
-the cosine and sine of a normal mode if that were all there is. Atoms that have left their places are left to the
-decoder. The cost is linear in atoms. Superposing the molecule on its template makes it exactly equivariant to rotations
-and translations; reflections are told apart.
+the cosine and sine of a normal mode if that were all there is. The cost is linear in atoms. Superposing the molecule on
+its template makes it exactly equivariant to rotations and translations; reflections are told apart. Where groups turn
+freely (a methyl on a ring) a linear map in one frame does not help.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from torch import Tensor, nn
 
 # Root mean square excursion from the template, in the model's unit (0.1 nm).
 EXCURSION = 0.2
-# An atom farther from its place than this (a methyl group has turned, say) takes part by less than a half.
-FARTHEST = 0.6
 # Share of the shorter of a template's two long axes in the longer below which atoms lie in a line: no frame is theirs.
 NARROWEST = 1e-3
 OUTPUT_SCALE = 0.25
@@ -62,14 +60,12 @@ class Modes(nn.Module):
         """Types `(n, width)`, centred states `(b, n, 3)`, the template `(n, 3)` -> two of `(b, n_new, n, 3)`."""
         turn = superposing_turns(x, template, masses_da)
         z = self.mix(z + self.of_place(template / EXCURSION))
-        away = x @ turn - template
-        near = 1.0 / (1.0 + (away / FARTHEST).square().sum(-1, keepdim=True).square())
-        state = torch.stack([away / EXCURSION, v @ turn], dim=-2) * near[..., None, :]
+        state = torch.stack([(x @ turn - template) / EXCURSION, v @ turn], dim=-2)
         into = self.into(z).unflatten(-1, (2, 3, self.n_modes)) / len(z) ** 0.5
         out_of = OUTPUT_SCALE * self.out_of(z).unflatten(-1, (3, self.n_modes))
         amplitudes = torch.einsum("bnwi,nwid->bwd", state, into)
         later = torch.einsum("bwd,tswd->btsd", amplitudes, self.over_time)
         moved = torch.einsum("btsd,nid->btsni", later, out_of)
         mean = self.mean(z).unflatten(-1, (self.n_new, 3)).transpose(0, 1)
-        back, near = turn.transpose(-1, -2)[:, None], near[:, None]
-        return near * ((moved[:, :, 0] + mean) @ back), near * (moved[:, :, 1] @ back)
+        back = turn.transpose(-1, -2)[:, None]
+        return (moved[:, :, 0] + mean) @ back, moved[:, :, 1] @ back
