@@ -23,6 +23,7 @@ from typing import Any
 INTERRUPTED, FAILED = 130, 1
 LONGEST_S = 120.0  # that any step of it may take on a busy machine
 CHUNKS_UNTIL_STOPPED = 6
+PATIENCE_S = 10.0
 
 
 @dataclass
@@ -41,11 +42,14 @@ class Child:
             time.sleep(0.002)
 
     def stop(self, number: signal.Signals) -> None:
-        """Send a signal, and say that it has been sent."""
+        """Send a signal and say so until the process ends: Python loses a Ctrl-C that comes while it imports."""
         assert self.process.pid is not None
-        os.kill(self.process.pid, number)
-        with suppress(OSError):  # it is gone
-            self.line.send(None)
+        deadline = time.monotonic() + LONGEST_S
+        while self.process.exitcode is None and time.monotonic() < deadline:
+            with suppress(OSError):  # it is gone
+                os.kill(self.process.pid, number)
+                self.line.send(None)
+            self.process.join(PATIENCE_S)
 
     def end(self) -> tuple[int | None, str]:
         """Wait for its end; return its exit status (negative: the signal) and its error, "" without one."""
@@ -85,15 +89,15 @@ def _guarded(work: Callable[..., None], line: Connection, *arguments: Any) -> No
 
 
 def until_stopped(line: Connection, weights: Path, outs: list[Path], config: Any) -> None:
-    """Go on with a rollout, for a few chunks at most: then it waits until it has been stopped."""
+    """Go on with a rollout, for a few chunks at most: then it waits for each further one until it hears of a signal."""
     chunks = 0
 
     def wait_for_signal(done: int, total: int, note: str) -> None:
         nonlocal chunks
         chunks += 1
         time.sleep(0.01)
-        if chunks >= CHUNKS_UNTIL_STOPPED:
-            line.poll(LONGEST_S)
+        if chunks >= CHUNKS_UNTIL_STOPPED and line.poll(LONGEST_S):
+            line.recv()
 
     _roll(weights, outs, config, progress=wait_for_signal)
 
