@@ -32,7 +32,10 @@ def reproduce(
     ] = False,
     without: Annotated[
         list[str] | None,
-        typer.Option("--without", help="Leave out: extrapolate, any-start, from-velocity, canonical. Repeatable."),
+        typer.Option(
+            "--without",
+            help="Leave out: extrapolate, any-start, from-velocity, canonical, predicted-only. Repeatable.",
+        ),
     ] = None,
     molecule: Annotated[
         list[str] | None,

@@ -144,7 +144,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
         for m in molecules
     }
     training, device = settings.training("lam-slide"), torch.device(settings.device)
-    model = lam_slide_model(large=device.type == "cuda")
+    model = lam_slide_model(settings, large=device.type == "cuda")
 
     def seen(m: MoleculeWindows, windows: Array) -> tuple[torch.Tensor, torch.Tensor]:
         x = torch.from_numpy(views[m.name].to_model(windows)).float()
@@ -173,7 +173,8 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
         return np.concatenate(blocks, axis=1)
 
     switches = {"body frame": settings.canonical, "corrects the linear forecast": settings.extrapolate,
-                "any start": settings.any_start}  # fmt: skip
+                "any start": settings.any_start,
+                "loss on predicted frames alone": settings.predicted_only}  # fmt: skip
     return FittedToMolecules(
         forecast,
         f"ten frames, elements, {settings.solver_steps} solver steps{beyond(switches)}",
@@ -182,7 +183,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
     )
 
 
-def lam_slide_model(*, large: bool) -> LamSlide:
+def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
     """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
     from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
     from surrogate.models.lam_slide.model import LamSlide
@@ -196,6 +197,7 @@ def lam_slide_model(*, large: bool) -> LamSlide:
             autoencoder=AutoencoderConfig(n_latents=sizes["n_latents"], latent_dim=32, n_octaves=3, type_weight=0.01),
             approximator=ApproximatorConfig(
                 chunk_frames=N_GIVEN + N_NEW,
+                loss_on_given=not settings.predicted_only,
                 n_conditioning=N_GIVEN,
                 latents_per_token=sizes["per_token"],
                 width=sizes["width"],

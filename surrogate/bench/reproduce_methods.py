@@ -37,9 +37,10 @@ class Settings:
 
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames
     misses, each predicted frame in units of its own size, instead of absolute positions; `any_start`: EGNN learns from
-    every frame of a trajectory, not from the tenth alone; `from_velocity`: EGNN adds the motion at constant velocity.
-    Of molecules alone, `canonical`: LaM-SLidE sees windows in the body frame instead of turned at random; there
-    `extrapolate` is the best linear forecast, and `any_start` takes every training window, not the protocol's 5,000.
+    every frame of a trajectory, not from the tenth alone; `from_velocity`: EGNN adds the motion at constant velocity;
+    `predicted_only`: LaM-SLidE's loss leaves out the given frames. Of molecules alone, `canonical`: LaM-SLidE sees
+    windows in the body frame instead of turned at random; there `extrapolate` is the best linear forecast, and
+    `any_start` takes every training window, not the protocol's 5,000.
     """
 
     folder: Path
@@ -51,6 +52,7 @@ class Settings:
     any_start: bool = True
     from_velocity: bool = True
     canonical: bool = True
+    predicted_only: bool = True
     device: str = "cpu"
     solver_steps: int = 10
     progress: ProgressFn | None = None
@@ -72,7 +74,7 @@ class Settings:
         return made
 
 
-SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical")
+SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical", "predicted-only")
 
 
 def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
@@ -87,6 +89,7 @@ def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
         any_start=settings.any_start and "any-start" not in without,
         from_velocity=settings.from_velocity and "from-velocity" not in without,
         canonical=settings.canonical and "canonical" not in without,
+        predicted_only=settings.predicted_only and "predicted-only" not in without,
     )
 
 
@@ -220,6 +223,7 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
             ),
             approximator=ApproximatorConfig(
                 chunk_frames=N_GIVEN + N_NEW,
+                loss_on_given=not settings.predicted_only,
                 n_conditioning=N_GIVEN,
                 latents_per_token=2,
                 width=128,
@@ -243,7 +247,8 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
         seen_ahead = sampled(model, known, n, n_samples, settings, generator)
         return np.stack([view.from_model(given, sample) for sample in seen_ahead])
 
-    more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate})
+    more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate,
+                   "loss on predicted frames alone": settings.predicted_only})  # fmt: skip
     return Fitted(
         forecast, f"positions, charges, {settings.solver_steps} solver steps{more}", seconds, n_parameters(model)
     )

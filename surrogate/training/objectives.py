@@ -80,7 +80,8 @@ def flow_loss(
     atoms: Atoms | None = None,
     told: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames, plus decoded position and distance.
+    """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames (with
+    `loss_on_given` on all), plus decoded position and distance.
 
     `importance` (b,): what each window counts (data.rarity); None is one each. With the `kind` (b,) of each window it
     counts in the cross entropy of the kinds alone: the network is told the kind, and within a kind draws are plain.
@@ -95,8 +96,9 @@ def flow_loss(
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
     noisy = alpha * latents + sigma * noise
-    prediction = model.approximator(noisy, tau, known, kind=kind, told=told)[:, c.n_conditioning :]
-    target = latents[:, c.n_conditioning :]
+    first = 0 if c.loss_on_given else c.n_conditioning
+    prediction = model.approximator(noisy, tau, known, kind=kind, told=told)[:, first:]
+    target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
         weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()

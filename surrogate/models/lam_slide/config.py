@@ -56,6 +56,8 @@ class ApproximatorConfig:
     # Conditioning frames see neither the flow time nor the frames that follow them, so that a chunk's evaluations
     # compute them once; False is the paper.
     clean_conditioning: bool = False
+    # Given frames count in the loss beside the predicted ones, as in the paper's code.
+    loss_on_given: bool = False
     # Flow times are logit-normal: a positive location draws more of them near the data end.
     tau_location: float = 0.5
     tau_scale: float = 1.4
@@ -68,6 +70,10 @@ class ApproximatorConfig:
     lag_range_ps: tuple[float, float] | None = None
     # Kinds of rare windows that the network is told of and a head gives the odds of (data.rarity).
     rare_kinds: tuple[Kind, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.loss_on_given and self.clean_conditioning:
+            raise InputError("approximator.loss_on_given: with clean_conditioning given frames come back as they are.")
 
     @property
     def n_kinds(self) -> int:

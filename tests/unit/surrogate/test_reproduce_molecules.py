@@ -163,7 +163,7 @@ def test_normal_modes_follow_vibrations_and_keep_the_pose() -> None:
 
 def test_switches_are_known_by_name() -> None:
     plain = without_switches(Settings(Path()), SWITCHES)
-    assert not (plain.extrapolate or plain.any_start or plain.from_velocity or plain.canonical)
+    assert not (plain.extrapolate or plain.any_start or plain.from_velocity or plain.canonical or plain.predicted_only)
     one = without_switches(Settings(Path()), ["canonical"])
     assert (one.extrapolate, one.canonical) == (True, False)
     with pytest.raises(UnknownNameError, match="Did you mean 'canonical'"):

@@ -18,6 +18,7 @@ from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.settings import read_toml
 from surrogate.training.lam_slide import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
+from surrogate.training.objectives import flow_loss
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.scene import Scene
 from systems.trajectory import open_writer
@@ -218,6 +219,23 @@ def test_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
     assert not config.canonical
     assert config.approximator.width == 128
     assert LamSlideConfig.from_dict(config.to_dict()) == config
+
+
+def test_given_frames_count_in_the_loss_where_they_are_asked_to(small_model_config: LamSlideConfig) -> None:
+    class Zeros(torch.nn.Module):
+        def forward(self, o: torch.Tensor, *others: torch.Tensor, **named: torch.Tensor) -> torch.Tensor:
+            return torch.zeros_like(o)
+
+    latents, tau = torch.randn(3, 8, 4, 12, generator=torch.Generator().manual_seed(0)), torch.full((3,), 0.5)
+    for on_given, counted in ((False, latents[:, 2:]), (True, latents)):
+        stage_two = replace(small_model_config.approximator, n_conditioning=2, precondition=False, auxiliary_frames=0,
+                            loss_on_given=on_given)  # fmt: skip
+        model = LamSlide(replace(small_model_config, approximator=stage_two))
+        model.approximator = Zeros()
+        loss, _ = flow_loss(model, latents, 22, tau, torch.Generator().manual_seed(1))
+        torch.testing.assert_close(loss, counted.square().mean())
+    with pytest.raises(InputError, match="clean_conditioning"):
+        replace(stage_two, clean_conditioning=True)
 
 
 def test_rotation_augmentation_trains_without_canonical_frames(tmp_path: Path, harmonic_frames: TrainingFrames,
