@@ -101,7 +101,8 @@ def rollout(
         if resuming:
             _cut_back(writers, outs, min(state.steps, plan.n_steps) // plan.stride)
         else:
-            state_path.unlink(missing_ok=True)  # of an earlier rollout, which was just replaced
+            # Before any frame is written: killed at any later moment, the rollout can be gone on with.
+            write_checkpoint(state_path, state, plan.settings)
         buffers: list[list[_Block]] = [[] for _ in outs]
         started = time.monotonic() - state.wall_s
         last_flush = time.monotonic()

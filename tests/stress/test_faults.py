@@ -17,7 +17,7 @@ import torch
 
 from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling.checkpoint import checkpoint_path, read_checkpoint
+from surrogate.sampling.checkpoint import Progress, checkpoint_path, read_checkpoint, write_checkpoint
 from surrogate.sampling.rollout import RolloutConfig, rollout
 from surrogate.sampling.simulation import Simulation
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError, WeightsError
@@ -93,6 +93,29 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
     for ours, whole in zip(outs, undisturbed, strict=True):
         assert everything(ours) == everything(whole)
     assert not state.exists()
+
+
+def test_stopped_between_its_first_frames_and_their_checkpoint_it_goes_on(
+    tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights, config: RolloutConfig, undisturbed: list[Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    outs = outs_in(tmp_path / "run")
+
+    class Killed(BaseException):
+        pass
+
+    def killed_after_frames(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
+        if progress.steps:
+            raise Killed
+        write_checkpoint(path, progress, settings)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr("surrogate.sampling.rollout.write_checkpoint", killed_after_frames)
+        rollout(alanine_dipeptide, small_weights, outs, config, flush_every_s=0.0)
+    assert len(frames_of(outs[0])) == small_weights.model.n_new
+    rollout(alanine_dipeptide, small_weights, outs, config, resume=True)
+    for ours, whole in zip(outs, undisturbed, strict=True):
+        assert everything(ours) == everything(whole)
 
 
 def test_a_full_disk_loses_nothing(
