@@ -14,7 +14,7 @@ from surrogate.bench.stress import StressConfig, choose_config, run_stress
 from surrogate.bench.stress_inputs import measure_invariance, measure_odd_inputs, permuted
 from surrogate.bench.stress_measures import measure_bonds, measure_drift, measure_validity
 from surrogate.bench.stress_report import markdown
-from surrogate.bench.stress_settings import measure_batches, measure_precision
+from surrogate.bench.stress_settings import measure_batches, measure_openmm, measure_precision, openmm_of
 from surrogate.data.weights import Weights
 from systems.errors import InputError
 from systems.scene import Scene
@@ -128,6 +128,29 @@ def test_a_stress_test_is_added_to(tmp_path: Path, small_weights: Weights) -> No
     other = replace(small_weights, hash="another")
     (row,) = run(other, 40, "length")["length"]
     assert "complete, but of weights_hash" in row["outcome"], "rollouts of other weights are not taken for its own"
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
+    small_weights: Weights, rigid: bool
+) -> None:
+    conditions = {"force_field": "ff14SB", "solvent": "vacuum", "temperature_k": 300.0, "constrain_hydrogens": rigid}
+    domain = replace(small_weights.domain, conditions=conditions, lag_ps=0.0004)
+    with openmm_of(domain, 0.001, seed=1) as engine:
+        frames = []
+        for _ in range(20):
+            engine.step(5)
+            frames.append(engine.positions())
+    scene = domain.scene
+    light = [(i, j) for i, j in scene.bonds.tolist() if "H" in (scene.elements[i], scene.elements[j])]
+    i, j = np.array(light).T
+    spread = np.linalg.norm(np.array(frames)[:, i] - np.array(frames)[:, j], axis=-1).std(axis=0)
+    assert (spread.max() < 1e-5) if rigid else (spread.min() > 1e-4)
+    # Frames 0.4 fs apart, and steps of 1 fs and more.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surrogate.bench.stress_settings.SETTLE_PS", 0.05)
+        row = measure_openmm(replace(small_weights, domain=domain), n_frames=40)[0]
+    assert row["timestep_fs"] == 1.0 and row["bond_variance_%"] > 0.0
 
 
 def test_settings_are_checked() -> None:
