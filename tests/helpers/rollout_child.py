@@ -24,6 +24,7 @@ INTERRUPTED, FAILED = 130, 1
 LONGEST_S = 120.0  # that any step of it may take on a busy machine
 CHUNKS_UNTIL_STOPPED = 6
 PATIENCE_S = 10.0
+UNDER_WAY = "under way"
 
 
 @dataclass
@@ -33,13 +34,11 @@ class Child:
     process: ForkServerProcess
     line: Connection
 
-    def wait_for(self, path: Path) -> None:
-        """Return when the file is there; AssertionError if the process ends before, or when it takes too long."""
-        deadline = time.monotonic() + LONGEST_S
-        while not path.exists():
-            assert self.process.is_alive(), f"ended before {path.name} was there: {self.end()}"
-            assert time.monotonic() < deadline, f"{path.name} is not there after {LONGEST_S:g} s"
-            time.sleep(0.002)
+    def wait_for_chunk(self) -> None:
+        """Return when it has drawn and written a chunk; AssertionError if it ends before, or takes too long."""
+        assert self.line.poll(LONGEST_S), f"no chunk after {LONGEST_S:g} s"
+        said = self.line.recv()
+        assert said == UNDER_WAY, said
 
     def stop(self, number: signal.Signals) -> None:
         """Send a signal and say so until the process ends: Python loses a Ctrl-C that comes while it imports."""
@@ -56,7 +55,9 @@ class Child:
         self.process.join(LONGEST_S)
         status, said = self.process.exitcode, ""
         with suppress(EOFError, OSError):
-            said = self.line.recv() if self.line.poll() else ""
+            while self.line.poll():
+                heard = self.line.recv()
+                said = said if heard == UNDER_WAY else heard
         if status is None:
             self.process.kill()
         return status, said
@@ -95,6 +96,8 @@ def until_stopped(line: Connection, weights: Path, outs: list[Path], config: Any
     def wait_for_signal(done: int, total: int, note: str) -> None:
         nonlocal chunks
         chunks += 1
+        if chunks == 1:
+            line.send(UNDER_WAY)
         time.sleep(0.01)
         if chunks >= CHUNKS_UNTIL_STOPPED and line.poll(LONGEST_S):
             line.recv()

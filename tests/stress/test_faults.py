@@ -77,9 +77,10 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
     assert times * CHUNKS_UNTIL_STOPPED < N_CHUNKS
     for stopped in range(times):
         child = start(until_stopped, small_weights_file, outs, config)
-        # In turn: at any moment from the first file on, and when there is something to go on from.
-        child.wait_for(state if stopped % 2 else outs[0])
-        time.sleep(rng.uniform(0.0, 0.15))
+        # In turn: while it starts, and after a chunk.
+        if stopped % 2:
+            child.wait_for_chunk()
+        time.sleep(rng.uniform(0.0, 0.15 if stopped % 2 else 0.5))
         child.stop(number)
         status, said = child.end()
         assert status in expected, said or status
