@@ -84,7 +84,7 @@ class Surrogate(nn.Module, ABC):
     # Solvers that `next_chunk` knows, the default first; empty for a model that answers in one evaluation.
     solvers: tuple[str, ...] = ()
     # Names (prefixes) of layers that compute in float32 under autocast too.
-    float32_layers: ClassVar[tuple[str, ...]] = ()
+    float32_layers: tuple[str, ...] = ()
     # Whether bf16 pays: False where the network is small and its rounding would heat what it integrates.
     bf16_by_default: ClassVar[bool] = True
     # Whether a chunk ends in velocities that the next one starts from.

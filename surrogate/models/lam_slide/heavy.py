@@ -24,7 +24,7 @@ class HeavyLamSlide(Surrogate):
     """
 
     arch: ClassVar[str] = LamSlide.arch
-    float32_layers: ClassVar[tuple[str, ...]] = tuple(f"model.{name}" for name in LamSlide.float32_layers)
+    float32_layers: tuple[str, ...] = tuple(f"model.{name}" for name in LamSlide.float32_layers)
     config: LamSlideConfig
 
     def __init__(

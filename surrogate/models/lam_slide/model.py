@@ -33,7 +33,7 @@ class LamSlide(Surrogate):
     """
 
     arch: ClassVar[str] = "lam-slide"
-    float32_layers: ClassVar[tuple[str, ...]] = ("autoencoder.to_position", "approximator.odds")
+    float32_layers: tuple[str, ...] = ("autoencoder.to_position", "approximator.odds")
     config: LamSlideConfig
     latent_mean: Tensor
     latent_scale: Tensor

@@ -81,11 +81,11 @@ class Painet(Surrogate):
         if c.n_modes:
             self.surroundings = Surroundings(c.width)
             self.modes = Modes(c.width, c.n_modes, c.n_new)
-            self.float32_layers = ("surroundings.", "modes.")  # type: ignore[misc]
+            self.float32_layers = ("surroundings.", "modes.")
         self.decoder: Egnn | Leapfrog = Egnn(c.width, c.n_decoder_layers)
         if c.decoder == "leapfrog":
             self.decoder = Leapfrog(c.width, c.n_decoder_layers, c.n_radial, c.n_scalars, c.n_vectors)
-            self.float32_layers = (*self.float32_layers, "decoder.")  # type: ignore[misc]
+            self.float32_layers = (*self.float32_layers, "decoder.")
         self._known: Structure | None = None
         self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
         self.register_buffer("reach", torch.ones(2))
