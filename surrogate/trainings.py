@@ -103,8 +103,9 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
             raise InputError(f"{request.start_from} holds {start.model.arch}, not {request.arch}.")
         model_config = start.model.config
     else:
-        model_config = LamSlideConfig.from_dict(record)
-    told: dict[str, Any] = {"graph": request.graph, "hydrogens": request.hydrogens, "entities": request.entities}
+        graph = request.graph or record.get("graph")
+        model_config = LamSlideConfig.of_many(record) if graph else LamSlideConfig.from_dict(record)
+    told: dict[str, Any] = {"hydrogens": request.hydrogens, "entities": request.entities}
     model_config = replace(model_config, **{key: value for key, value in told.items() if value})
     if model_config.graph:
         sets = collect_sets(request.paths, held=request.held, spool=request.out.parent)
@@ -114,7 +115,8 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         for validation in (False, True):
             frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
     steps = request.steps
-    first = None if steps is None else 0 if start is not None else max(1, round(steps * STAGE_ONE_SHARE))
+    alone = start is not None or model_config.latents_are_atoms  # stage two: nothing else is to be trained
+    first = None if steps is None else 0 if alone else max(1, round(steps * STAGE_ONE_SHARE))
     asked = {
         "budget_s": request.budget_s,
         "stage_one_steps": first,
@@ -127,7 +129,7 @@ def _lam_slide(request: TrainingRequest) -> Prepared:
         "longest_lag_ps": request.longest_lag_ps,
     }
     settings = _settings(TrainingConfig, request, training, asked)
-    share_one = 0.0 if start is not None else STAGE_ONE_SHARE
+    share_one = 0.0 if alone else STAGE_ONE_SHARE
 
     def run(advance: AdvanceFn) -> Path:
         def report(stage: str, share: float, metrics: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Part of a scene: some of its atoms, by number or in MDTraj's selection language."""
+"""Part of a scene, by number or in MDTraj's selection language, and a scene with its atoms in another order."""
 
 from __future__ import annotations
 
@@ -50,4 +50,21 @@ def part_of(scene: Scene, atoms: IntArray) -> Scene:
         masses_da=scene.masses_da[atoms],
         positions_nm=scene.positions_nm[atoms],
         velocities_nm_ps=None if velocities is None else velocities[atoms],
+    )
+
+
+def reordered(scene: Scene, order: IntArray) -> Scene:
+    """Return the scene whose atom k is this one's atom order[k]; bonds and residues keep their places."""
+    where = np.argsort(order)
+    velocities = scene.velocities_nm_ps
+    return replace(
+        scene,
+        atom_names=tuple(scene.atom_names[i] for i in order),
+        elements=tuple(scene.elements[i] for i in order),
+        residue_of_atom=scene.residue_of_atom[order],
+        bonds=np.sort(where[scene.bonds], axis=1),
+        formal_charges=scene.formal_charges[order],
+        masses_da=scene.masses_da[order],
+        positions_nm=scene.positions_nm[order],
+        velocities_nm_ps=None if velocities is None else velocities[order],
     )

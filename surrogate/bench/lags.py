@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.bench.many_molecules import model_config
+from systems.units import parse_wall_s
 from systems.validity import INVALID, Geometry, check_frames
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 LAGS_PS = (1, 3, 10, 30, 100, 300, 1000)
+CHUNK_FRAMES = 16
 _BINS = 24
 
 
@@ -46,18 +47,16 @@ class Row:
     phi: float
 
 
-def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, steps: int) -> None:
-    """Train one model for all lags; what is there stays."""
-    from surrogate.bench.many_molecules import STAGE_ONE_STEPS
+def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
+    """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
+    from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
     from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
 
-    if out.exists():
+    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
         return
-    first = round(steps * STAGE_ONE_STEPS)
-    settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
-                              time_reversal=True, validate_every_s=300.0, longest_lag_ps=longest_lag_ps)  # fmt: skip
-    config = model_config(graph=False, turn=False)
+    settings = TrainingConfig(budget_s=budget_s, time_reversal=True, longest_lag_ps=longest_lag_ps, compile=compile_)
+    config = LamSlideConfig(approximator=ApproximatorConfig(chunk_frames=CHUNK_FRAMES))
     train_lam_slide(collect_frames(list(references)), out, config, settings, resume=True)
 
 
@@ -136,12 +135,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--train", type=Path, nargs="+", required=True, help="references of one molecule")
     parser.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
     parser.add_argument("--longest-lag-ps", type=float, default=1000.0)
-    parser.add_argument("--steps", type=int, default=1600, help="optimiser steps of the training")
+    parser.add_argument("--budget", default="50min", help="wall time of the training")
+    parser.add_argument("--compile", action="store_true", help="compile the network; needs a C++ compiler")
     parser.add_argument("--starts", type=int, default=128, help="frames that each lag is started from")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
     out = a.folder / "lags.safetensors"
-    train(a.train, out, longest_lag_ps=a.longest_lag_ps, steps=a.steps)
+    train(a.train, out, longest_lag_ps=a.longest_lag_ps, budget_s=parse_wall_s(a.budget), compile_=a.compile)
     weights, test = load_weights(out), collect_frames(list(a.test))
     rows = []
     for lag_ps in LAGS_PS:

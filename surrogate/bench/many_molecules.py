@@ -1,10 +1,11 @@
 """One LaM-SLidE for many molecules against one for each: `python -m surrogate.bench.many_molecules FOLDER`.
 
-References of small alcohols and alkanes are simulated (GAFF2 in vacuum, 300 K, frames 1 ps apart), one model is trained
-on most of them, with `graph` on, and rolled on molecules that it has seen and on ones that it has not; models of one
-molecule alone, trained on that molecule's own reference for a quarter of the steps (over twice as many as each molecule
-gets of the one for all), stand beside it. What is finished in FOLDER is not done again. Frames are held against that
-molecule's own reference, which of an unseen one the model never saw.
+References of small alkanes, alcohols and ethers are simulated (GAFF2 in vacuum, 300 K, frames 1 ps apart), one model
+is trained on most of them, with `graph` on, and rolled on molecules that it has seen and on ones that it has not;
+models of one molecule alone, trained on that molecule's own reference for a quarter of the time (seven times what each
+molecule gets of the one for all), stand beside it. What is finished in FOLDER is not done again. Frames are held
+against that molecule's own reference, which of an unseen one the model never saw. `--latents set` is the paper's code
+of a frame instead of one latent for each atom.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.scene import Scene
+from systems.units import parse_wall_s
 from systems.validity import BOND_20_PERCENT, INVALID, check_frames, geometry_from_frames
 
 if TYPE_CHECKING:
     from surrogate.models.lam_slide.config import LamSlideConfig
 
 FloatArray = npt.NDArray[np.float64]
-TRAINED = ("CC", "CCC", "CCCC", "CCCCC", "CCCCCC", "CC(C)C", "CCCO", "CCCCO", "CC(C)O")
-UNSEEN = ("CCO", "CCCCCO")
+TRAINED = (
+    "CC", "CCC", "CCCC", "CCCCC", "CCCCCC", "CC(C)C", "CC(C)(C)C", "CCC(C)C", "CC(C)C(C)C", "CCC(C)(C)C", "CCC(C)CC",
+    "CO", "CCCO", "CCCCO", "CC(C)O", "CC(C)(C)O", "CC(C)CCO", "OCCO", "OCCCO", "CCC(O)CC", "CC(C)(C)CO", "OCC(C)CO",
+    "COC", "CCOC", "CCOCC", "COCCO", "COCCOC", "CC(C)OC",
+)  # fmt: skip
+UNSEEN = ("CCO", "CCCCCO", "CCCC(C)C", "CC(C)CO", "CCCOC", "OCCCCO")
 # Of these, models of their own are trained as well.
 ALONE = ("CCCO", "CCO")
 OWN_SHARE = 1 / 4
-# Of all steps, those of the autoencoder.
-STAGE_ONE_STEPS = 0.5
 _BINS = 30
 _REPLICAS = 4
-# Bonds that the reference keeps at their length vary by less, by rounding alone.
-_RIGID_NM = 2e-4
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Row:
 def measure(scene: Scene, reference_nm: FloatArray, replicas_nm: Sequence[FloatArray], model: str) -> Row:
     """Hold replicas' frames `(n, n_atoms, 3)` nm each against the reference's."""
     from surrogate.judge.distributions import distance
+    from surrogate.training.lam_slide import RIGID_NM
     from systems.chemistry import rotatable_torsions
     from systems.geometry import torsion
 
@@ -73,7 +76,7 @@ def measure(scene: Scene, reference_nm: FloatArray, replicas_nm: Sequence[FloatA
     flags = check_frames(frames_nm, geometry_from_frames(scene, reference_nm))
     i, j = scene.bonds.T
     bonds = [np.linalg.norm(x[:, i] - x[:, j], axis=-1) for x in (reference_nm, frames_nm)]
-    free = bonds[0].std(0) > _RIGID_NM
+    free = bonds[0].std(0) > RIGID_NM
     quads = rotatable_torsions(scene, rotors=True)
     edges = np.linspace(-np.pi, np.pi, _BINS + 1)
     jsd = []
@@ -100,15 +103,18 @@ def change_per_frame(frames_nm: FloatArray, lag: int = 1) -> float:
     return float(np.sqrt(np.square(distances[lag:] - distances[:-lag]).mean()))
 
 
-def model_config(*, graph: bool, turn: bool) -> LamSlideConfig:
-    """Return a network that a few minutes of one core train."""
-    from surrogate.models.lam_slide.config import ApproximatorConfig, GraphConfig, LamSlideConfig
+def model_config(latents: str) -> LamSlideConfig:
+    """Return a network that an hour of one core trains: with `latents` "atoms" or "set" one for many molecules, with
+    "identifiers" for one."""
+    from surrogate.models.lam_slide.config import LamSlideConfig
 
-    return LamSlideConfig(
-        graph=graph,
-        atoms=GraphConfig(turn=turn),
-        approximator=ApproximatorConfig(chunk_frames=16, width=128, n_layers=4, auxiliary_frames=2),
-    )
+    if latents == "atoms":
+        return LamSlideConfig.of_many({})
+    # A token for each frame is faster than one for each of its atoms, so that there may be more and wider layers.
+    record = {"approximator": {"chunk_frames": 8, "auxiliary_frames": 2, "width": 192, "n_layers": 7}}
+    if latents == "identifiers":
+        return LamSlideConfig.from_dict(record)
+    return LamSlideConfig.of_many({**record, "atoms": {"latents": "set"}})
 
 
 def simulate(smiles: Sequence[str], folder: Path, time_ps: float) -> dict[str, Path]:
@@ -125,15 +131,14 @@ def simulate(smiles: Sequence[str], folder: Path, time_ps: float) -> dict[str, P
     return found
 
 
-def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: LamSlideConfig, steps: int) -> None:
-    """Train on references, one model for all; what is there stays."""
+def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: LamSlideConfig, budget_s: float) -> None:
+    """Train on references, one model for all; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.data.molecules import FrameSets, collect_sets
     from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
 
-    if out.exists():
+    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
         return
-    first = round(steps * STAGE_ONE_STEPS)
     sets = collect_sets(list(references), held=list(held)) if config.graph else FrameSets(
         (collect_frames(list(references)),))  # fmt: skip
     started = time.monotonic()
@@ -145,8 +150,7 @@ def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: L
             )
             sys.stderr.write(f"{out.stem} {stage} {100 * share:.0f} % {time.monotonic() - started:.0f} s: {shown}\n")
 
-    settings = TrainingConfig(stage_one_steps=first, stage_two_steps=steps - first, stage_two_batch=32,
-                              time_reversal=True, validate_every_s=300.0)  # fmt: skip
+    settings = TrainingConfig(budget_s=budget_s, stage_two_batch=32, time_reversal=True, validate_every_s=300.0)
     train_lam_slide(sets, out, config, settings, resume=True, progress=tell)
 
 
@@ -170,13 +174,12 @@ def roll(reference: Path, weights: Path, n_frames: int) -> tuple[Scene, FloatArr
     return scene, truth, frames
 
 
-def run(folder: Path, *, steps: int, time_ps: float, n_frames: int, turn: bool) -> list[Row]:
+def run(folder: Path, *, budget_s: float, time_ps: float, n_frames: int, latents: str) -> list[Row]:
     """Simulate, train, roll and measure."""
     folder.mkdir(parents=True, exist_ok=True)
     references = simulate([*TRAINED, *UNSEEN], folder, time_ps)
-    many = folder / ("many-turned.safetensors" if turn else "many.safetensors")
-    train([references[m] for m in TRAINED], [references[m] for m in UNSEEN], many, model_config(graph=True, turn=turn),
-          steps)  # fmt: skip
+    many = folder / f"{latents}.safetensors"
+    train([references[m] for m in TRAINED], [references[m] for m in UNSEEN], many, model_config(latents), budget_s)
     rows = []
     for text, reference in references.items():
         seen = "seen" if text in TRAINED else "unseen"
@@ -186,7 +189,7 @@ def run(folder: Path, *, steps: int, time_ps: float, n_frames: int, turn: bool) 
         rows.append(replace(measure(scene, truth, frames, f"one for all, {seen}"), molecule=text))
         if text in ALONE:
             own = folder / f"own-{text}.safetensors"
-            train([reference], [], own, model_config(graph=False, turn=False), round(steps * OWN_SHARE))
+            train([reference], [], own, model_config("identifiers"), budget_s * OWN_SHARE)
             scene, truth, frames = roll(reference, own, n_frames)
             rows.append(replace(measure(scene, truth, frames, "its own"), molecule=text))
     return rows
@@ -210,16 +213,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse, run, print the table and keep it in FOLDER."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=2520, help="optimiser steps of the model for all")
+    parser.add_argument("--budget", default="70min", help="wall time of the training of the model for all")
     parser.add_argument("--time-ps", type=float, default=3000.0, help="of each reference")
     parser.add_argument("--frames", type=int, default=1200, help="of each molecule, in four replicas")
-    parser.add_argument("--turn", action="store_true", help="train with windows turned at random")
+    parser.add_argument("--latents", choices=("atoms", "set"), default="atoms")
     a = parser.parse_args(arguments)
-    rows = run(a.folder, steps=a.steps, time_ps=a.time_ps, n_frames=a.frames, turn=a.turn)
+    budget_s = parse_wall_s(a.budget)
+    rows = run(a.folder, budget_s=budget_s, time_ps=a.time_ps, n_frames=a.frames, latents=a.latents)
     record: dict[str, Any] = {"settings": {**vars(a), "folder": str(a.folder)}, "rows": [asdict(row) for row in rows]}
-    name = "many-turned" if a.turn else "many"
-    (a.folder / f"{name}.json").write_text(json.dumps(record, indent=1))
-    (a.folder / f"{name}.md").write_text(table(rows) + "\n")
+    (a.folder / f"{a.latents}.json").write_text(json.dumps(record, indent=1))
+    (a.folder / f"{a.latents}.md").write_text(table(rows) + "\n")
     sys.stdout.write(table(rows) + "\n")
 
 

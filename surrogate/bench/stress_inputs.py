@@ -18,7 +18,7 @@ from systems.errors import OutOfDomainError, SurromdError
 from systems.pdb_text import pdb_text
 from systems.prepare import prepare
 from systems.scene import Scene
-from systems.selection import part_of
+from systems.selection import part_of, reordered
 from systems.validity import Geometry
 
 if TYPE_CHECKING:
@@ -41,21 +41,6 @@ def moved_scenes(scene: Scene, seed: int) -> Iterator[tuple[str, Scene, FloatArr
     for far in (1.0, 10.0, 1e6):
         shift = far * direction
         yield f"translated by {far:g} nm", scene.with_positions(scene.positions_nm + shift), still, shift
-
-
-def permuted(scene: Scene, order: npt.NDArray[np.int64]) -> Scene:
-    """Return the scene whose atom k is this one's atom order[k], residues in runs left as they are numbered."""
-    where = np.argsort(order)
-    return replace(
-        scene,
-        atom_names=tuple(scene.atom_names[i] for i in order),
-        elements=tuple(scene.elements[i] for i in order),
-        residue_of_atom=scene.residue_of_atom[order],
-        bonds=np.sort(where[scene.bonds], axis=1),
-        formal_charges=scene.formal_charges[order],
-        masses_da=scene.masses_da[order],
-        positions_nm=scene.positions_nm[order],
-    )
 
 
 def first_chunk(scene: Scene, weights: Weights, sampler: ChunkSampler, *, force: bool = False, rows: int = 1,
@@ -87,7 +72,7 @@ def measure_invariance(weights: Weights, *, precision: str, seed: int = 0) -> li
     for name, error in _moved_in_files(scene, weights, sampler):
         rows.append({"input": name, "precision": precision, "deviation_nm": error, "of_size": error / size})
     order = np.random.default_rng(seed).permutation(scene.n_atoms)
-    chunk = first_chunk(permuted(scene, order), weights, sampler)
+    chunk = first_chunk(reordered(scene, order), weights, sampler)
     error = float(np.abs(chunk - plain[:, :, order]).max())
     rows.append({"input": "atoms permuted", "precision": precision, "deviation_nm": error, "of_size": error / size})
     return rows

@@ -46,7 +46,8 @@ def gelu(x: Tensor) -> Tensor:
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `mask` True where allowed.
+    """Softmax attention: queries `(..., n, head_dim)`, keys and values `(..., m, head_dim)`; `mask` True where allowed,
+    or numbers that are added to the scores.
 
     On a CPU the plain products are preferred for short sequences, as in a chunk of 32 frames: torch's fused kernel was
     the largest item in a profile of training.
@@ -56,7 +57,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
     q, k, v = q.contiguous(), k.contiguous(), v.contiguous()
     scores = (q @ k.transpose(-1, -2)) * q.shape[-1] ** -0.5
     if mask is not None:
-        scores = scores.masked_fill(~mask, -math.inf)
+        scores = scores.masked_fill(~mask, -math.inf) if mask.dtype == torch.bool else scores + mask
     # Rows that are no multiple of 32 take five times as long in bf16.
     return torch.softmax(scores, -1, dtype=torch.float32).to(v.dtype) @ v
 
@@ -95,11 +96,13 @@ class ParallelBlock(nn.Module):
         self.offset = nn.Parameter(torch.zeros(3, width))
 
     def forward(
-        self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None, past: KeysValues | None = None
-    ) -> tuple[Tensor, KeysValues]:
+        self, x: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor] | None, past: KeysValues | None = None,
+        bias: Tensor | None = None,
+    ) -> tuple[Tensor, KeysValues]:  # fmt: skip
         """`x` (batch, groups, length, width), attention over length; `modulation` (batch, 3, width).
 
-        `past`: keys and values that stand before those of `x`, as an earlier call returned them.
+        `past`: keys and values that stand before those of `x`, as an earlier call returned them. `bias` (n_heads,
+        length, length) is added to the scores.
         """
         shift, scale, gate = (modulation + self.offset)[:, None, None].unbind(-2)
         h = torch.addcmul(shift, F.layer_norm(x, (self.width,)).to(shift.dtype), 1.0 + scale)
@@ -113,7 +116,7 @@ class ParallelBlock(nn.Module):
         v = v.reshape(batch * groups, length, self.n_heads, -1).transpose(1, 2)
         if past is not None:
             k, v = (torch.cat([old, new], dim=2) for old, new in zip(past, (k, v), strict=True))
-        attended = attend(q, k, v)
+        attended = attend(q, k, v, None if bias is None else bias.to(v.dtype))
         attended = attended.transpose(1, 2).reshape(batch, groups, length, self.width)
         update = self.attention_out(attended) + self.mlp_out(gelu(hidden))
         return x + gate * update, (k, v)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.data.poses import in_standard_pose
+from surrogate.data.poses import in_standard_pose, order_along_axis
 from systems.chemistry import ring_bonds, rotatable_torsions
 from systems.errors import OutOfDomainError
 from systems.matching import match_atoms
 from systems.scene import Scene
+from systems.selection import reordered
 from systems.symmetry import local_handedness
 from systems.validity import Geometry, geometry_from_scene
 
@@ -48,9 +49,10 @@ def cover(scene: Scene, domain: TrainingDomain) -> tuple[TrainingDomain, tuple[D
     """Return the domain of one molecule that a scene is rolled in, and how the scene leaves all that was trained on.
 
     Of weights for one molecule it is theirs. Else it is that of the molecule trained on that the scene is; of an unseen
-    molecule it is made of the scene itself: its positions in their standard pose are the template, and its bonds and
-    handedness, not a reference, say what a valid frame is. Such a molecule must be no larger than those trained on, and
-    have no element, bond type, atom environment, charge, stereocentre or torsion environment that they do not have.
+    molecule it is made of the scene itself: its positions in their standard pose are the template, its atoms in their
+    order along the longest axis, so that their numbering plays no part, and its bonds and handedness, not a reference,
+    say what a valid frame is. Such a molecule must be no larger than those trained on, and have no element, bond type,
+    atom environment, charge, stereocentre or torsion environment that they do not have.
     """
     if not domain.transferable:
         return domain, ()
@@ -77,7 +79,7 @@ def cover(scene: Scene, domain: TrainingDomain) -> tuple[TrainingDomain, tuple[D
         key: value if all(member.conditions.get(key) == value for member in domain.members) else None
         for key, value in domain.conditions.items()
     }
-    posed = in_standard_pose(scene)
+    posed = reordered(in_standard_pose(scene), order_along_axis(scene))
     geometry = geometry_from_scene(posed).to_dict()
     own = replace(domain, scene=posed, conditions=conditions, geometry=geometry, limits=None, further=(),
                   transferable=False)  # fmt: skip

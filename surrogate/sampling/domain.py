@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.data.poses import order_along_axis
 from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, cover, torsion_environments
 from surrogate.sampling.lags import at_lag, choose_lag
 from systems.chemistry import bonded_graph
@@ -108,7 +109,7 @@ def _compare(scene: Scene, domain: TrainingDomain, temperature_k: float | None) 
     seen = not domain.transferable or any(own.scene is member.scene for member in domain.members)
     found, order = list(beyond), np.arange(0)
     if not seen:
-        order = np.arange(scene.n_atoms)
+        order = order_along_axis(scene)
     elif not beyond:
         order, found = _compare_molecules(scene, own.scene)
         if not any(not d.forcible for d in found):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
@@ -31,6 +32,9 @@ from systems.units import whole_steps
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
 LATENT_CACHE_BYTES = 2_000_000_000
+# Bonds that a reference holds rigid vary by less, by rounding alone; others by ten times as much.
+RIGID_NM = 2e-4
+_LOOKED_AT = 1000
 # Share of the whole budget that stage one gets.
 STAGE_ONE_SHARE = 0.2
 
@@ -64,8 +68,9 @@ class TrainingConfig:
     # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
     longest_lag_ps: float | None = None
 
-    def stages(self) -> tuple[StageConfig, StageConfig]:
-        share = STAGE_ONE_SHARE
+    def stages(self, *, with_autoencoder: bool = True) -> tuple[StageConfig, StageConfig]:
+        """Return both stages; stage two gets the whole budget where there is no autoencoder to train."""
+        share = STAGE_ONE_SHARE if with_autoencoder else 0.0
         budget_one = None if self.budget_s is None else self.budget_s * share
         budget_two = None if self.budget_s is None else self.budget_s * (1 - share)
         common: dict[str, Any] = {"bf16": self.bf16, "validate_every_s": self.validate_every_s}
@@ -100,6 +105,8 @@ def train_lam_slide(
     sets = frames if isinstance(frames, FrameSets) else FrameSets((frames,))
     first = sets.trained[0]
     model_config = _settle(sets, model_config, config)
+    if start is None and model_config.graph and all(holds_hydrogens(frames) for frames in sets.trained):
+        model_config = replace(model_config, atoms=replace(model_config.atoms, rigid_hydrogens=True))
     length = model_config.approximator.chunk_frames
     told_of = model_config.approximator.rare_kinds
     kinds = window_kinds(first, told_of, length) if told_of else None
@@ -114,12 +121,15 @@ def train_lam_slide(
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
     if start is None:
-        one, two = config.stages()
-        spent_one = _stage_one(model, subjects, unseen, one, states[0], log_path, resume, progress)
+        one, two = config.stages(with_autoencoder=model.first_stage is not None)
+        spent_one = 0.0
+        if model.first_stage is not None:
+            spent_one = _stage_one(model, model.first_stage, subjects, unseen, one, states[0], log_path, resume,
+                                   progress)  # fmt: skip
         normalise_latents(model, subjects, config.seed)
     else:
         _check_start(start, first, model_config)
-        two = replace(config.stages()[1], budget_s=config.budget_s)
+        two = config.stages(with_autoencoder=False)[1]
         spent_one = 0.0
         _take_over(model, start)
     if kinds is not None and (start is None or not start.model.config.approximator.rare_kinds):
@@ -167,6 +177,14 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
     return replace(model_config, approximator=told)
 
 
+def holds_hydrogens(frames: TrainingFrames) -> bool:
+    """Return whether bonds to hydrogen keep their length in these frames, as a reference with constraints has them."""
+    idx = np.linspace(0, frames.n_frames - 1, min(_LOOKED_AT, frames.n_frames)).astype(int)
+    x, is_hydrogen = frames.positions_nm(idx), np.array(frames.scene.elements) == "H"
+    i, j = frames.scene.bonds[is_hydrogen[frames.scene.bonds].any(axis=1)].T
+    return bool((np.linalg.norm(x[:, i] - x[:, j], axis=-1).std(axis=0) < RIGID_NM).all())
+
+
 def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
     frames, lags = sets.trained[0], model_config.approximator.lag_range_ps
@@ -184,8 +202,9 @@ def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
     return strides
 
 
-def _stage_one(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Subject], stage: StageConfig, state: Path,
-               log: Path, resume: bool, progress: ProgressFn | None) -> float:  # fmt: skip
+def _stage_one(model: LamSlide, trained: nn.Module, subjects: Sequence[Subject], unseen: Sequence[Subject],
+               stage: StageConfig, state: Path, log: Path, resume: bool,
+               progress: ProgressFn | None) -> float:  # fmt: skip
     starts = [subject.frames.window_starts(1, validation=False) for subject in subjects]
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -205,7 +224,7 @@ def _stage_one(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
             if some
         }
 
-    return run_stage(model.first_stage, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+    return run_stage(trained, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
                      device=model.latent_mean.device, progress=progress)  # fmt: skip
 
 
@@ -229,13 +248,14 @@ def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
         wide = [StrideSampler.of(subject.frames, length, strides) for subject in subjects]
     else:
         plain = [window_sampler(subject.frames, length, config.rare_draws, kinds) for subject in subjects]
-    model.first_stage.requires_grad_(False)
+    if model.first_stage is not None:
+        model.first_stage.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
-    ae, turned = model.config.autoencoder, model.config.graph and model.config.atoms.turn
-    n_frames = sum(subject.frames.n_frames for subject in subjects)
-    if model.canonical and not turned and 4 * n_frames * ae.n_latents * ae.latent_dim <= LATENT_CACHE_BYTES:
+    turned = model.config.graph and model.config.atoms.turn
+    numbers = sum(subject.frames.n_frames * math.prod(model.noise_shape(subject.n_atoms)) for subject in subjects)
+    if model.canonical and not turned and 4 * numbers // length <= LATENT_CACHE_BYTES:
         for subject in subjects:
             subject.keep_latents(model)
 
@@ -286,7 +306,7 @@ def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
             shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
             next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
 
-    return run_stage(model.approximator, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+    return run_stage(model.second_stage, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
                      device=device, progress=progress, on_save=on_save)  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.atoms import Atoms
+from surrogate.models.lam_slide.atoms import Atoms, Told
 from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
@@ -78,14 +78,14 @@ def flow_loss(
     importance: Tensor | None = None,
     kind: Tensor | None = None,
     atoms: Atoms | None = None,
-    told: Tensor | None = None,
+    told: Told | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames (with
     `loss_on_given` on all), plus decoded position and distance.
 
     `importance` (b,): what each window counts (data.rarity); None is one each. With the `kind` (b,) of each window it
     counts in the cross entropy of the kinds alone: the network is told the kind, and within a kind draws are plain.
-    `atoms` and `told` (b, width): see `LamSlide.atoms_of` and `LamSlide.told`.
+    `atoms` and `told`: see `LamSlide.atoms_of` and `LamSlide.told`.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the

@@ -74,7 +74,6 @@ class Subject:
         ]
         self.latents = torch.cat(parts).to(self.molecule.elements.device)
 
-    @torch.no_grad()
     def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> tuple[Tensor, Atoms | None]:
         """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), and what else the flow is told
         of the molecule, in each window's pose."""
@@ -82,7 +81,8 @@ class Subject:
             return self.latents[idx.to(self.latents.device)], model.atoms_of(self.molecule)
         turns = self.poses(model, len(idx), generator)
         x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
-        return model.encode(x, self.molecule.elements, atoms), atoms
+        with torch.no_grad():
+            return model.encode(x, self.molecule.elements, atoms), atoms
 
 
 def pick(subjects: Sequence[Subject], generator: torch.Generator) -> int:
@@ -94,7 +94,8 @@ def pick(subjects: Sequence[Subject], generator: torch.Generator) -> int:
 
 @torch.no_grad()
 def normalise_latents(model: LamSlide, subjects: Sequence[Subject], seed: int, n_frames: int = 20_000) -> None:
-    """Measure the latents' means and common scale on training frames, as many of each molecule, and set them."""
+    """Measure the latents' means and common scale on training frames, as many of each molecule, and set them. Latents
+    that are atoms have no mean: the template is there already."""
     model.latent_mean.zero_()
     model.latent_scale.fill_(1.0)
     rng, found = np.random.default_rng(seed), []
@@ -102,6 +103,10 @@ def normalise_latents(model: LamSlide, subjects: Sequence[Subject], seed: int, n
         starts = subject.frames.window_starts(1, validation=False)
         idx = rng.choice(len(starts), size=min(n_frames // len(subjects), len(starts)), replace=False)
         found.append(subject.encode(model, starts[np.sort(idx)]))
+    if model.config.latents_are_atoms:
+        z = torch.cat([latents.flatten() for latents in found])
+        model.latent_scale.copy_(z.square().mean().sqrt())
+        return
     z = torch.cat(found)
     model.latent_mean.copy_(z.mean(0))
     model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())

@@ -1,4 +1,8 @@
-"""Stage two: the latent flow model, transformer layers alternating over latents and time (Algorithms 4 and 5)."""
+"""Stage two: the latent flow model, transformer layers alternating over latents and time (Algorithms 4 and 5).
+
+Where latents are atoms (`latents = "atoms"`), any number of them, each is known by its tag instead of its place among
+the latents, and attention among the atoms of a frame by how many bonds lie between two.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.atoms import Conditioning
+from surrogate.models.lam_slide.atoms import MAX_HOPS, Conditioning, Told
 from surrogate.models.lam_slide.config import ApproximatorConfig
 from surrogate.models.layers import KeysValues, ParallelBlock, TimeEmbedding, rotary_angles
 from systems.errors import InputError
@@ -25,17 +29,22 @@ class LatentLayer(nn.Module):
     """Algorithm 5: one parallel block along the latent dimension, one along time. With a single latent vector there is
     nothing to attend to along the first, and its block is left out."""
 
-    def __init__(self, width: int, n_heads: int, n_latents: int) -> None:
+    def __init__(self, width: int, n_heads: int, n_latents: int, *, of_atoms: bool = False) -> None:
         super().__init__()
-        self.spatial = ParallelBlock(width, n_heads) if n_latents > 1 else None
+        self.spatial = ParallelBlock(width, n_heads) if n_latents > 1 or of_atoms else None
         self.temporal = ParallelBlock(width, n_heads)
+        self.of_hops = nn.Embedding(MAX_HOPS + 1, n_heads) if of_atoms else None
 
     def forward(
-        self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope, past: KeysValues | None = None
-    ) -> tuple[Tensor, KeysValues]:
+        self, o: Tensor, modulation: Tensor, rope_latent: Rope, rope_time: Rope, past: KeysValues | None = None,
+        told: Told | None = None,
+    ) -> tuple[Tensor, KeysValues]:  # fmt: skip
         """`o` (b, L, T, width), `modulation` (b, 6, width): three for each block; `past` of earlier frames."""
         if self.spatial is not None:
-            o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope_latent)[0].transpose(1, 2)
+            near = None if told is None or told.hops is None else told.hops
+            bias = None if self.of_hops is None or near is None else self.of_hops(near).permute(2, 0, 1)
+            rope = rope_latent if bias is None else None
+            o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope, bias=bias)[0].transpose(1, 2)
         return self.temporal(o, modulation[:, 3:], rope_time, past)
 
 
@@ -47,19 +56,26 @@ class Approximator(nn.Module):
     cos_latent: Tensor
     sin_latent: Tensor
 
-    def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int, tag_dim: int = 0) -> None:
-        """`tag_dim`: of the tags of atoms, where the network is told of the molecule."""
+    def __init__(self, config: ApproximatorConfig, n_latents: int, latent_dim: int, tag_dim: int = 0, *,
+                 of_atoms: bool = False) -> None:  # fmt: skip
+        """`tag_dim`: of the tags of atoms, where the network is told of the molecule. With `of_atoms` latents are atoms
+        and each is a token: `n_latents` is one."""
         super().__init__()
         self.config = c = config
-        if n_latents % c.latents_per_token:
-            raise InputError(f"latents_per_token = {c.latents_per_token} does not divide {n_latents} latents.")
-        n_latents, latent_dim = n_latents // c.latents_per_token, latent_dim * c.latents_per_token
+        self.per_token = 1 if of_atoms else c.latents_per_token
+        if n_latents % self.per_token:
+            raise InputError(f"latents_per_token = {self.per_token} does not divide {n_latents} latents.")
+        n_latents, latent_dim = n_latents // self.per_token, latent_dim * self.per_token
         self.embed_noisy = nn.Linear(latent_dim, c.width)
         self.embed_conditioning = nn.Linear(latent_dim, c.width)
         self.embed_mask = nn.Embedding(2, c.width)
-        self.embed_latent = nn.Parameter(torch.randn(n_latents, c.width) * 0.02)
+        self.of_tag = nn.Linear(tag_dim, c.width) if of_atoms else None
+        if not of_atoms:
+            self.embed_latent = nn.Parameter(torch.randn(n_latents, c.width) * 0.02)
         self.embed_time = TimeEmbedding(c.width)
-        self.layers = nn.ModuleList(LatentLayer(c.width, c.n_heads, n_latents) for _ in range(c.n_layers))
+        self.layers = nn.ModuleList(
+            LatentLayer(c.width, c.n_heads, n_latents, of_atoms=of_atoms) for _ in range(c.n_layers)
+        )
         self.modulation = nn.Linear(c.width, 6 * c.width)
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
         self.final = nn.Linear(c.width, latent_dim)
@@ -107,36 +123,38 @@ class Approximator(nn.Module):
 
     def forward(
         self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, kind: Tensor | None = None,
-        told: Tensor | None = None,
+        told: Told | None = None,
     ) -> Tensor:  # fmt: skip
         """Return the predicted data `(b, T, L, dim)`.
 
         `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
         first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
         `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds; `told`
-        (b, width): molecule and lag, as `conditioning` has them, for one that knows those.
+        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds; `told`:
+        molecule and lag, for one that knows those.
         """
         c = self.config
         of_kind = None if kind is None else self.embed_kind(kind)[:, None, None, :]
-        time = self.embed_time(tau) if told is None else self.embed_time(tau) + told
+        time = self.embed_time(tau) if told is None else self.embed_time(tau) + told.whole
         if c.clean_conditioning:
             known = self.remember(conditioning, told) if memory is None else memory
             n_known = conditioning.shape[1]
-            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, time, known, n_known, of_kind))
+            found = self._denoise(
+                o[:, n_known:], tau, lambda x: self._network_after(x, time, known, n_known, of_kind, told)
+            )
             return torch.cat([conditioning.to(found.dtype), found], dim=1)
-        return self._denoise(o, tau, lambda x: self._network(x, time, conditioning, of_kind))
+        return self._denoise(o, tau, lambda x: self._network(x, time, conditioning, of_kind, told))
 
-    def remember(self, conditioning: Tensor, told: Tensor | None = None) -> Memory:
+    def remember(self, conditioning: Tensor, told: Told | None = None) -> Memory:
         """Return keys and values of clean frames `(b, n_conditioning, L, dim)`, which see each other alone and no flow
         time but that of the data (tau = 1)."""
-        h = self.embed_conditioning(self._tokens(conditioning)) + self.embed_mask.weight[1] + self.embed_latent
+        h = self.embed_conditioning(self._tokens(conditioning)) + self.embed_mask.weight[1] + self._places(told)
         time = self.embed_time(torch.ones(len(h), device=h.device))
-        modulation, _ = self._modulations(time if told is None else time + told)
+        modulation, _ = self._modulations(time if told is None else time + told.whole)
         memory: Memory = []
         h = h.transpose(1, 2)
         for layer in self.layers:
-            h, kept = layer(h, modulation, *self._ropes(0, conditioning.shape[1]))
+            h, kept = layer(h, modulation, *self._ropes(0, conditioning.shape[1]), told=told)
             memory.append(kept)
         return memory
 
@@ -147,7 +165,8 @@ class Approximator(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
         return skip * o + out * network(o * scale_in)
 
-    def _network(self, o: Tensor, time: Tensor, conditioning: Tensor, of_kind: Tensor | None) -> Tensor:
+    def _network(self, o: Tensor, time: Tensor, conditioning: Tensor, of_kind: Tensor | None,
+                 told: Told | None) -> Tensor:  # fmt: skip
         shape = o.shape
         o, conditioning = self._tokens(o), self._tokens(conditioning)
         n_known, n_frames = conditioning.shape[1], o.shape[1]
@@ -156,29 +175,38 @@ class Approximator(nn.Module):
         padded = F.pad(conditioning, (0, 0, 0, 0, 0, n_frames - n_known))
         noisy = torch.where(known[None, :, None, None] == 1, 0.0, o)
         h = self.embed_noisy(noisy) + self.embed_conditioning(padded)
-        h = h + self.embed_mask(known)[None, :, None, :] + self.embed_latent
+        h = h + self.embed_mask(known)[None, :, None, :] + self._places(told)
         h = h if of_kind is None else h + of_kind
-        return self._transform(h, time, 0, [None] * len(self.layers)).reshape(shape)
+        return self._transform(h, time, 0, [None] * len(self.layers), told).reshape(shape)
 
-    def _network_after(self, o: Tensor, time: Tensor, memory: Memory, n_known: int, of_kind: Tensor | None) -> Tensor:
-        h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
+    def _network_after(self, o: Tensor, time: Tensor, memory: Memory, n_known: int, of_kind: Tensor | None,
+                       told: Told | None) -> Tensor:  # fmt: skip
+        h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self._places(told)
         h = h if of_kind is None else h + of_kind
-        return self._transform(h, time, n_known, memory).reshape(o.shape)
+        return self._transform(h, time, n_known, memory, told).reshape(o.shape)
 
-    def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:
+    def _places(self, told: Told | None) -> Tensor:
+        """Return what tells a frame's latents apart, `(L, width)`, or of atoms `(b, 1, L, width)`."""
+        if self.of_tag is None:
+            return self.embed_latent
+        if told is None or told.tags is None:
+            raise InputError("this model needs to be told of the molecule's atoms.")
+        return self.of_tag(told.tags)[:, None]
+
+    def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[KeysValues | None],
+                   told: Told | None) -> Tensor:  # fmt: skip
         """Embedded frames `(b, T, L, width)`, of which the first has the place `first`, through all layers."""
         modulation, final_modulation = self._modulations(time)
         ropes = self._ropes(first, h.shape[1])
         h = h.transpose(1, 2)
         for layer, before in zip(self.layers, past, strict=True):
-            h, _ = layer(h, modulation, *ropes, before)
+            h, _ = layer(h, modulation, *ropes, before, told)
         shift, scale = final_modulation[:, None, None, :].chunk(2, dim=-1)
         h = F.layer_norm(h.transpose(1, 2), h.shape[-1:]) * (1.0 + scale) + shift
         return self.final(h).float()
 
     def _tokens(self, o: Tensor) -> Tensor:
-        per_token = self.config.latents_per_token
-        return o if per_token == 1 else o.unflatten(2, (-1, per_token)).flatten(-2)
+        return o if self.per_token == 1 else o.unflatten(2, (-1, self.per_token)).flatten(-2)
 
     def _modulations(self, time: Tensor) -> tuple[Tensor, Tensor]:
         """From the embedded flow time `(b, width)`, molecule and lag included where the network knows them."""

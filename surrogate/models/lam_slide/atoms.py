@@ -22,15 +22,19 @@ if TYPE_CHECKING:
     from surrogate.models.lam_slide.config import GraphConfig
 
 _MAX_ATOMIC_NUMBER = 54
+# Atoms further apart along bonds are alike far.
+MAX_HOPS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Atoms:
-    """What encoder and decoder are told of atoms: `tags` (b, n_atoms, dim) and `template` (b, n_atoms, 3), where each
-    is at rest, in scaled units; b is the number of molecules' poses, or 1 for all rows alike."""
+    """What encoder and decoder are told of atoms: `tags` (b, n_atoms, dim), `template` (b, n_atoms, 3), where each is
+    at rest, in scaled units, and `hops` (n_atoms, n_atoms), bonds between two, at most MAX_HOPS; b is the number of
+    molecules' poses, or 1 for all rows alike."""
 
     tags: Tensor
     template: Tensor
+    hops: Tensor
 
     def spread(self, lead: torch.Size) -> Atoms:
         """Return one row for each of the leading dimensions `lead`, of which the first is b (or anything where b is
@@ -40,7 +44,50 @@ class Atoms:
             wide = x.reshape(x.shape[0], *([1] * (len(lead) - 1)), *x.shape[1:])
             return wide.expand(*lead, *x.shape[1:]).reshape(-1, *x.shape[1:])
 
-        return Atoms(rows(self.tags), rows(self.template))
+        return Atoms(rows(self.tags), rows(self.template), self.hops)
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What the latent flow is told beside the frames: `whole` (b, width) of molecule and lag, and, where latents are
+    atoms, `tags` (b, n_atoms, dim) and `hops` (n_atoms, n_atoms) of these."""
+
+    whole: Tensor
+    tags: Tensor | None = None
+    hops: Tensor | None = None
+
+    def rows(self, which: Tensor) -> Told:
+        """Return what is told of the rows `which`."""
+        return Told(self.whole[which], None if self.tags is None else self.tags[which], self.hops)
+
+
+def bonds_between(bonds: Tensor, n_atoms: int) -> Tensor:
+    """Return how many bonds of `(n_bonds, 2)` lie between two atoms, `(n_atoms, n_atoms)` int64, at most MAX_HOPS."""
+    near = torch.eye(n_atoms, device=bonds.device)
+    step = near.clone()
+    step[bonds[:, 0], bonds[:, 1]] = step[bonds[:, 1], bonds[:, 0]] = 1.0
+    hops = torch.full((n_atoms, n_atoms), MAX_HOPS, dtype=torch.int64, device=bonds.device)
+    for n in range(MAX_HOPS):
+        hops[(near > 0) & (hops == MAX_HOPS)] = n
+        near = near @ step
+    return hops
+
+
+def hold_hydrogens(frames_nm: Tensor, molecule: Molecule) -> Tensor:
+    """Return frames `(..., n_atoms, 3)` nm with each hydrogen of a single bond moved along it to the template's length.
+
+    Where it lies on its neighbour, so that there is no direction, it stays.
+    """
+    assert molecule.atoms is not None
+    ends = torch.cat([molecule.bonds, molecule.bonds.flip(1)])
+    single = torch.bincount(ends[:, 0], minlength=molecule.n_atoms) == 1
+    ends = ends[single[ends[:, 0]] & (molecule.elements[ends[:, 0]] == 1)]
+    hydrogen, parent = ends.T
+    template = molecule.atoms.template_nm
+    length = (template[hydrogen] - template[parent]).norm(dim=-1, keepdim=True)
+    bond = frames_nm[..., hydrogen, :] - frames_nm[..., parent, :]
+    held = torch.where(bond == 0.0, bond, F.normalize(bond, dim=-1) * length)
+    return frames_nm.index_copy(-2, hydrogen, frames_nm[..., parent, :] + held)
 
 
 class MessageRound(nn.Module):

@@ -96,6 +96,22 @@ class Autoencoder(nn.Module):
             return Decoded(self.to_position(h.float()), logits)
 
 
+class AtomCode(nn.Module):
+    """No stage one: a frame's latents are its atoms' displacements from the template, and come back as they are."""
+
+    def n_entities(self, n_atoms: int) -> int:
+        return n_atoms
+
+    def types(self, elements: Tensor) -> Tensor:
+        return elements
+
+    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
+        return x
+
+    def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
+        return Decoded(latents, None)
+
+
 def pair_distances(x: Tensor) -> Tensor:
     """Return distances `(..., n, n)` (eq. 15), differentiable on the diagonal."""
     difference = x.unsqueeze(-2) - x.unsqueeze(-3)

@@ -83,12 +83,17 @@ class ApproximatorConfig:
 @dataclass(frozen=True)
 class GraphConfig:
     """Atoms known by the covalent graph (`LamSlideConfig.graph`). `turn`: training turns each window at random, its
-    template with it; else every molecule keeps the pose that its own shape decides (data.poses)."""
+    template with it; else every molecule keeps the pose that its own shape decides (data.poses). `latents`: what codes
+    a frame, a 'set' of latent vectors from an autoencoder, as in the paper, or the 'atoms' themselves, one token each:
+    slower, but nothing is lost of a molecule that no autoencoder saw. `rigid_hydrogens`: chunks have bonds to hydrogen
+    of the template's length; training sets it where the references hold them rigid."""
 
     width: int = 96
     n_rounds: int = 4
     n_octaves: int = 3
     turn: bool = False
+    latents: str = "set"
+    rigid_hydrogens: bool = False
 
 
 @dataclass(frozen=True)
@@ -117,18 +122,34 @@ class LamSlideConfig:
     residues: ResidueLayout | None = None
 
     def __post_init__(self) -> None:
-        for name, known in (("hydrogens", ("modelled", "placed")), ("entities", ("atom", "residue"))):
-            if getattr(self, name) not in known:
-                raise InputError(f"{name} = {getattr(self, name)!r} is unknown; choose {' or '.join(known)}.")
+        for name, value, known in (("hydrogens", self.hydrogens, ("modelled", "placed")),
+                                   ("entities", self.entities, ("atom", "residue")),
+                                   ("atoms.latents", self.atoms.latents, ("set", "atoms"))):  # fmt: skip
+            if value not in known:
+                raise InputError(f"{name} = {value!r} is unknown; choose {' or '.join(known)}.")
         if self.graph and not self.canonical:
             raise InputError("graph = true lays frames on each molecule's template; leave canonical = true.")
         if self.graph and self.on_heavy_atoms:
             raise InputError("graph = true knows all atoms of many molecules; hydrogens are placed for one alone.")
 
     @property
+    def latents_are_atoms(self) -> bool:
+        """Whether every atom is a latent of its own; without the graph, atoms are nothing to the flow."""
+        return self.graph and self.atoms.latents == "atoms"
+
+    @property
     def on_heavy_atoms(self) -> bool:
         """Whether the network sees heavy atoms alone."""
         return self.hydrogens == "placed" or self.entities == "residue"
+
+    @staticmethod
+    def of_many(record: dict[str, Any]) -> LamSlideConfig:
+        """Return the configuration of a model for many molecules: `record` over sizes that suit latents that are atoms,
+        or, where it asks for a set of them, over the sizes of one molecule. Raises InputError as `from_dict` does."""
+        atoms = {"latents": "atoms", **record.get("atoms", {})}
+        sizes = {"chunk_frames": 8, "width": 128, "n_layers": 5, "auxiliary_frames": 2}
+        approximator = {**(sizes if atoms["latents"] == "atoms" else {}), **record.get("approximator", {})}
+        return LamSlideConfig.from_dict({**record, "graph": True, "atoms": atoms, "approximator": approximator})
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

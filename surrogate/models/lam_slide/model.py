@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.approximator import Approximator
-from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms
-from surrogate.models.lam_slide.autoencoder import Autoencoder
+from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms, Told, bonds_between, hold_hydrogens
+from surrogate.models.lam_slide.autoencoder import AtomCode, Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.further_noise import REDRAWS, generators
 from surrogate.models.lam_slide.kinds import kinds_of_windows
@@ -43,17 +43,23 @@ class LamSlide(Surrogate):
         self.config = config
         self.solvers = flow.solvers_for(config.approximator.interpolant)
         ae = config.autoencoder
-        self.autoencoder = (
-            Autoencoder(ae)
-            if config.residues is None
-            else ResidueAutoencoder(ae, config.residues, config.position_scale_nm)
-        )
         self.atom_encoder = AtomEncoder(config.atoms, ae.identifier_dim) if config.graph else None
         tag_dim = ae.identifier_dim if config.graph else 0
-        self.approximator = Approximator(config.approximator, ae.n_latents, ae.latent_dim, tag_dim)
+        # Of latents that are atoms: of each of them.
+        n_latents, latent_dim = (1, 3) if config.latents_are_atoms else (ae.n_latents, ae.latent_dim)
+        self.autoencoder: Autoencoder | AtomCode
+        if config.latents_are_atoms:
+            self.autoencoder = AtomCode()
+        elif config.residues is not None:
+            self.autoencoder = ResidueAutoencoder(ae, config.residues, config.position_scale_nm)
+        else:
+            self.autoencoder = Autoencoder(ae)
+        self.approximator = Approximator(
+            config.approximator, n_latents, latent_dim, tag_dim, of_atoms=config.latents_are_atoms
+        )
         # Of the frames that `next_chunk` returns; the shortest that it knows, until `at_lag` says otherwise.
         self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
-        self.register_buffer("latent_mean", torch.zeros(ae.n_latents, ae.latent_dim))
+        self.register_buffer("latent_mean", torch.zeros(n_latents, latent_dim))
         self.register_buffer("latent_scale", torch.ones(()))
 
     @property
@@ -74,11 +80,20 @@ class LamSlide(Surrogate):
         return torch.arange(self.autoencoder.n_entities(n_atoms), device=self.latent_mean.device)
 
     @property
-    def first_stage(self) -> nn.Module:
-        """What stage one trains and stage two leaves as it is."""
+    def first_stage(self) -> nn.Module | None:
+        """What stage one trains and stage two leaves as it is; None where latents are atoms."""
+        if self.config.latents_are_atoms:
+            return None
         if self.atom_encoder is None:
             return self.autoencoder
         return nn.ModuleDict({"autoencoder": self.autoencoder, "atom_encoder": self.atom_encoder})
+
+    @property
+    def second_stage(self) -> nn.Module:
+        """What stage two trains."""
+        if self.config.latents_are_atoms and self.atom_encoder is not None:
+            return nn.ModuleDict({"approximator": self.approximator, "atom_encoder": self.atom_encoder})
+        return self.approximator
 
     def at_lag(self, lag_ps: float) -> LamSlide:
         """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
@@ -102,18 +117,21 @@ class LamSlide(Surrogate):
             raise InputError("this model knows atoms by their bonds; make molecules by `data.descriptions.describe`.")
         template = molecule.atoms.template_nm[None] / self.config.position_scale_nm
         template = template if turns is None else template @ turns.mT
-        return Atoms(self.atom_encoder(molecule, molecule.atoms, template), template)
+        hops = bonds_between(molecule.bonds, molecule.n_atoms)
+        return Atoms(self.atom_encoder(molecule, molecule.atoms, template), template, hops)
 
-    def told(self, atoms: Atoms | None, lag_ps: Tensor | None, rows: int) -> Tensor | None:
-        """Return what the latent flow is told `(rows, width)` of the molecule and of the lags `(rows,)` asked for (the
-        model's own where None); None of a model that is told neither."""
+    def told(self, atoms: Atoms | None, lag_ps: Tensor | None, rows: int) -> Told | None:
+        """Return what the latent flow is told, in so many rows, of the molecule and of the lags `(rows,)` asked for
+        (the model's own where None); None of a model that is told neither."""
         conditioning = self.approximator.conditioning
         if conditioning is None:
             return None
         if lag_ps is None and self.lag_ps is not None:
             lag_ps = torch.full((rows,), self.lag_ps, device=self.latent_mean.device)
-        found: Tensor = conditioning(atoms, lag_ps)
-        return found.expand(rows, -1)
+        whole: Tensor = conditioning(atoms, lag_ps).expand(rows, -1)
+        if atoms is None or not self.config.latents_are_atoms:
+            return Told(whole)
+        return Told(whole, atoms.tags.expand(rows, -1, -1), atoms.hops)
 
     def encode(self, frames_nm: Tensor, elements: Tensor, atoms: Atoms | None = None) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> latents `(..., n_latents, latent_dim)`. `atoms`: of each leading row, or one
@@ -141,6 +159,8 @@ class LamSlide(Surrogate):
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         ae = self.config.autoencoder
+        if self.config.latents_are_atoms:
+            return (n_atoms, self.config.approximator.chunk_frames, 3)
         return (self.config.approximator.chunk_frames, ae.n_latents, ae.latent_dim)
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
@@ -153,6 +173,7 @@ class LamSlide(Surrogate):
             mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
             return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
         c = self.config.approximator
+        noise = noise.transpose(1, 2) if self.config.latents_are_atoms else noise
         atoms = self.atoms_of(molecule)
         known = self.encode(last_frames_nm, molecule.elements, atoms)
         of_molecule = self.told(atoms, None, len(known))
@@ -162,7 +183,7 @@ class LamSlide(Surrogate):
         def solve(rows: Tensor, noise: Tensor) -> Tensor:
             told = None if kind is None else kind[rows]
             before = known[rows]
-            about = None if of_molecule is None else of_molecule[rows]
+            about = None if of_molecule is None else of_molecule.rows(rows)
             memory = self.approximator.remember(before, about) if c.clean_conditioning else None
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
@@ -171,7 +192,8 @@ class LamSlide(Surrogate):
                 return self.approximator(o, tau, before, memory, told, about)
 
             latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
-            return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2], atoms)
+            frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2], atoms)
+            return hold_hydrogens(frames, molecule) if self.config.atoms.rigid_hydrogens else frames
 
         frames = solve(torch.arange(len(noise), device=noise.device), noise)
         if kind is not None:

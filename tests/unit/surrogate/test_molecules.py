@@ -17,9 +17,10 @@ from surrogate.data.molecules import FrameSets, collect_sets
 from surrogate.data.poses import in_standard_pose
 from surrogate.data.weights import Weights, load_weights, read_header
 from surrogate.models.lam_slide.config import GraphConfig, LamSlideConfig
+from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.training.lam_slide import TrainingConfig, holds_hydrogens, train_lam_slide
 from systems.errors import InputError, OutOfDomainError
 from systems.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -60,13 +61,16 @@ def graph_config(small_model_config: LamSlideConfig) -> LamSlideConfig:
     return replace(small_model_config, graph=True, atoms=GraphConfig(width=32, n_rounds=2))
 
 
-@pytest.fixture(scope="module")
-def weights(write: Write, graph_config: LamSlideConfig, tmp_path_factory: pytest.TempPathFactory) -> Weights:
+@pytest.fixture(scope="module", params=["set", "atoms"])
+def weights(
+    request: pytest.FixtureRequest, write: Write, graph_config: LamSlideConfig, tmp_path_factory: pytest.TempPathFactory
+) -> Weights:
     """Of propanol and propane, with ethanol held out whole."""
     sets = collect_sets([write(smiles("CCCO"), "propanol"), write(smiles("CCC"), "propane")],
                         held=[write(smiles("CCO"), "ethanol")])  # fmt: skip
+    config = replace(graph_config, atoms=replace(graph_config.atoms, latents=request.param))
     out = tmp_path_factory.mktemp("many") / "many.safetensors"
-    return load_weights(train_lam_slide(sets, out, graph_config, replace(QUICK, stage_one_steps=60)))
+    return load_weights(train_lam_slide(sets, out, config, replace(QUICK, stage_one_steps=60)))
 
 
 def smiles(text: str) -> Scene:
@@ -89,8 +93,10 @@ def test_two_molecules_train_one_model_and_a_third_is_watched(weights: Weights) 
     assert weights.provenance["reference_ns"] == pytest.approx(0.48)
     rows = list(csv.DictReader(weights.path.with_suffix(".csv").open()))
     errors = {row["stage"]: row for row in rows}
-    assert 0.0 < float(errors["autoencoder"]["validation_rmsd_nm"]) < 0.05
-    assert float(errors["autoencoder"]["unseen_rmsd_nm"]) > 0.0
+    assert ("autoencoder" in errors) != weights.model.config.latents_are_atoms
+    if "autoencoder" in errors:
+        assert 0.0 < float(errors["autoencoder"]["validation_rmsd_nm"]) < 0.05
+        assert float(errors["autoencoder"]["unseen_rmsd_nm"]) > 0.0
     assert float(errors["flow"]["validation_flow"]) != float(errors["flow"]["unseen_flow"])
 
 
@@ -136,10 +142,13 @@ def test_the_molecule_is_told_to_the_flow(weights: Weights) -> None:
     model = weights.model
     molecules = [describe(model, member.scene) for member in weights.domain.members]
     told = [model.told(model.atoms_of(molecule), None, 1) for molecule in molecules]
-    assert (told[0] - told[1]).abs().max() > 1e-3
+    assert (told[0].whole - told[1].whole).abs().max() > 1e-3
     order = torch.randperm(molecules[0].n_atoms, generator=torch.Generator().manual_seed(0))
     again = model.told(model.atoms_of(molecules[0].permuted(order)), None, 1)
-    torch.testing.assert_close(again, told[0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(again.whole, told[0].whole, rtol=0, atol=1e-5)
+    if weights.model.config.latents_are_atoms:
+        torch.testing.assert_close(again.tags, told[0].tags[:, order], rtol=0, atol=1e-5)
+        assert torch.equal(again.hops, told[0].hops[order][:, order])
 
 
 @pytest.mark.parametrize(
@@ -232,6 +241,57 @@ def test_windows_that_turn_with_their_template_train(
     rows = list(csv.DictReader(out.with_suffix(".csv").open()))
     assert float(rows[0]["validation_rmsd_nm"]) < 0.05
     assert load_weights(out).model.config.atoms.turn
+
+
+def test_rigid_hydrogens_are_learned_from_the_references(
+    write: Write, graph_config: LamSlideConfig, tmp_path: Path
+) -> None:
+    """From their frames: what made a trajectory may not say."""
+    scene = smiles("CCC")
+    hydrogens = np.array([e == "H" for e in scene.elements])
+    parent = {h: p for i, j in scene.bonds.tolist() for h, p in ((i, j), (j, i)) if hydrogens[h]}
+    rng, rigid = np.random.default_rng(0), tmp_path / "rigid.h5"
+    with open_writer(rigid, scene, {"temperature_k": 300.0}) as writer:
+        heavy = scene.positions_nm + 0.004 * rng.normal(size=(240, scene.n_atoms, 3))
+        for h, p in parent.items():
+            heavy[:, h] = heavy[:, p] + scene.positions_nm[h] - scene.positions_nm[p]
+        writer.append(heavy, np.arange(1, 241) * 1.0)
+    config = replace(graph_config, atoms=replace(graph_config.atoms, latents="atoms"))
+    for paths, held in (([rigid], True), ([rigid, write(smiles("CCO"), "ethanol")], False)):
+        sets = collect_sets(paths)
+        assert [holds_hydrogens(frames) for frames in sets.trained] == ([True] if held else [True, False])
+        out = train_lam_slide(sets, tmp_path / f"{held}.safetensors", config, QUICK)
+        weights = load_weights(out)
+        assert weights.model.config.atoms.rigid_hydrogens is held
+        frames, _ = roll(scene, weights, tmp_path / f"{held}.h5", replace(ROLL, force=True))
+        off = [
+            np.abs(np.linalg.norm(frames[:, h] - frames[:, p], axis=-1)
+                   - np.linalg.norm(scene.positions_nm[h] - scene.positions_nm[p])).max()
+            for h, p in parent.items()
+        ]  # fmt: skip
+        assert max(off) < 1e-5 if held else max(off) > 1e-3
+
+
+def test_the_atom_encoder_is_trained_where_there_is_no_stage_one_too(weights: Weights) -> None:
+    torch.manual_seed(QUICK.seed)
+    begun, ended = LamSlide(weights.model.config).atom_encoder, weights.model.atom_encoder
+    assert begun is not None and ended is not None
+    for name, value in begun.named_parameters():
+        if "elements" not in name:  # most elements do not occur
+            assert not torch.equal(value, ended.state_dict()[name]), name
+    stages = {row["stage"] for row in csv.DictReader(weights.path.with_suffix(".csv").open())}
+    assert stages == ({"flow"} if weights.model.config.latents_are_atoms else {"autoencoder", "flow"})
+
+
+def test_settings_for_many_molecules_are_laid_over_sizes_that_suit_their_latents() -> None:
+    plain = LamSlideConfig.of_many({})
+    assert plain.latents_are_atoms and plain.approximator.width == 128
+    of_set = LamSlideConfig.of_many({"atoms": {"latents": "set"}})
+    assert of_set.graph and not of_set.latents_are_atoms and of_set.approximator == LamSlideConfig().approximator
+    own = LamSlideConfig.of_many({"approximator": {"n_layers": 2}, "atoms": {"width": 8}})
+    assert (own.approximator.n_layers, own.approximator.chunk_frames, own.atoms.width) == (2, 8, 8)
+    with pytest.raises(InputError, match="widht"):
+        LamSlideConfig.of_many({"atoms": {"widht": 8}})
 
 
 def test_the_standard_pose_follows_the_molecule(write: Write) -> None:

@@ -12,13 +12,14 @@ import pytest
 
 from md_reference.engine import Engine
 from surrogate.bench.stress import StressConfig, choose_config, run_stress
-from surrogate.bench.stress_inputs import measure_invariance, measure_odd_inputs, permuted
+from surrogate.bench.stress_inputs import measure_invariance, measure_odd_inputs
 from surrogate.bench.stress_measures import measure_bonds, measure_drift, measure_validity
 from surrogate.bench.stress_report import markdown
 from surrogate.bench.stress_settings import measure_batches, measure_openmm, measure_precision, openmm_of
 from surrogate.data.weights import Weights
 from systems.errors import InputError
 from systems.scene import Scene
+from systems.selection import reordered
 from systems.validity import Geometry, geometry_from_frames
 
 
@@ -79,7 +80,7 @@ def test_moved_and_permuted_input_gives_the_moved_chunk(small_weights: Weights) 
         assert row["deviation_nm"] < (5e-6 if "1e+06" in name else 1e-6), name
     scene = small_weights.domain.scene
     order = np.random.default_rng(1).permutation(22)
-    other = permuted(scene, order)
+    other = reordered(scene, order)
     assert [other.elements[k] for k in range(22)] == [scene.elements[i] for i in order]
     assert other.molecule_key == scene.molecule_key
 
