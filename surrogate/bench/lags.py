@@ -37,7 +37,7 @@ _BINS = 24
 @dataclass(frozen=True)
 class Row:
     """One source at one lag: the share of `valid` frames, the Jensen-Shannon distance of their joint phi/psi to the
-    test trajectories', and the correlation of cos psi and cos phi with the start one lag later."""
+    test trajectories', and the correlation of cos psi and cos phi with the `starts` one lag later."""
 
     lag_ps: float
     source: str
@@ -45,6 +45,11 @@ class Row:
     jsd: float
     psi: float
     phi: float
+    starts: int
+
+    def error(self, correlation: float) -> float:
+        """Return the standard error of one of its correlations (Fisher)."""
+        return float((1.0 - correlation**2) / self.starts**0.5)
 
 
 def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
@@ -76,26 +81,33 @@ def measure(weights: Weights, test: TrainingFrames, lag_ps: float, n_starts: int
     from surrogate.sampling.chunks import ChunkSampler
     from surrogate.sampling.domain import fit_weights
 
-    geometry, stride = Geometry.from_dict(weights.domain.geometry), round(lag_ps / test.lag_ps)
-    length = weights.model.n_new + 1
-    starts = test.window_starts((length - 1) * stride + 1, validation=False)
-    starts = starts[np.linspace(0, len(starts) - 1, n_starts).astype(int)]
-    known = test.positions_nm(starts[:, None] + np.arange(length) * stride).astype(np.float64)
-    everything = torsions(test.scene, test.positions_nm(np.arange(0, test.n_frames, 5)).astype(np.float64))
+    known = evenly_started(test, weights.model.n_new + 1, round(lag_ps / test.lag_ps), n_starts)
     sources = {"MD": known[:, 1:]}
     for name, told_ps in (("model", lag_ps), ("model, told the shortest", weights.domain.lag_ps)):
         fitted, _ = fit_weights(weights.domain.scene, weights, lag_ps=told_ps)
         drawn = ChunkSampler(fitted).draw(known[:, :1], list(range(n_starts)))
         sources[name] = np.asarray(drawn.frames_nm, dtype=np.float64)
-    first = torsions(test.scene, known[:, 0])
-    rows = []
-    for name, frames in sources.items():
-        found = torsions(test.scene, frames)
-        flags = check_frames(frames.reshape(-1, *frames.shape[2:]), geometry)
-        phi, psi = (_correlation(np.cos(first[:, k]), np.cos(found[:, 0, k])) for k in (0, 1))
-        valid = float(((flags & INVALID) == 0).mean())
-        rows.append(Row(lag_ps, name, valid, _joint_distance(found.reshape(-1, 2), everything), psi, phi))
-    return rows
+    geometry = Geometry.from_dict(weights.domain.geometry)
+    return [hold_against(test, known[:, 0], frames, geometry, lag_ps, name) for name, frames in sources.items()]
+
+
+def evenly_started(test: TrainingFrames, length: int, stride: int, n_starts: int) -> FloatArray:
+    """Return windows `(n_starts, length, n_atoms, 3)` nm of frames `stride` apart, spread evenly over a test set."""
+    starts = test.window_starts((length - 1) * stride + 1, validation=False)
+    starts = starts[np.linspace(0, len(starts) - 1, n_starts).astype(int)]
+    return test.positions_nm(starts[:, None] + np.arange(length) * stride).astype(np.float64)
+
+
+def hold_against(test: TrainingFrames, first_nm: FloatArray, frames_nm: FloatArray, geometry: Geometry, lag_ps: float,
+                 source: str) -> Row:  # fmt: skip
+    """Return the row of frames `(n_starts, n, n_atoms, 3)` nm that came after `first_nm` (n_starts, n_atoms, 3)."""
+    everything = torsions(test.scene, test.positions_nm(np.arange(0, test.n_frames, 5)).astype(np.float64))
+    first, found = torsions(test.scene, first_nm), torsions(test.scene, frames_nm)
+    flags = check_frames(frames_nm.reshape(-1, *frames_nm.shape[2:]), geometry)
+    phi, psi = (_correlation(np.cos(first[:, k]), np.cos(found[:, 0, k])) for k in (0, 1))
+    valid = float(((flags & INVALID) == 0).mean())
+    jsd = _joint_distance(found.reshape(-1, 2), everything)
+    return Row(lag_ps, source, valid, jsd, psi, phi, len(first))
 
 
 def _correlation(x: FloatArray, y: FloatArray) -> float:
@@ -118,7 +130,8 @@ def table(rows: Sequence[Row]) -> str:
         "| lag, ps | frames of | valid | joint φ/ψ JSD | cos ψ one lag later | cos φ one lag later |",
         "|---|---|---|---|---|---|",
         *(
-            f"| {r.lag_ps:g} | {r.source} | {100 * r.valid:.2f} % | {r.jsd:.3f} | {r.psi:.2f} | {r.phi:.2f} |"
+            f"| {r.lag_ps:g} | {r.source} | {100 * r.valid:.2f} % | {r.jsd:.3f} "
+            f"| {r.psi:.2f} ± {r.error(r.psi):.2f} | {r.phi:.2f} ± {r.error(r.phi):.2f} |"
             for r in rows
         ),
     ]

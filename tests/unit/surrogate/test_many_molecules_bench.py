@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.bench import lags, many_molecules
-from surrogate.bench.many_molecules import change_per_frame, measure, table
+from surrogate.bench.many_molecules import change_per_frame, measure, summary, table
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import load_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
@@ -38,6 +38,21 @@ def test_the_other_half_of_a_reference_passes_and_faults_show(
     # Frames correlated by 0.8 change by sqrt(0.2) of what strangers do.
     assert shuffled.step == pytest.approx(1.0 / np.sqrt(0.2), rel=0.1)
     assert "| MD | 400 | 100.00 % |" in table([fair])
+
+
+def test_means_over_molecules_keep_seen_and_unseen_and_their_references_apart(
+    frames: np.ndarray, harmonic_frames: TrainingFrames
+) -> None:
+    one = measure(harmonic_frames.scene, frames[:400], [frames[400:]], "reference, other half")
+    rows = [
+        replace(one, molecule=name, model=model, valid=valid)
+        for name, kind, valid in (("CC", "seen", 0.9), ("CCC", "seen", 1.0), ("CCO", "unseen", 0.5))
+        for model, valid in ((one.model, 1.0), (f"one for all, {kind}", valid))
+    ]
+    said = {line.split("|")[1].strip(): line for line in summary(rows).splitlines()[2:]}
+    assert "| 2 | 95.000 ± 5 |" in said["one for all, seen"] and "| 1 | 50.000 |" in said["one for all, unseen"]
+    assert "| 2 | 100.000 ± 0 |" in said["reference, other half (seen)"]
+    assert "| 1 | 100.000 |" in said["reference, other half (unseen)"]
 
 
 def test_strangers_change_by_more_than_neighbours(frames: np.ndarray) -> None:
