@@ -174,8 +174,9 @@ def train(
     local geometry; `entities` 'residue': of peptides, whose residues are then what it codes; both as in `config`.
     `graph`: lam-slide knows atoms by their bonds, so that references may be of many molecules and the weights cover
     unseen ones that look like them (surrogate.sampling.coverage); trajectories in `validation` of molecules that are
-    not trained on hold those out whole. `longest_lag_ps`: lam-slide learns every spacing of frames from that of the
-    references to this one, and takes it as an input. Beside `out`, a
+    not trained on hold those out whole; each atom is then a latent of its own, or, with `atoms.latents = "set"` in
+    `config`, an autoencoder codes them as it does for one molecule. `longest_lag_ps`: lam-slide learns every spacing of
+    frames from that of the references to this one, and takes it as an input. Beside `out`, a
     CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
     drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.

@@ -130,6 +130,9 @@ def stress(
             "--section", help="Only this: length, invariance, inputs, precision, batches, solvers, openmm. Repeatable."
         ),
     ] = None,
+    scene: Annotated[
+        str | None, typer.Option("--scene", help="Of weights for many molecules: the one to try, such as smiles:CCO.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Short runs of everything: a minute or two.")] = False,
     seed: SeedOpt = 0,
     quiet: QuietOpt = False,
@@ -142,6 +145,7 @@ def stress(
         weights,
         out,
         choose_config(quick=quick, frames=frames, replicas=replicas, guards=guard, sections=section, seed=seed),
+        scene=scene,
         report=lambda name: None if quiet or as_json else typer.echo(f"running: {name}", err=True),
     )
     if as_json:

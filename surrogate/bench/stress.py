@@ -77,17 +77,26 @@ def choose_config(
 
 
 def stress_weights(
-    weights: str | Path, folder: Path, config: StressConfig, *, report: ReportFn = lambda name: None
-) -> dict[str, Any]:
+    weights: str | Path, folder: Path, config: StressConfig, *, scene: str | None = None,
+    report: ReportFn = lambda name: None,
+) -> dict[str, Any]:  # fmt: skip
     """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
 
-    Raises SurromdError for weights that cannot be loaded and a folder that cannot be written; KeyboardInterrupt says
-    what is kept.
+    Weights for many molecules are tried on `scene`, as `systems.prepare` reads it, or the first that they were trained
+    on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that cannot be
+    written; KeyboardInterrupt says what is kept.
     """
     from surrogate.data.shipped import weights_path
     from surrogate.data.weights import load_weights
+    from surrogate.sampling.domain import fit_weights
 
     loaded = load_weights(weights_path(weights))
+    if scene is not None:
+        from systems.prepare import prepare
+
+        loaded, _ = fit_weights(prepare(scene), loaded)
+    elif loaded.domain.transferable:
+        loaded, _ = fit_weights(loaded.domain.scene, loaded)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -100,6 +109,7 @@ def stress_weights(
 
 def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: ReportFn) -> dict[str, Any]:
     """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
+    Weights are for one molecule (`sampling.domain.fit_weights`).
 
     Tables, plot and JSON are written anew after each section, so that what is done survives an interruption; sections
     that an earlier run of the same weights left in `folder` stay where this one does not run them. `report` is told of
@@ -110,6 +120,7 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
         "weights_hash": weights.hash,
         "model": weights.model.arch,
         "domain": weights.domain.describe(),
+        "scene": weights.domain.scene.name,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": platform.processor() or platform.machine(),
         "seed": config.seed,
@@ -129,7 +140,10 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
 def _earlier_sections(folder: Path, weights: Weights) -> dict[str, list[dict[str, Any]]]:
     try:
         found = json.loads((folder / "stress.json").read_text(encoding="utf-8"))
-        return dict(found["sections"]) if found["weights_hash"] == weights.hash else {}
+        same = found["weights_hash"] == weights.hash and found.get("scene", weights.domain.scene.name) == (
+            weights.domain.scene.name
+        )
+        return dict(found["sections"]) if same else {}
     except (OSError, ValueError, LookupError, TypeError):
         return {}
 

@@ -60,6 +60,19 @@ def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
     assert forced.exit_code == 0, forced.stderr
 
 
+def test_stress_takes_the_molecule_to_try(folder: Path) -> None:
+    common = ["stress", str(folder / "w.safetensors"), "-o", str(folder / "stress"), "--section", "invariance"]
+    done = run(*common, "--scene", "smiles:CCO", "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["scene"] == "CCO" and max(r["deviation_nm"] for r in found["sections"]["invariance"]) < 1e-5
+    first = json.loads(run(*common, "--json").stdout)
+    assert first["scene"] == "CCCO"
+    for text, why in (("smiles:CCN", "elements"), ("smiles:C((", "smiles")):
+        refused = run(*common, "--scene", text)
+        assert refused.exit_code == 1 and why in refused.stderr.lower() and refused.stderr.count("\n") == 1
+
+
 def test_other_architectures_and_further_training_take_neither(folder: Path) -> None:
     reference, out = str(folder / "CCC.h5"), str(folder / "x.safetensors")
     for more in (["--graph"], ["--longest-lag", "10ps"]):
