@@ -41,9 +41,10 @@ class LatentLayer(nn.Module):
     ) -> tuple[Tensor, KeysValues]:  # fmt: skip
         """`o` (b, L, T, width), `modulation` (b, 6, width): three for each block; `past` of earlier frames."""
         if self.spatial is not None:
-            near = None if told is None or told.hops is None else told.hops
-            bias = None if self.of_hops is None or near is None else self.of_hops(near).permute(2, 0, 1)
-            rope = rope_latent if bias is None else None
+            rope: Rope | None = rope_latent
+            bias: Tensor | None = None
+            if self.of_hops is not None and told is not None:  # atoms have no places, but distances along bonds
+                rope, bias = None, self.of_hops(told.hops).permute(2, 0, 1)
             o = self.spatial(o.transpose(1, 2), modulation[:, :3], rope, bias=bias)[0].transpose(1, 2)
         return self.temporal(o, modulation[:, 3:], rope_time, past)
 

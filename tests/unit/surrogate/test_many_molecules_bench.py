@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from surrogate.bench import lags, many_molecules
+from surrogate.bench import heavy_atoms, lags, many_molecules
 from surrogate.bench.many_molecules import change_per_frame, measure, summary, table
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import load_weights
@@ -80,3 +81,26 @@ def test_rows_of_a_lag_hold_md_and_the_model(
     # Ten frames on, nothing is left of where correlated (0.8) motion began.
     assert abs(rows["MD"].psi) < 0.5 and rows["MD"].valid == 1.0 and rows["MD"].jsd < 0.6
     assert many_molecules.UNSEEN and not set(many_molecules.UNSEEN) & set(many_molecules.TRAINED)
+
+
+def test_hydrogens_of_all_three_kinds_are_held_against_md(
+    harmonic_frames: TrainingFrames,
+    small_model_config: LamSlideConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    settings = TrainingConfig(stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False)
+
+    def train(references: list[Path], out: Path, kind: str, budget_s: float) -> None:
+        train_lam_slide(harmonic_frames, out, replace(small_model_config, **heavy_atoms.KINDS[kind]), settings)
+
+    monkeypatch.setattr(heavy_atoms, "train", train)
+    monkeypatch.setattr("surrogate.data.frames.collect_frames", lambda paths: harmonic_frames)
+    heavy_atoms.main([str(tmp_path), "--train", "a.h5", "--test", "b.h5", "--starts", "32"])
+    rows = json.loads((tmp_path / "heavy_atoms.json").read_text())["rows"]
+    assert [row["source"] for row in rows] == ["MD", "modelled", "placed", "residue"]
+    assert rows[0]["valid"] == 1.0 and all(row["starts"] == 32 for row in rows)
+    # So short a training leaves frames as rough as heavy atoms of 0.004 nm of noise are, with hydrogens in their place.
+    assert rows[2]["valid"] > 0.9 and all(row["ms_a_frame"] > 0.0 for row in rows[1:])
+    assert "| residue |" in capsys.readouterr().out
