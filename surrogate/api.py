@@ -93,11 +93,15 @@ def campaign(
 
 def info(path: PathLike) -> dict[str, Any]:
     """Return what a trajectory, a windows or weights file or a campaign's folder is and where it came from (JSON-able).
+    Shipped weights may be given by name.
 
     Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
     """
+    from surrogate.data.shipped import shipped_weights
     from surrogate.describe import describe_file
 
+    if not Path(path).exists():
+        return describe_file(shipped_weights().get(str(path), Path(path)))
     if Path(path).is_dir():
         from surrogate.campaigns import describe_campaign
 

@@ -420,7 +420,8 @@ def compare(
 @app.command()
 def info(
     path: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A trajectory, a windows file, weights or a campaign's folder.")
+        Path,
+        typer.Argument(metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's folder."),
     ],
     as_json: JsonOpt = False,
 ) -> None:

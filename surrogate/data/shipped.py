@@ -10,6 +10,11 @@ from systems.errors import InputError, UnknownNameError, nearest
 _FOLDER = Path(__file__).parents[1] / "pretrained"
 
 
+def shipped_weights() -> dict[str, Path]:
+    """Return the files of the weights that are shipped, by name."""
+    return {p.stem: p for p in sorted(_FOLDER.glob("*.safetensors"))}
+
+
 def weights_path(weights: str | os.PathLike[str]) -> Path:
     """Return the file of shipped weights by name, or the path itself.
 
@@ -20,7 +25,7 @@ def weights_path(weights: str | os.PathLike[str]) -> Path:
         if not path.is_file():
             raise InputError(f"{path}: no such weights file.")
         return path
-    shipped = {p.stem: p for p in sorted(_FOLDER.glob("*.safetensors"))}
+    shipped = shipped_weights()
     if str(weights) not in shipped:
         raise UnknownNameError(
             f"no weights are called {str(weights)!r}; shipped: {', '.join(shipped) or 'none'}."

@@ -8,16 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surrogate import api
 from surrogate.bench.many_molecules import TRAINED, UNSEEN, change_per_frame
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.sampling.domain import find_deviations
 from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.errors import InputError
 from systems.molecule import scene_from_smiles
 from systems.trajectory import open_trajectory
 from systems.validity import BOND_20_PERCENT, INVALID, check_frames, geometry_from_scene
 
 NAME = "alkanes-alcohols-ethers"
+
+
+def test_shipped_weights_are_described_by_name() -> None:
+    found = api.info(NAME)
+    assert f"{len(TRAINED)} molecules of up to 20 atoms" in found["summary"] and found["covers_unseen_molecules"]
+    with pytest.raises(InputError, match="no such file"):
+        api.info(NAME + "s")
 
 
 def test_unseen_ethanol_rolls_and_its_frames_are_valid(tmp_path: Path) -> None:
