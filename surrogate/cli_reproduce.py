@@ -9,6 +9,7 @@ import typer
 
 from surrogate.cli_options import JsonOpt, QuietOpt, ResumeOpt, SeedOpt, literal
 from surrogate.cli_printing import print_json
+from systems.errors import InputError
 from systems.units import parse_time_ps, parse_wall_s
 
 _SIZE = {"min": 2, "help": "Trajectories (md17: windows of each molecule), instead of the published number."}
@@ -37,6 +38,9 @@ def reproduce(
             help="Leave out: extrapolate, any-start, from-velocity, canonical, predicted-only. Repeatable.",
         ),
     ] = None,
+    clean_conditioning: Annotated[
+        bool, typer.Option("--clean-conditioning", help="md17: LaM-SLidE computes given frames once a chunk.")
+    ] = False,
     molecule: Annotated[
         list[str] | None,
         typer.Option("--molecule", help=literal("md17: only this; may be repeated. [default: all eight]")),
@@ -87,7 +91,10 @@ def reproduce(
         resume=resume,
         device=choose_device(device),
         solver_steps=solver_steps,
+        clean_conditioning=clean_conditioning,
     )
+    if clean_conditioning and not of_molecules:
+        raise InputError(f"--clean-conditioning: {name} does not know it; leave it out.")
     settings = without_switches(settings, SWITCHES if plain else without or [])
     shown = not (quiet or as_json)
 

@@ -174,7 +174,8 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
 
     switches = {"body frame": settings.canonical, "corrects the linear forecast": settings.extrapolate,
                 "any start": settings.any_start,
-                "loss on predicted frames alone": settings.predicted_only}  # fmt: skip
+                "loss on predicted frames alone": settings.predicted_only,
+                "clean conditioning frames": settings.clean_conditioning}  # fmt: skip
     return FittedToMolecules(
         forecast,
         f"ten frames, elements, {settings.solver_steps} solver steps{beyond(switches)}",
@@ -198,6 +199,7 @@ def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
             approximator=ApproximatorConfig(
                 chunk_frames=N_GIVEN + N_NEW,
                 loss_on_given=not settings.predicted_only,
+                clean_conditioning=settings.clean_conditioning,
                 n_conditioning=N_GIVEN,
                 latents_per_token=sizes["per_token"],
                 width=sizes["width"],

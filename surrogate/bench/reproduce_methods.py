@@ -38,9 +38,10 @@ class Settings:
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames
     misses, each predicted frame in units of its own size, instead of absolute positions; `any_start`: EGNN learns from
     every frame of a trajectory, not from the tenth alone; `from_velocity`: EGNN adds the motion at constant velocity;
-    `predicted_only`: LaM-SLidE's loss leaves out the given frames. Of molecules alone, `canonical`: LaM-SLidE sees
-    windows in the body frame instead of turned at random; there `extrapolate` is the best linear forecast, and
-    `any_start` takes every training window, not the protocol's 5,000.
+    `predicted_only`: LaM-SLidE's loss leaves out the given frames. Of molecules alone, `clean_conditioning`: in
+    LaM-SLidE given frames see neither flow time nor what follows, so that evaluations compute them once; `canonical`:
+    LaM-SLidE sees windows in the body frame instead of turned at random; there `extrapolate` is the best linear
+    forecast, and `any_start` takes every training window, not the protocol's 5,000.
     """
 
     folder: Path
@@ -53,6 +54,7 @@ class Settings:
     from_velocity: bool = True
     canonical: bool = True
     predicted_only: bool = True
+    clean_conditioning: bool = False
     device: str = "cpu"
     solver_steps: int = 10
     progress: ProgressFn | None = None

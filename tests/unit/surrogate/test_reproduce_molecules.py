@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from surrogate.bench.molecule_methods import METHODS
+from surrogate.bench.molecule_methods import METHODS, lam_slide_model
 from surrogate.bench.molecule_views import BodyFrame, LinearForecast, MoleculeView
 from surrogate.bench.reproduce_errors import block_means, forecast_errors
 from surrogate.bench.reproduce_methods import N_GIVEN, N_NEW, SWITCHES, Settings, without_switches
@@ -221,6 +221,14 @@ def test_md17s_own_ethanol_is_read_in_our_atom_order(real_ethanol: Path) -> None
     assert np.linalg.norm(np.diff(windows, axis=1), axis=-1).max() < 0.06
 
 
+def test_clean_conditioning_reaches_the_network_and_is_told() -> None:
+    for clean in (True, False):
+        settings = Settings(Path(), clean_conditioning=clean)
+        assert lam_slide_model(settings, large=False).config.approximator.clean_conditioning is clean
+    with pytest.raises(InputError, match="clean_conditioning"):
+        lam_slide_model(Settings(Path(), clean_conditioning=True, predicted_only=False), large=False)
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -228,6 +236,7 @@ def test_md17s_own_ethanol_is_read_in_our_atom_order(real_ethanol: Path) -> None
         (["md17", "--method", "pair-forces"], "unknown method 'pair-forces'"),
         (["md17", "--without", "canon"], "unknown switch 'canon'"),
         (["md18"], "n-body-charged"),
+        (["n-body-spring", "--clean-conditioning"], "--clean-conditioning: n-body-spring does not know it"),
     ],
 )
 def test_bad_names_are_refused_in_one_line(arguments: list[str], expected: str, tmp_path: Path) -> None:
