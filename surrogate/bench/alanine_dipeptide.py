@@ -134,9 +134,9 @@ def _train(out: Path, references: list[Path], config: TrainingConfig, start: Wei
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import LamSlideConfig
     from surrogate.progress import training_bar
-    from surrogate.training.lam_slide import train_lam_slide
+    from surrogate.training.lam_slide import is_trained, train_lam_slide
 
-    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
+    if is_trained(out):
         return out
     with training_bar(f"training {out.stem}") as report:
         frames = collect_frames(references)

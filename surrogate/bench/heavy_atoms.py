@@ -35,9 +35,9 @@ def train(references: Sequence[Path], out: Path, kind: str, budget_s: float) -> 
     """Train one of KINDS; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import LamSlideConfig
-    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+    from surrogate.training.lam_slide import TrainingConfig, is_trained, train_lam_slide
 
-    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
+    if is_trained(out):
         return
     settings = TrainingConfig(budget_s=budget_s, time_reversal=True)
     train_lam_slide(collect_frames(list(references)), out, LamSlideConfig.from_dict(dict(KINDS[kind])), settings,
@@ -45,15 +45,15 @@ def train(references: Sequence[Path], out: Path, kind: str, budget_s: float) -> 
 
 
 def run(folder: Path, references: Sequence[Path], tests: Sequence[Path], *, budget_s: float,
-        n_starts: int) -> list[tuple[Row, float]]:  # fmt: skip
-    """Train, draw and measure; return each row with the milliseconds that a frame took."""
+        n_starts: int) -> list[tuple[Row, float | None]]:  # fmt: skip
+    """Train, draw and measure; return each row with the milliseconds that a frame took, None of MD."""
     from surrogate.data.frames import collect_frames
     from surrogate.data.weights import load_weights
     from surrogate.sampling.chunks import ChunkSampler
 
     folder.mkdir(parents=True, exist_ok=True)
     test = collect_frames(list(tests))
-    rows: list[tuple[Row, float]] = []
+    rows: list[tuple[Row, float | None]] = []
     for kind in KINDS:
         out = folder / f"{kind}.safetensors"
         train(references, out, kind, budget_s)
@@ -61,7 +61,7 @@ def run(folder: Path, references: Sequence[Path], tests: Sequence[Path], *, budg
         geometry, lag_ps = Geometry.from_dict(weights.domain.geometry), weights.domain.lag_ps
         known = evenly_started(test, weights.model.n_new + 1, 1, n_starts)
         if not rows:
-            rows.append((hold_against(test, known[:, 0], known[:, 1:], geometry, lag_ps, "MD"), float("nan")))
+            rows.append((hold_against(test, known[:, 0], known[:, 1:], geometry, lag_ps, "MD"), None))
         sampler, started = ChunkSampler(weights), time.perf_counter()
         frames = np.asarray(sampler.draw(known[:, :1], list(range(n_starts))).frames_nm, dtype=np.float64)
         each_ms = 1e3 * (time.perf_counter() - started) / (frames.shape[0] * frames.shape[1])
@@ -69,7 +69,7 @@ def run(folder: Path, references: Sequence[Path], tests: Sequence[Path], *, budg
     return rows
 
 
-def table(rows: Sequence[tuple[Row, float]]) -> str:
+def table(rows: Sequence[tuple[Row, float | None]]) -> str:
     """Return the rows as Markdown."""
     lines = [
         "| hydrogens | valid | joint φ/ψ JSD | cos ψ one frame later | cos φ one frame later | ms a frame |",
@@ -78,7 +78,7 @@ def table(rows: Sequence[tuple[Row, float]]) -> str:
     for r, each_ms in rows:
         lines.append(
             f"| {r.source} | {100 * r.valid:.2f} % | {r.jsd:.3f} | {r.psi:.2f} ± {r.error(r.psi):.2f} "
-            f"| {r.phi:.2f} ± {r.error(r.phi):.2f} | {each_ms:.2f} |"
+            f"| {r.phi:.2f} ± {r.error(r.phi):.2f} | {'–' if each_ms is None else f'{each_ms:.2f}'} |"
         )
     return "\n".join(lines)
 

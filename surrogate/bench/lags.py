@@ -56,9 +56,9 @@ def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budge
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
-    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+    from surrogate.training.lam_slide import TrainingConfig, is_trained, train_lam_slide
 
-    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
+    if is_trained(out):
         return
     settings = TrainingConfig(budget_s=budget_s, time_reversal=True, longest_lag_ps=longest_lag_ps, compile=compile_)
     config = LamSlideConfig(approximator=ApproximatorConfig(chunk_frames=CHUNK_FRAMES))

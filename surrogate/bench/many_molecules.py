@@ -131,14 +131,12 @@ def simulate(smiles: Sequence[str], folder: Path, time_ps: float) -> dict[str, P
 
 def train(references: Sequence[Path], held: Sequence[Path], out: Path, config: LamSlideConfig, budget_s: float) -> None:
     """Train on references, one model for all; what is there stays, what was interrupted goes on."""
-    from surrogate.data.frames import collect_frames
-    from surrogate.data.molecules import FrameSets, collect_sets
-    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+    from surrogate.data.molecules import collect_sets
+    from surrogate.training.lam_slide import TrainingConfig, is_trained, train_lam_slide
 
-    if out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors")):
+    if is_trained(out):
         return
-    sets = collect_sets(list(references), held=list(held)) if config.graph else FrameSets(
-        (collect_frames(list(references)),))  # fmt: skip
+    sets = collect_sets(list(references), held=list(held))
     started = time.monotonic()
 
     def tell(stage: str, share: float, metrics: dict[str, float]) -> None:

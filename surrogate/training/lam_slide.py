@@ -81,6 +81,11 @@ class TrainingConfig:
         return one, two
 
 
+def is_trained(out: Path) -> bool:
+    """Return whether `out` is there and no state of an interrupted training is beside it."""
+    return out.exists() and not list(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+
+
 def train_lam_slide(
     frames: TrainingFrames | FrameSets,
     out: str | Path,

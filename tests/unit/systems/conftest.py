@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from systems import selection
 from systems.scene import Scene
 
 
@@ -37,21 +36,6 @@ def _from_smiles(smiles: str, seed: int = 1) -> Scene:
     )
 
 
-def _reordered(scene: Scene, order: npt.ArrayLike) -> Scene:
-    order = np.asarray(order)
-    where = np.argsort(order)
-    return replace(
-        scene,
-        atom_names=tuple(scene.atom_names[i] for i in order),
-        elements=tuple(scene.elements[i] for i in order),
-        residue_of_atom=scene.residue_of_atom[order],
-        bonds=np.sort(where[scene.bonds], axis=1),
-        formal_charges=scene.formal_charges[order],
-        masses_da=scene.masses_da[order],
-        positions_nm=scene.positions_nm[order],
-    )
-
-
 @pytest.fixture(scope="session")
 def from_smiles() -> Callable[..., Scene]:
     """`from_smiles(smiles, seed=1)`: an embedded molecule with all hydrogens."""
@@ -61,7 +45,7 @@ def from_smiles() -> Callable[..., Scene]:
 @pytest.fixture(scope="session")
 def reordered() -> Callable[..., Scene]:
     """`reordered(scene, order)`: atom k of the result is atom order[k] of the scene."""
-    return _reordered
+    return selection.reordered
 
 
 @pytest.fixture(scope="session")
