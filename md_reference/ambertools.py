@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import signal
-import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from md_reference.programs import run_program
 from systems.errors import PreparationError
 
 PROGRAMS = ("antechamber", "parmchk2", "tleap", "sqm")
@@ -65,11 +65,18 @@ def gaff2_table() -> Path:
     return _gaff2_table(ambertools().bin.resolve().parent)
 
 
-def run(program: str, arguments: list[str], folder: Path, **variables: str) -> str:
+def run(
+    program: str,
+    arguments: list[str],
+    folder: Path,
+    *,
+    waiting: Callable[[float], None] | None = None,
+    **variables: str,
+) -> str:
     """Run one program in `folder`, with these environment variables added, and return what it printed.
 
-    An interruption ends it and whatever it has started: antechamber leaves its sqm running for minutes otherwise.
-    Raises PreparationError with its own complaint.
+    `waiting`, interruptions and the end of this process: as `programs.run_program`; antechamber leaves its sqm running
+    for minutes otherwise. Raises PreparationError with the program's own complaint.
     """
     tools = ambertools()
     environment = os.environ | {
@@ -78,23 +85,9 @@ def run(program: str, arguments: list[str], folder: Path, **variables: str) -> s
         "OMP_NUM_THREADS": "1",
         **variables,
     }
-    with subprocess.Popen(
-        [str(tools.bin / program), *arguments],
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        start_new_session=True,
-    ) as process:
-        try:
-            printed = _COLOUR.sub("", process.communicate()[0])
-        except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
-    if process.returncode != 0:
+    status, printed = run_program([str(tools.bin / program), *arguments], folder, environment, waiting=waiting)
+    printed = _COLOUR.sub("", printed)
+    if status != 0:
         raise PreparationError(f"{program} failed: {complaint(printed)}")
     return printed
 

@@ -6,7 +6,6 @@ Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import networkx as nx
@@ -16,6 +15,7 @@ from md_reference import parameter_cache
 from md_reference.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
 from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
+from md_reference.programs import scratch_folder
 from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError, StorageError
 from systems.residues import template_for
@@ -122,8 +122,7 @@ def refuse(scene: Scene) -> None:
 
 def _parametrise(scene: Scene) -> Entry:
     tools = ambertools()
-    with tempfile.TemporaryDirectory(prefix="surromd-gaff-") as name:
-        folder = Path(name)
+    with scratch_folder("surromd-gaff-") as folder:
         try:
             notes = _charges_and_types(scene, folder)
             _missing_terms(scene, folder)

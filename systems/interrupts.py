@@ -1,4 +1,5 @@
-"""Ctrl-C and SIGTERM that wait for a good moment: a long run stops between frames, never inside a write."""
+"""Ctrl-C, SIGTERM and SIGHUP: each ends what this process has started, and a long run waits for a good moment: it stops
+between frames, never inside a write."""
 
 from __future__ import annotations
 
@@ -11,8 +12,50 @@ from types import FrameType
 
 # Pressed again after this long, Ctrl-C means now.
 _PATIENCE_S = 1.0
+# So long what ends is not disturbed by being told to end again.
+_CLEAN_UP_S = 30.0
 
 _thread = threading.local()
+
+
+def interrupt_on_signals() -> None:
+    """Have SIGTERM and SIGHUP interrupt this process as Ctrl-C does: KeyboardInterrupt in the main thread.
+
+    For a program of ours, when it starts: Python's own way, to end at once, leaves folders and processes behind. SIGINT
+    is heeded also where a shell has started the program in the background and had it ignored; SIGHUP stays ignored
+    where it is (nohup). What cleans up after the first signal is not disturbed by another one for half a minute, but
+    by Ctrl-C a second later.
+    """
+    asked_at: float | None = None
+
+    def handle(number: int, _: FrameType | None) -> None:
+        nonlocal asked_at
+        now = time.monotonic()
+        if asked_at is None or now - asked_at > (_PATIENCE_S if number == signal.SIGINT else _CLEAN_UP_S):
+            asked_at = now
+            raise KeyboardInterrupt
+
+    for number in _numbers():
+        signal.signal(number, handle)
+
+
+def stop_if_asked() -> None:
+    """Raise KeyboardInterrupt where this thread has been asked to stop, through `deferred_interrupt` or `stop_when`.
+
+    For whoever waits within a run, for another program, say: nothing would look otherwise.
+    """
+    asked: Callable[[], bool] | None = getattr(_thread, "deferred", None) or getattr(_thread, "asked", None)
+    if asked is not None and asked():
+        raise KeyboardInterrupt
+
+
+def _numbers() -> list[signal.Signals]:
+    """The signals that ask a process to end. A hang-up that is ignored (nohup) is none."""
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        numbers.append(hang_up)
+    return numbers
 
 
 @contextmanager
@@ -28,7 +71,7 @@ def stop_when(asked: Callable[[], bool]) -> Iterator[None]:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether the user (SIGINT) or the system (SIGTERM) asked to stop.
+    """Yield a function that says whether the user (SIGINT, SIGHUP) or the system (SIGTERM) asked to stop.
 
     The caller looks at it where stopping leaves everything whole, and then raises KeyboardInterrupt. A second Ctrl-C, a
     second later, raises it at once. Outside the main thread, where Python takes no signals, the question goes to the
@@ -47,9 +90,15 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
         elif number == signal.SIGINT and now - asked_at > _PATIENCE_S:
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    def asked() -> bool:
+        return asked_at is not None
+
+    outer = getattr(_thread, "deferred", None)
+    previous = {number: signal.signal(number, handle) for number in _numbers()}
+    _thread.deferred = asked
     try:
-        yield lambda: asked_at is not None
+        yield asked
     finally:
+        _thread.deferred = outer
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from systems import interrupts
-from systems.interrupts import deferred_interrupt, stop_when
+from systems.interrupts import deferred_interrupt, interrupt_on_signals, stop_if_asked, stop_when
 
 
 @pytest.fixture(autouse=True)
@@ -81,3 +82,75 @@ def test_a_thread_is_asked_to_stop_by_whoever_runs_it() -> None:
     assert seen == [False, True, False]
     with stop_when(asked.is_set), deferred_interrupt() as asked_to_stop:
         assert not asked_to_stop(), "the main thread listens to signals"
+
+
+@pytest.fixture
+def as_a_program() -> Iterator[None]:
+    """The handlers of a program of ours, for one test."""
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    before = {number: signal.getsignal(number) for number in numbers}
+    interrupt_on_signals()
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no hang-up on this system")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_program_is_interrupted_once_and_then_cleans_up_in_peace(as_a_program: None, name: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.Signals[name])
+    signal.raise_signal(signal.SIGTERM)
+    signal.raise_signal(signal.SIGHUP)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no hang-up on this system")
+def test_a_program_asked_again_much_later_is_interrupted_again(
+    as_a_program: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+    now = time.monotonic()
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "monotonic", lambda: now + 2.0)
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        patch.setattr(time, "monotonic", lambda: now + 60.0)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no hang-up on this system")
+def test_nohup_stays_nohup() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        interrupt_on_signals()
+        signal.raise_signal(signal.SIGHUP)
+        with deferred_interrupt() as asked_to_stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not asked_to_stop()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_whoever_waits_within_a_run_hears_of_the_wish_to_stop() -> None:
+    stop_if_asked()
+    with deferred_interrupt():
+        stop_if_asked()
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            stop_if_asked()
+        with deferred_interrupt():
+            stop_if_asked()
+        with pytest.raises(KeyboardInterrupt):
+            stop_if_asked()
+    stop_if_asked()
+    with stop_when(lambda: True), pytest.raises(KeyboardInterrupt):
+        stop_if_asked()
+    stop_if_asked()
