@@ -12,6 +12,7 @@ from surrogate.judge.ensemble import Ensemble
 from surrogate.judge.rows import Sample
 from surrogate.judge.structure import first_invalid_ps
 from systems import validity
+from systems.imposed import imposed_terms
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class Account:
     """What one trajectory is: where from, how long, how it was made, what it cost.
 
     `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
-    `ns_per_day` and `wall_s` are None where its record holds no cost.
+    `ns_per_day` and `wall_s` are None where its record holds no cost; `imposed` are terms that no model made
+    (systems.imposed).
     """
 
     label: str
@@ -34,6 +36,7 @@ class Account:
     wall_s: float | None
     ns_per_day: float | None
     cost: dict[str, Any]
+    imposed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def account_of(ensemble: Ensemble) -> Account:
         wall_s=wall_s,
         ns_per_day=None if wall_s is None else ensemble.total_ps * 1e-3 * 86_400.0 / wall_s,
         cost=dict(cost),
+        imposed=imposed_terms(record),
     )
 
 

@@ -19,6 +19,7 @@ from surrogate.judge.curves import Curves
 from surrogate.judge.energy_rows import EnergyFn, energy_rows, measure_energies
 from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
 from surrogate.judge.forecast import forecast_charts
+from surrogate.judge.imposed_rows import imposed_notes
 from surrogate.judge.interventions import intervention_rows
 from surrogate.judge.lifetimes import lifetime_rows
 from surrogate.judge.movie import Movie, make_movie
@@ -240,7 +241,7 @@ def _judge(
     seams, without_seams = relaxation.boundary_row(trio)
     rooms = [room(trio) for room in ROOMS]
     more = [row for found, _, _ in rooms for row in found]
-    judged = verdict.judge_rows(by_group([*rows, *kinetic, *slowest, *seams, *more]), options)
+    judged = verdict.judge_rows(by_group([*rows, *kinetic, *slowest, *seams, *more]), options, account.imposed)
     found = verdict.findings(judged)
     compared = trio.reference.features.total_ps
     truth = trio.reference
@@ -269,7 +270,9 @@ def _judge(
             *(x for _, _, why in rooms for x in why),
         ),
         notes=tuple(
-            remarks.trimming(trio, reference, candidate, replicate, correlation) + remarks.unlike(judged, options)
+            remarks.trimming(trio, reference, candidate, replicate, correlation)
+            + remarks.unlike(judged, options)
+            + imposed_notes(account.label, judged, account.imposed)
         ),
         curves=Curves(
             ramachandran=curves.ramachandran_maps(trio),

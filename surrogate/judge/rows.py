@@ -27,7 +27,7 @@ from systems.validity import Geometry
 FloatArray = npt.NDArray[np.float64]
 Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
 Kind = Literal["share", "distance", "observable"]
-Word = Literal["agrees", "close", "differs", "fails", "undecided"]
+Word = Literal["agrees", "close", "differs", "fails", "undecided", "imposed"]
 
 GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributions", "kinetics")
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Literal
 
+from surrogate.judge.imposed_rows import is_imposed
 from surrogate.judge.rows import Options, Row, Word
 from surrogate.judge.statistics import holm
 from systems import validity
@@ -15,23 +16,27 @@ Status = Literal["indistinguishable", "close", "different", "broken", "undecided
 
 _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
-_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
+_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0, "imposed": 0}
 _MENTIONED = 3
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
 
 
-def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
+def judge_rows(rows: Sequence[Row], options: Options, imposed: Collection[str] = ()) -> tuple[Row, ...]:
     """Return the rows with corrected p-values and a word each.
 
     agrees: no significant difference (5 % over all rows, Holm), and a difference beyond the tolerance would have shown;
     close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
-    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
+    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance;
+    imposed: of terms that the candidate's frames were given (systems.imposed), which count for nothing.
     """
-    corrected = holm([math.nan if r.kind == "share" else r.p_value for r in rows])
+    given = [is_imposed(row, imposed) for row in rows]
+    corrected = holm(
+        [math.nan if r.kind == "share" or known else r.p_value for r, known in zip(rows, given, strict=True)]
+    )
     judged = [
-        replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
-        for row, p in zip(rows, corrected, strict=True)
+        replace(row, p_corrected=p, verdict="imposed" if known else _word(row, p, options.significance))
+        for row, p, known in zip(rows, corrected, given, strict=True)
     ]
     hard = [r.verdict for r in judged if r.kind == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
     worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
@@ -96,7 +101,7 @@ def status(rows: Sequence[Row]) -> Status:
         return "broken"
     if "differs" in words:
         return "different"
-    statistical = [r.verdict for r in rows if r.kind != "share"]
+    statistical = [r.verdict for r in rows if r.kind != "share" and r.verdict != "imposed"]
     if statistical and statistical.count("undecided") > 0.5 * len(statistical):
         return "undecided"
     return "close" if "close" in words else "indistinguishable"
@@ -130,13 +135,16 @@ def _excess(row: Row) -> float:
 def sentence(rows: Sequence[Row], found: Sequence[str], compared: str) -> str:
     """Return the verdict in one or two sentences; `compared` is the compared length in words."""
     kind = status(rows)
-    n = len(rows)
+    imposed = sum(r.verdict == "imposed" for r in rows)
+    n = len(rows) - imposed
     undecided = sum(r.verdict == "undecided" for r in rows)
     worst = "; ".join(found[:_MENTIONED])
     more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
     tail = ""
     if undecided:
         tail = f" {undecided} of {n} metrics cannot be decided with this much reference."
+    if imposed:
+        tail += f" {imposed} more are imposed and left out."
     if kind == "broken":
         return f"Broken: {worst}{more}.{tail}"
     if kind == "different":

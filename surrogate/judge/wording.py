@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from surrogate.judge.rows import Row
 from surrogate.judge.statistics import Estimate
 
-MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?"}
+MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?", "imposed": "="}
 STATUS_MARKS = {"indistinguishable": "✓", "close": "≈", "different": "✗", "broken": "‼", "undecided": "?"}
 GROUP_TITLES = {
     "validity": "Validity of frames",
@@ -20,7 +20,7 @@ GROUP_TITLES = {
     "experiment": "To lay beside experiment",
     "energies": "Energies",
 }
-_SEVERITY = ("agrees", "undecided", "close", "differs", "fails")
+_SEVERITY = ("agrees", "imposed", "undecided", "close", "differs", "fails")
 _UNITS = {"_per_ps": "/ps", "_k": "K", "_ps": "ps", "_da": "Da", "_nm": "nm", "_s": "s"}
 
 
