@@ -1,0 +1,91 @@
+"""Which peptides the weights `peptides` are trained on, and which are kept for testing and never trained on."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+# Amino acids with their protonation states, as the library has them capped.
+RESIDUES = (
+    "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HID", "HIE", "HIP", "ILE", "LEU", "LYS", "MET", "PHE",
+    "PRO", "SER", "THR", "TRP", "TYR", "VAL",
+)  # fmt: skip
+# Never trained on. Monomers are tested on long runs of their own: their residues are all in training.
+TEST_PAIRS = (("LEU", "SER"), ("VAL", "ASN"), ("PHE", "GLY"), ("LYS", "GLU"), ("ALA", "PRO"), ("TRP", "THR"))
+TEST_MONOMERS = ("ALA", "ASN", "PHE")
+TEST_CHAINS = (("ALA", "SER", "VAL", "LEU"), ("GLY", "TYR", "GLU", "LYS"))
+TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"),)
+_PAIR_ROUNDS = 3
+_CHAINS = 12
+_FREE_PAIRS = 12
+_SEED = 15
+
+
+@dataclass(frozen=True)
+class Peptide:
+    """One training molecule: residues without caps, whether it is capped (ACE, NME), how many starts and how long."""
+
+    residues: tuple[str, ...]
+    capped: bool
+    n_starts: int
+    time_ps: float
+
+    @property
+    def sequence(self) -> str:
+        """What `sequence:` is given."""
+        return "-".join(("ACE", *self.residues, "NME") if self.capped else self.residues)
+
+    @property
+    def name(self) -> str:
+        return ("" if self.capped else "free-") + "-".join(self.residues)
+
+
+def training_peptides() -> tuple[Peptide, ...]:
+    """Return every training molecule in the order in which they are simulated.
+
+    Monomers first; then capped pairs in three rounds, each of which has every residue once at either position, so that
+    the first n pairs are a fair set for any n; then tri- and tetrapeptides and pairs with free termini by turns.
+    """
+    monomers = [Peptide((residue,), True, 48, 2000.0) for residue in RESIDUES]
+    rng = random.Random(_SEED)
+    taken = set(TEST_PAIRS)
+    pairs = []
+    for _ in range(_PAIR_ROUNDS):
+        drawn = _matching(rng, taken)
+        taken.update(drawn)
+        pairs += [Peptide(pair, True, 20, 1600.0) for pair in drawn]
+    chains = [
+        Peptide(residues, True, 20, 1600.0)
+        for residues in _chains(rng, {*TEST_CHAINS, *TEST_FREE_CHAINS}, lengths=(3, 4), n=_CHAINS)
+    ]
+    free = [
+        Peptide(residues, False, 20, 1600.0) for residues in _chains(rng, set(TEST_PAIRS), lengths=(2,), n=_FREE_PAIRS)
+    ]
+    return (*monomers, *pairs, *(peptide for both in zip(chains, free, strict=True) for peptide in both))
+
+
+def _matching(rng: random.Random, taken: set[tuple[str, ...]]) -> list[tuple[str, str]]:
+    """Return one pair for each residue at the first place, each once at the second, none of them `taken`."""
+    while True:
+        second = list(RESIDUES)
+        rng.shuffle(second)
+        pairs = list(zip(rng.sample(RESIDUES, len(RESIDUES)), second, strict=True))
+        if not taken & set(pairs):
+            return pairs
+
+
+def _chains(
+    rng: random.Random, taken: set[tuple[str, ...]], *, lengths: tuple[int, ...], n: int
+) -> list[tuple[str, ...]]:
+    """Return `n` chains whose residues come from shuffled decks, so that none is drawn far more often than another."""
+    deck: list[str] = []
+    found: list[tuple[str, ...]] = []
+    while len(found) < n:
+        length = lengths[len(found) % len(lengths)]
+        while len(deck) < length:
+            deck += rng.sample(RESIDUES, len(RESIDUES))
+        chain, deck = tuple(deck[:length]), deck[length:]
+        if chain not in taken:
+            taken.add(chain)
+            found.append(chain)
+    return found

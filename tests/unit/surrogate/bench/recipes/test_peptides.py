@@ -1,0 +1,95 @@
+"""The training set of the weights `peptides`: which molecules, from which starts, in which files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from md_reference.platforms import PlatformChoice
+from surrogate.bench.recipes import peptide_runs, peptide_seeds
+from surrogate.bench.recipes.peptide_list import (
+    RESIDUES,
+    TEST_CHAINS,
+    TEST_FREE_CHAINS,
+    TEST_PAIRS,
+    training_peptides,
+)
+from systems import library
+from systems.geometry import torsion
+from systems.sequence import build_peptide
+from systems.trajectory import open_trajectory
+
+
+def test_every_residue_stands_three_times_at_either_place_of_the_capped_pairs() -> None:
+    pairs = [p.residues for p in training_peptides() if p.capped and len(p.residues) == 2]
+    assert len(pairs) == len(set(pairs)) == 66
+    for place in (0, 1):
+        assert Counter(p[place] for p in pairs) == dict.fromkeys(RESIDUES, 3)
+        assert Counter(p[place] for p in pairs[: len(RESIDUES)]) == dict.fromkeys(RESIDUES, 1)
+
+
+def test_no_test_molecule_is_trained_on() -> None:
+    trained = {(p.residues, p.capped) for p in training_peptides()}
+    tested = {(p, True) for p in (*TEST_PAIRS, *TEST_CHAINS)} | {(p, False) for p in TEST_FREE_CHAINS}
+    assert not trained & tested
+    # A pair with free termini would teach the capped one, and a free chain the capped one of the same residues.
+    assert not {r for r, _ in trained} & {r for r, _ in tested}
+
+
+def test_residues_are_those_that_the_library_has_capped() -> None:
+    assert set(RESIDUES) == {n.split("-")[1] for n in library.names() if n.startswith("ACE-")} | {"ALA"}
+
+
+def test_a_turned_peptide_bond_is_cis() -> None:
+    scene = build_peptide("ACE-ALA-PRO-NME")
+    proline = next(r for r in peptide_seeds.residue_torsions(scene) if r.name == "PRO")
+    assert proline.omega is not None
+    turned = peptide_seeds._turned(scene, scene.positions_nm, proline.omega)
+    before, after = (float(torsion(x, np.array([proline.omega]))[0]) for x in (scene.positions_nm, turned))
+    assert abs(np.degrees(before)) > 170
+    assert abs(np.degrees(after)) < 10
+    i, j = scene.bonds.T
+    assert np.allclose(
+        np.linalg.norm(turned[i] - turned[j], axis=-1),
+        np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1),
+    )
+
+
+def test_metadynamics_fills_the_basins_and_not_the_clash() -> None:
+    scene = build_peptide("ACE-ALA-NME")
+    frames, (free,) = peptide_seeds.metadynamics(
+        scene, time_ps=80, temperature_k=500, bias_factor=8, seed=4, platform="Reference"
+    )
+    assert frames.shape == (80, 22, 3)
+    # Minus the bias: no deeper than what was deposited, deepest in alpha and beta, and none at phi = psi = 0.
+    n = len(free) - 1
+    at = np.rint((np.radians([[-70, -30], [-70, 150], [0, 0]]) + np.pi) / (2 * np.pi) * n).astype(int)
+    alpha, beta, clash = (free[psi, phi] for phi, psi in at)
+    assert max(alpha, beta) < clash - 3.0
+
+
+def test_frames_are_drawn_evenly_over_cells() -> None:
+    cells = np.array([0] * 950 + [1] * 50)
+    drawn = peptide_seeds._evenly(np.arange(1000), cells, 40, np.random.default_rng(0))
+    assert len(set(drawn)) == 40
+    assert 10 <= sum(k >= 950 for k in drawn) <= 30
+
+
+@pytest.fixture
+def alanine() -> peptide_runs.Peptide:
+    return replace(training_peptides()[0], n_starts=2, time_ps=3.0)
+
+
+def test_runs_start_at_their_seeds_and_are_made_once(tmp_path: Path, alanine: peptide_runs.Peptide) -> None:
+    scene = build_peptide(alanine.sequence)
+    seeds = peptide_seeds.Seeds(np.stack([scene.positions_nm] * 2), ("basin", "phi>0"))
+    peptide_runs.run(scene, seeds, 1, tmp_path / "run_001.h5", alanine, PlatformChoice("Reference", 1, "told"))
+    with open_trajectory(tmp_path / "run_001.h5") as reader:
+        assert reader.n_frames == 3
+        assert reader.record["start"] == {"group": "phi>0", "index": 1, "discarded_ps": 20.0}
+        assert reader.record["force_field"] == "ff14SB"
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
