@@ -64,7 +64,7 @@ def training_peptides() -> tuple[Peptide, ...]:
     return (*monomers, *pairs, *(peptide for both in zip(chains, free, strict=True) for peptide in both))
 
 
-def _matching(rng: random.Random, taken: set[tuple[str, ...]]) -> list[tuple[str, str]]:
+def _matching(rng: random.Random, taken: set[tuple[str, str]]) -> list[tuple[str, str]]:
     """Return one pair for each residue at the first place, each once at the second, none of them `taken`."""
     while True:
         second = list(RESIDUES)

@@ -180,7 +180,7 @@ def choose_seeds(scene: Scene, n: int, *, seed: int, platform: str) -> Seeds:
 
 
 def _angles(frames_nm: FloatArray, quad: Quad) -> FloatArray:
-    return torsion(frames_nm, np.array([quad]))[:, 0]
+    return np.asarray(torsion(frames_nm, np.array([quad]))[:, 0], dtype=np.float64)
 
 
 def _cells(frames_nm: FloatArray, residues: list[ResidueTorsions]) -> IntArray:
