@@ -1,0 +1,100 @@
+"""What RCSB, CHARMM, GROMACS, VMD and others write into PDB files, and what becomes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from systems import library
+from systems.errors import InputError, PreparationError
+from systems.prepare import prepare
+from systems.scene import Scene
+
+ALA2 = library.load("alanine-dipeptide")
+ROWS = [
+    line
+    for line in (Path(library.__file__).parent / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
+    if line.startswith("ATOM")
+]
+WATER = (
+    "HETATM  901  OW  SOL   101      20.000  20.000  20.000  1.00  0.00",
+    "HETATM  902  HW1 SOL   101      20.957  20.000  20.000  1.00  0.00",
+    "HETATM  903  HW2 SOL   101      19.760  20.927  20.000  1.00  0.00",
+    "HETATM  904  MW  SOL   101      20.100  20.130  20.000  1.00  0.00",
+)
+MATRICES = [
+    f"{name}{k}    {''.join(f'{float(j == k):10.6f}' for j in (1, 2, 3))}        0.00000                         "
+    for name in ("ORIGX", "SCALE", "MTRIX")
+    for k in (1, 2, 3)
+]
+
+
+def shifted(lines: list[str], by: float) -> list[str]:
+    return [f"{line[:30]}{float(line[30:38]) + by:8.3f}{line[38:]}" for line in lines]
+
+
+def read(folder: Path, lines: list[str], **switches: bool) -> Scene:
+    path = folder / "x.pdb"
+    path.write_text("\n".join(lines) + "\n")
+    return prepare(str(path), **switches)
+
+
+def said(scene: Scene) -> str:
+    return " | ".join(scene.provenance["repairs"])
+
+
+def test_matrices_of_the_header_are_no_atoms(tmp_path: Path) -> None:
+    scene = read(tmp_path, [*MATRICES, *ROWS, "END"])
+    assert (scene.n_atoms, said(scene)) == (22, "")
+    assert scene.molecule_key == ALA2.molecule_key
+    with pytest.raises(InputError, match="line 1: 'ORIGX4' is no record"):
+        read(tmp_path, [MATRICES[0].replace("ORIGX1", "ORIGX4"), *ROWS])
+
+
+def test_end_ends_a_structure(tmp_path: Path) -> None:
+    scene = read(tmp_path, [*ROWS, "END", *shifted(ROWS, 0.2), "END"])
+    assert said(scene) == "22 atoms after END left out: they are another structure"
+    assert scene.positions_nm == pytest.approx(ALA2.positions_nm, abs=1e-4)
+    conect = [f"CONECT{i + 1:5d}{j + 1:5d}" for i, j in ALA2.bonds.tolist()]
+    ligand = [line.replace(line[17:20], "LIG").replace("A   " + line[25], "A   1") for line in ROWS]
+    scene = read(tmp_path, [*ligand, "END", *conect])
+    assert said(scene) == "LIG A1: bonds from CONECT records"
+
+
+def test_an_atom_written_twice_is_one(tmp_path: Path) -> None:
+    scene = read(tmp_path, [*ROWS[:9], ROWS[8][:60], *ROWS[9:]])
+    assert (scene.n_atoms, said(scene)) == (22, "1 atom written twice on one point: one of each left out")
+    other = ROWS[8][:12] + " CB " + ROWS[8][16:]
+    with pytest.raises(PreparationError, match="stand on one point"):
+        read(tmp_path, [*ROWS[:9], other, *ROWS[9:]])
+
+
+def test_molecules_numbered_alike_are_chains_of_their_own(tmp_path: Path) -> None:
+    plain = [line[:21] + " " + line[22:] for line in ROWS]
+    for between in ([], ["TER"]):
+        scene = read(tmp_path, [*plain, *between, *shifted(plain, 20.0)])
+        assert scene.residue_names == ("ACE", "ALA", "NME") * 2
+        assert scene.chain_of_residue == ("", "", "", ":2", ":2", ":2")
+        assert said(scene) == "residue numbers come again: :2 are chains of their own"
+        assert len(scene.bonds) == 2 * len(ALA2.bonds)
+
+
+def test_virtual_sites_and_drude_particles_are_left_out(tmp_path: Path) -> None:
+    scene = read(tmp_path, [*ROWS, *WATER], drop_water=True)
+    assert said(scene) == "1 virtual sites and Drude particles left out: MW | 1 water molecule left out"
+    drude = [f"{line[:12]} D{line[13:15].strip():<2s}{line[16:66]}" for line in ROWS if line[12:15] in (" N ", " CA")]
+    lone = f"{ROWS[4][:12]} LPA{ROWS[4][16:30]}{float(ROWS[4][30:38]) + 0.3:8.3f}{ROWS[4][38:66]}"
+    scene = read(tmp_path, [*ROWS, *drude, lone])
+    assert scene.n_atoms == 22 and said(scene).startswith(f"{len(drude) + 1} virtual sites and Drude particles left")
+    far = drude[0][:30] + "  50.000" + drude[0][38:]
+    with pytest.raises(InputError, match="no recognisable element"):
+        read(tmp_path, [*ROWS, far])
+
+
+def test_numbers_beyond_five_figures_and_a_byte_order_mark(tmp_path: Path) -> None:
+    wide = [f"ATOM {100_000 + k:6d}{line[11:]}" for k, line in enumerate(ROWS)]
+    scene = read(tmp_path, ["\ufeffREMARK", *wide])
+    assert (scene.n_atoms, said(scene)) == (22, "")
+    assert np.abs(scene.positions_nm - ALA2.positions_nm).max() < 1e-4
