@@ -6,7 +6,7 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from md_reference.campaign_settings import Settings, read_settings, to_config
 from md_reference.protocol import settle_by_name
 from md_reference.run_config import MDConfig
 from systems.errors import InputError, SurromdError, nearest
+from systems.protocols import find_protocol
 from systems.units import parse_temperature_k, parse_wall_s
 
 SUFFIXES = ("h5", "dcd")
@@ -102,7 +103,8 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
 
 _CAMPAIGN_KEYS = ("name", "out", "format", "seed", "retries", "checkpoint_every", "scenes", "cluster")
 _SCENE_KEYS = ("scene", "name")
-_AXIS_KEYS = ("replicas", "temperatures")
+# What a table says of its runs beside their settings.
+_AXIS_KEYS = ("replicas", "temperatures", "protocol")
 
 
 def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
@@ -225,8 +227,9 @@ def _name_of(source: str) -> str:
 
 
 def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix: str) -> list[Run]:
+    shared, protocol = _by_protocol(shared, own)
     given = {**shared.values, **own.values}
-    values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given)
+    values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given, protocol)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.
     if "temperature_k" in own.values and "temperatures" not in own.axes:
@@ -249,6 +252,18 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix
     if len({run.name for run in runs}) < len(runs):
         raise InputError("a temperature is listed twice.")
     return runs
+
+
+def _by_protocol(shared: Settings, own: Settings) -> tuple[Settings, str | None]:
+    """Return the protocol that a scene's runs go by, and the campaign's settings without what it outweighs: a protocol
+    of the scene's own outweighs what the campaign says, that of the campaign does not."""
+    if "protocol" not in own.axes:
+        return shared, _text(shared.axes, "protocol", "") or None
+    name = _text(own.axes, "protocol", "")
+    decided = find_protocol(name).settings
+    values = {key: value for key, value in shared.values.items() if key not in decided}
+    left_out = ("protocol", "temperatures") if "temperature_k" in decided else ("protocol",)
+    return replace(shared, values=values, axes={k: v for k, v in shared.axes.items() if k not in left_out}), name
 
 
 def first_seed(seed: int, scene: str, temperature_k: float) -> int:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any
 
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.run_config import MDConfig, settings_of
 from systems.errors import InputError, nearest
-from systems.units import parse_mass_da, parse_rate_per_ps, parse_temperature_k, parse_time_ps
+from systems.units import PARSERS
 
-# The longest ending first: a friction ends in _ps, too.
-_PARSERS: dict[str, Callable[[str, str], float]] = {
-    "_per_ps": parse_rate_per_ps,
-    "_ps": parse_time_ps,
-    "_k": parse_temperature_k,
-    "_da": parse_mass_da,
-}
+# Settings whose names end so are written without it, as texts with a unit.
+_PARSERS = {ending: PARSERS[ending] for ending in ("_per_ps", "_ps", "_k", "_da")}
 # These belong to a run's place in the campaign.
 _NOT_SETTINGS = ("seed", "force")
 # As on the command line: what the user leaves open is settled for the scene.

@@ -1,4 +1,7 @@
-"""The settings of a run: what the user gave, else the protocol of a library scene, else the program's defaults."""
+"""The settings of a run: what the user gave, else the protocol asked for by name, else the program's defaults.
+
+The defaults are those of the molecule, under whichever name it is asked for. Model systems bring settings of their own.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from md_reference.forcefield import QUANTUM, ForceFieldSpec
 from md_reference.run_config import MDConfig
 from systems import library
 from systems.errors import InputError
+from systems.protocols import find_protocol
 from systems.scene import Scene
 from systems.units import format_time_ps
 
@@ -35,22 +39,23 @@ def defaults() -> dict[str, Any]:
     return found | {"force_field": "auto", "solvent": "auto"}
 
 
-def settle(scene: Scene, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def settle(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
     """Return all settings of a run of `scene`, and a line about what its protocol decided, empty where nothing.
 
-    `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec. A protocol goes with scenes of
-    the library (`systems.library.protocol`). Its solvent goes with its force field and is left out when the user names
-    another one; its flexible bonds are left out above a time step of 1 fs.
+    `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names one of
+    `systems.protocols`. Its solvent goes with its force field and is left out when the user names another one; its
+    flexible bonds are left out above a time step of 1 fs. Raises UnknownNameError, and InputError for a model system,
+    whose settings are its own.
     """
     name = scene.provenance.get("library_name")
-    return settle_by_name(name if isinstance(name, str) else "", given)
+    return settle_by_name(name if isinstance(name, str) else "", given, protocol)
 
 
-def settle_by_name(name: str, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
     """Return what `settle` does for the scene of this name, or any other if the library does not know it."""
-    protocol = library.protocol(name) if library.knows(name) else {}
+    decisive, said_as = _decisive(name, protocol)
     if "force_field" in given:
-        protocol.pop("solvent", None)
+        decisive.pop("solvent", None)
     own = defaults()
     if given.get("force_field") == QUANTUM:
         if given.get("timestep_ps", 0.0) > LONGEST_FLEXIBLE_STEP_PS:
@@ -59,17 +64,26 @@ def settle_by_name(name: str, given: Mapping[str, Any]) -> tuple[dict[str, Any],
                 "long; use --timestep 1fs or less."
             )
         own |= QUANTUM_DEFAULTS
-        protocol.pop("equilibrate_ps", None)
-    settings = own | protocol | dict(given)
+        decisive.pop("equilibrate_ps", None)
+    settings = own | decisive | dict(given)
     if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:
         settings["constrain_hydrogens"] = True
-    # Force field and solvent are said even where `auto` comes to the same: they are what a protocol is about.
-    decided = {key: settings[key] for key in protocol if key not in given and settings[key] != own[key]}
-    changed = set(decided) - {"force_field", "solvent"}
-    if not changed and protocol.get("solvent", "obc2") == "obc2":
+    decided = {key: settings[key] for key in decisive if key not in given and settings[key] != own[key]}
+    if not decided:
         return settings, ""
-    words = ", ".join(_say(key, value) for key, value in decided.items())
-    return settings, f"by the library's protocol: {words} ({library.protocol_source(name)})"
+    what, source = said_as
+    return settings, f"{what}: {', '.join(_say(key, value) for key, value in decided.items())} ({source})"
+
+
+def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[str, str]]:
+    """Return the settings that come before the program's defaults, and how they and their source are called."""
+    own = library.own_settings(name) if library.knows(name) else {}
+    if protocol is None:
+        return own, ("by the system's own settings", library.source_of_settings(name) if own else "")
+    if own:
+        raise InputError(f"{name} brings its own law and its own settings; leave --protocol out.")
+    found = find_protocol(protocol)
+    return dict(found.settings), (f"by protocol {found.name}", found.source)
 
 
 def _say(key: str, value: Any) -> str:

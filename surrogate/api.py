@@ -1,7 +1,8 @@
 """The verbs, as plain functions: each does what the command of the same name does, and returns what it printed.
 
-Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton. A `scene` is a `systems.scene.Scene`, or what
-the command line takes: a library name, a path, `smiles:CCO` or `sequence:ACE-ALA-NME`. Everything a user can get wrong
+Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton; a text carries its own unit (`time_ps="10ns"`,
+`temperature_k="310K"`). A `scene` is a `systems.scene.Scene`, or what the command line takes: a library name, a path,
+`smiles:CCO` or `sequence:ACE-ALA-NME`. Everything a user can get wrong
 raises a `systems.errors.SurromdError` whose message is one line.
 """
 
@@ -19,6 +20,7 @@ from surrogate.references import plan, reference
 from surrogate.rollouts import rollout
 from surrogate.scenes import systems
 from systems.errors import InputError, UnknownNameError, nearest
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison
@@ -29,8 +31,8 @@ __all__ = ["campaign", "compare", "demo", "info", "plan", "reference", "rollout"
 def demo(
     out_dir: PathLike = "surromd-demo",
     *,
-    reference_ps: float = 3_000.0,
-    rollout_ps: float = 2_500.0,
+    reference_ps: Quantity = 3_000.0,
+    rollout_ps: Quantity = 2_500.0,
     rollout_replicas: int = 8,
     seed: int = 0,
     quiet: bool = False,
@@ -40,6 +42,7 @@ def demo(
     Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate_r0.h5, ..., report.html and report.json into
     `out_dir`, replacing those of an earlier demo.
     """
+    reference_ps, rollout_ps = quantity("reference_ps", reference_ps), quantity("rollout_ps", rollout_ps)
     folder = Path(out_dir)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -146,7 +149,7 @@ def train(
     *,
     arch: str = "lam-slide",
     config: PathLike | None = None,
-    budget_s: float | None = None,
+    budget_s: Quantity | None = None,
     steps: int | None = None,
     start_from: PathLike | None = None,
     validation: Trajectories | None = None,
@@ -156,7 +159,7 @@ def train(
     hydrogens: str | None = None,
     entities: str | None = None,
     graph: bool = False,
-    longest_lag_ps: float | None = None,
+    longest_lag_ps: Quantity | None = None,
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
@@ -199,7 +202,7 @@ def train(
         held=[],
         out=out,
         config=None if config is None else Path(config),
-        budget_s=budget_s,
+        budget_s=quantity("budget_s", budget_s),
         steps=steps,
         start_from=None if start_from is None else weights_path(start_from),
         time_reversal=time_reversal,
@@ -208,7 +211,7 @@ def train(
         hydrogens=hydrogens,
         entities=entities,
         graph=graph,
-        longest_lag_ps=longest_lag_ps,
+        longest_lag_ps=quantity("longest_lag_ps", longest_lag_ps),
         seed=seed,
         device=device,
         resume=resume,

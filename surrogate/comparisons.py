@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.outputs import PathLike, Trajectories, check_outputs, find_trajectories
 from systems.errors import InputError
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,19 +21,20 @@ if TYPE_CHECKING:
 
 def compare(
     reference: Trajectories,
-    candidates: Sequence[Trajectories],
+    candidates: PathLike | Sequence[Trajectories],
     out_html: PathLike | None = None,
     *,
     replicate: Trajectories | None = None,
     top: PathLike | None = None,
-    lag_ps: float | None = None,
-    labels: Sequence[str] | None = None,
+    lag_ps: Quantity | None = None,
+    labels: str | Sequence[str] | None = None,
     energies: bool = False,
 ) -> Comparison:
     """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
     The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
-    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other. `top`: topology for
+    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
+    `candidates` is one candidate, and a sequence holds one each. `top`: topology for
     files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. `energies`:
     judge the potential energy of every k-th frame too, by the force field that the reference's file names.
     Raises InputError, TrajectoryError, OutOfDomainError.
@@ -40,6 +42,10 @@ def compare(
     from surrogate.judge.comparison import compare as judge
     from surrogate.judge.ensemble import load_ensemble
 
+    if isinstance(candidates, str | Path):
+        candidates = [candidates]
+    labels = [labels] if isinstance(labels, str) else labels
+    lag_ps = quantity("lag_ps", lag_ps)
     if not candidates:
         raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
     if labels is not None and len(labels) != len(candidates):

@@ -2,7 +2,7 @@
 
 Python takes them as keywords (`takes`), the command line as flags (`surrogate.cli_options.spread_options`); a
 campaign's file calls them as the flags do (`md_reference.campaign_settings`). What is left open (None) is settled for
-the scene: by the protocol of a library scene, else by what the help calls the default.
+the scene: by the protocol that is asked for, else by what the help calls the default.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypedDict, TypeVar, get_type_hints
 
 from systems.units import (
+    Quantity,
     parse_length_nm,
     parse_mass_da,
     parse_molar,
+    parse_pressure_bar,
     parse_rate_per_ps,
     parse_temperature_k,
     parse_time_ps,
@@ -58,28 +60,31 @@ Replicas = Annotated[int, Flag("--replicas", "Independent runs; NAME.h5 becomes 
 class MDSettings(TypedDict, total=False):
     """What the MD is and how it is run: fields of MDConfig and ForceFieldSpec, and what makes the box."""
 
+    protocol: Annotated[
+        str | None, Flag("--protocol", "A paper's settings, unless given: md17, md22, mdgen, fast-folders.")
+    ]
     force_field: Annotated[
         str | None, Flag("--force-field", "ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb. [default: auto]")
     ]
     solvent: Annotated[str | None, Flag("--solvent", "obc2, gbn2, tip3p, opc, vacuum, amber99-obc. [default: auto]")]
     level: Annotated[str | None, Flag("--level", "mm or gfn2-xtb, quantum mechanics for molecules. [default: mm]")]
     padding_nm: Annotated[
-        float | None,
+        Quantity | None,
         Flag("--padding", "From the solute to the walls, in explicit water. [default: 1nm]", read=parse_length_nm),
     ]
     ionic_strength_molar: Annotated[
-        float | None,
+        Quantity | None,
         Flag("--ionic-strength", "Of NaCl in explicit water, beside counter-ions. [default: 0M]", read=parse_molar),
     ]
     temperature_k: Annotated[
-        float | None, Flag("--temperature", "Of the bath. [default: 300K]", read=parse_temperature_k)
+        Quantity | None, Flag("--temperature", "Of the bath. [default: 300K]", read=parse_temperature_k)
     ]
     friction_per_ps: Annotated[
-        float | None, Flag("--friction", "Of the Langevin bath. [default: 1/ps]", read=parse_rate_per_ps)
+        Quantity | None, Flag("--friction", "Of the Langevin bath. [default: 1/ps]", read=parse_rate_per_ps)
     ]
-    timestep_ps: Annotated[float | None, Flag("--timestep", "Integration step. [default: 4fs]", read=parse_time_ps)]
+    timestep_ps: Annotated[Quantity | None, Flag("--timestep", "Integration step. [default: 4fs]", read=parse_time_ps)]
     hydrogen_mass_da: Annotated[
-        float | Default | None,
+        Quantity | Default | None,
         Flag(
             "--hydrogen-mass",
             "Repartitioned mass, or 'natural'. [default: 3Da]",
@@ -88,11 +93,13 @@ class MDSettings(TypedDict, total=False):
         ),
     ]
     equilibrate_ps: Annotated[
-        float | None,
+        Quantity | None,
         Flag("--equilibrate", "So long before the first frame, unwritten. [default: 100ps]", read=parse_time_ps),
     ]
     ensemble: Annotated[str | None, Flag("--ensemble", "nvt, nve or npt. [default: nvt]")]
-    pressure_bar: Annotated[float | None, Flag("--pressure", "Of the barostat (npt), in bar. [default: 1]")]
+    pressure_bar: Annotated[
+        Quantity | None, Flag("--pressure", "Of the barostat (npt). [default: 1bar]", read=parse_pressure_bar)
+    ]
     replicas: Replicas
     platform: Annotated[
         str, Flag("--platform", "OpenMM platform; auto: the fastest, timed on the scene.", default="auto")
@@ -121,20 +128,21 @@ def flags_of(options: Any) -> dict[str, tuple[Any, Flag]]:
 
 
 def takes(options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let a verb that ends in `**options: Unpack[...]` be called with all of them filled in by their defaults.
+    """Let a verb that ends in `**options: Unpack[...]` be called with all of them filled in by their defaults, and
+    texts with units (`temperature_k="310K"`) read.
 
     Its signature lists them one by one, as an editor or `help` shows it. Any other keyword is a TypeError, as always.
     """
 
     def decorate(verb: Callable[P, R]) -> Callable[P, R]:
-        plain = inspect.signature(verb)
+        plain, flags = inspect.signature(verb), flags_of(options)
         named = [p for p in plain.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
         whole = plain.replace(
             parameters=[
                 *named,
                 *(
                     inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=flag.default, annotation=kind)
-                    for name, (kind, flag) in flags_of(options).items()
+                    for name, (kind, flag) in flags.items()
                 ),
             ]
         )
@@ -146,6 +154,10 @@ def takes(options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
             except TypeError as error:
                 raise TypeError(f"{verb.__name__}() {error}") from None
             bound.apply_defaults()
+            for name, (_, flag) in flags.items():
+                value = bound.arguments[name]
+                if flag.read is not None and isinstance(value, str) and value != flag.default:
+                    bound.arguments[name] = flag.read(value, name)
             return verb(*bound.args, **bound.kwargs)
 
         call.__signature__ = whole  # type: ignore[attr-defined]

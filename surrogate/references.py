@@ -10,6 +10,7 @@ from surrogate.md_options import MDOptions, takes
 from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, guarded_outputs
 from surrogate.progress import progress_bar
 from surrogate.scenes import prepare_scene, tell
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from md_reference.simulate import MDConfig
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @takes(MDOptions)
-def plan(scene: str | Scene, *, time_ps: float | None = None, **options: Unpack[MDOptions]) -> dict[str, Any]:
+def plan(scene: str | Path | Scene, *, time_ps: Quantity | None = None, **options: Unpack[MDOptions]) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
     `options`: those of `reference` (surrogate.md_options.MDOptions). Steps are timed for about a second; with `time_ps`
@@ -25,6 +26,7 @@ def plan(scene: str | Scene, *, time_ps: float | None = None, **options: Unpack[
     """
     from md_reference.plan import make_plan
 
+    time_ps = quantity("time_ps", time_ps)
     molecule = prepare_scene(scene, options, quiet=False)
     molecule, config, protocol = _settle(
         molecule, options, time_ps=1.0 if time_ps is None else time_ps, seed=0, quiet=True
@@ -47,11 +49,11 @@ def plan(scene: str | Scene, *, time_ps: float | None = None, **options: Unpack[
 
 @takes(MDOptions)
 def reference(
-    scene: str | Scene,
+    scene: str | Path | Scene,
     out: str | Path,
     *,
-    time_ps: float,
-    save_every_ps: float | None = None,
+    time_ps: Quantity,
+    save_every_ps: Quantity | None = None,
     save_velocities: bool = False,
     save_forces: bool = False,
     seed: int = 0,
@@ -72,14 +74,16 @@ def reference(
     each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
 
     `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
-    `seed + 1`, ... Settings that are not given are those of the library's protocol for a scene of the library
-    (`systems(name)`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs,
-    3 Da, 100 ps of equilibration that is not written, nvt, frames every ps. `hydrogen_mass_da=None` keeps natural
-    masses. `ph` to `drop_water`: see `systems.prepare.prepare`. `resume` goes on from the checkpoint beside `out`.
+    `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name: `systems.protocols`), else
+    ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs, 3 Da, 100 ps of
+    equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked for by; model systems
+    bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see `systems.prepare.prepare`.
+    `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.replicas import replica_paths, simulate_replicas
 
+    time_ps, save_every_ps = quantity("time_ps", time_ps), quantity("save_every_ps", save_every_ps)
     replicas = options["replicas"]
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
@@ -125,7 +129,7 @@ def _settle(
     seed: int,
     quiet: bool,
 ) -> tuple[Scene, MDConfig, str]:
-    """Return the scene, solvated if asked, the settings of a run, and a line about what the library's protocol decided.
+    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
 
     Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
     """
@@ -142,11 +146,15 @@ def _settle(
     asked = {name: value for name, value in given.items() if name in settings_of_a_run and value is not None}
     if options["hydrogen_mass_da"] != "default":
         asked["hydrogen_mass_da"] = options["hydrogen_mass_da"]
-    settings, protocol = settle(scene, asked)
+    settings, protocol = settle(scene, asked, options["protocol"])
     config = to_config(settings | {"time_ps": time_ps}, seed=seed)
     config = replace(config, force=resolve(scene, config.force))
     dry = scene
-    scene = solvate_if_asked(scene, config.force, options["padding_nm"], options["ionic_strength_molar"], seed=seed)
+    padding_nm, salt_molar = (
+        quantity("padding_nm", options["padding_nm"]),
+        quantity("ionic_strength_molar", options["ionic_strength_molar"]),
+    )
+    scene = solvate_if_asked(scene, config.force, padding_nm, salt_molar, seed=seed)
     config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
     if not quiet:
         if scene is not dry:

@@ -11,6 +11,7 @@ from surrogate.md_options import Preparation, takes
 from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, guarded_outputs
 from surrogate.progress import progress_bar
 from surrogate.scenes import prepare_scene
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -18,13 +19,13 @@ if TYPE_CHECKING:
 
 @takes(Preparation)
 def rollout(
-    scene: str | Scene,
+    scene: str | Path | Scene,
     weights: str | Path,
     out: str | Path,
     *,
-    time_ps: float,
-    save_every_ps: float | None = None,
-    lag_ps: float | None = None,
+    time_ps: Quantity,
+    save_every_ps: Quantity | None = None,
+    lag_ps: Quantity | None = None,
     replicas: int = 1,
     seed: int = 0,
     solver: str | None = None,
@@ -33,11 +34,11 @@ def rollout(
     compile: bool = False,
     guard: str = "flag",
     energy_every: int = 0,
-    md_between_ps: float = 0.0,
+    md_between_ps: Quantity = 0.0,
     select: str | None = None,
     atoms: str = "all",
     force: bool = False,
-    temperature_k: float | None = None,
+    temperature_k: Quantity | None = None,
     resume: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
@@ -65,6 +66,9 @@ def rollout(
     """
     from md_reference.replicas import replica_paths
 
+    time_ps, save_every_ps = quantity("time_ps", time_ps), quantity("save_every_ps", save_every_ps)
+    lag_ps, md_between_ps = quantity("lag_ps", lag_ps), quantity("md_between_ps", md_between_ps)
+    temperature_k = quantity("temperature_k", temperature_k)
     outs = replica_paths(Path(out), replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
     file = weights_path(weights)

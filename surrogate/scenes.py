@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def systems(name: str | None = None) -> list[dict[str, Any]]:
-    """Return what the library holds: one record per named scene, or the one asked for, with its protocol and atoms.
+    """Return what the library holds: one record per named scene, or the one asked for, with its protocols and atoms.
 
     Raises UnknownNameError (with the nearest name).
     """
@@ -35,6 +36,7 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
     }
     if whole:
         from systems.chemistry import backbone_torsions
+        from systems.protocols import find_protocol
 
         record |= {
             "n_bonds": len(scene.bonds),
@@ -45,21 +47,30 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
             "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
             "topology_hash": scene.topology_hash,
             "molecule_key": scene.molecule_key,
-            "protocol": {k: "natural" if v is None else v for k, v in library.protocol(name).items()},
-            "protocol_source": library.protocol_source(name),
+            "protocols": {each: _written(find_protocol(each).settings) for each in library.protocols(name)},
         }
         if scene.interactions is not None:
-            record["law"] = scene.interactions
+            record |= {
+                "law": scene.interactions,
+                "settings": _written(library.own_settings(name)),
+                "source": library.source_of_settings(name),
+            }
     return record
 
 
-def prepare_scene(scene: str | Scene, options: Preparation, *, quiet: bool) -> Scene:
-    """Return a Scene for what a user may write; what had to be repaired is said on stderr.
+def _written(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings as they are printed."""
+    return {key: "natural" if value is None else value for key, value in settings.items()}
+
+
+def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
+    """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr.
 
     Raises what `systems.prepare.prepare` raises.
     """
-    if not isinstance(scene, str):
+    if not isinstance(scene, str | Path):
         return scene
+    scene = str(scene)
     from systems.prepare import prepare
 
     prepared = prepare(

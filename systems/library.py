@@ -49,17 +49,25 @@ def describe(name: str) -> str:
     return _known(name).title
 
 
-def protocol(name: str) -> dict[str, Any]:
-    """Return the settings that a run of this scene takes where the user gives none (names of `api.reference`).
+def own_settings(name: str) -> dict[str, Any]:
+    """Return the settings that a model system brings (names of `api.reference`); empty for a molecule.
 
     Raises UnknownNameError.
     """
-    return dict(_known(name).protocol)
+    return dict(_known(name).own_settings)
 
 
-def protocol_source(name: str) -> str:
-    """Return where the protocol of a named scene comes from, in words. Raises UnknownNameError."""
+def source_of_settings(name: str) -> str:
+    """Return where a model system's own settings come from, in words. Raises UnknownNameError."""
     return _known(name).source
+
+
+def protocols(name: str) -> tuple[str, ...]:
+    """Return the names of the protocols (systems.protocols) that papers simulated this scene by.
+
+    Raises UnknownNameError.
+    """
+    return _known(name).protocols
 
 
 def load(name: str) -> Scene:
@@ -138,11 +146,9 @@ def _find(name: str) -> Entry | None:
     if len(residues) == 4 and "ACE" not in residues and "NME" not in residues:
         return _tetrapeptide(sequence, sequence)
     title = f"{sequence}, built extended from its sequence"
-    return Entry(sequence, catalogue.PEPTIDES, title, catalogue.PEPTIDE_PROTOCOL, "this program's defaults",
-                 sequence=sequence)  # fmt: skip
+    return Entry(sequence, catalogue.PEPTIDES, title, sequence=sequence)
 
 
 def _tetrapeptide(name: str, sequence: str) -> Entry:
     title = f"{sequence}, a tetrapeptide with charged ends, built extended from its sequence"
-    return Entry(name, catalogue.PEPTIDES, title, catalogue.TETRAPEPTIDE_PROTOCOL, catalogue.TETRAPEPTIDE_SOURCE,
-                 sequence=sequence)  # fmt: skip
+    return Entry(name, catalogue.PEPTIDES, title, protocols=("mdgen",), sequence=sequence)

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
+from numbers import Real
+from typing import Any, overload
 
 from systems.errors import UnitError
+
+# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
+Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
 _TIME_PS = {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "\u00b5s": 1e6, "\u03bcs": 1e6, "ms": 1e9}
@@ -16,6 +22,7 @@ _RATE_PER_PS = {"/ps": 1.0, "1/ps": 1.0, "ps^-1": 1.0, "/fs": 1e3, "1/fs": 1e3, 
 _LENGTH_NM = {"nm": 1.0, "A": 0.1, "Å": 0.1, "angstrom": 0.1, "pm": 1e-3}
 _MOLAR = {"M": 1.0, "mM": 1e-3, "mol/l": 1.0, "mol/L": 1.0, "": 1.0}
 _MASS_DA = {"Da": 1.0, "u": 1.0, "amu": 1.0, "": 1.0}
+_PRESSURE_BAR = {"bar": 1.0, "atm": 1.01325, "": 1.0}
 _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 
@@ -71,6 +78,48 @@ def parse_length_nm(text: str, what: str = "length") -> float:
 def parse_molar(text: str, what: str = "concentration") -> float:
     """Return a concentration in mol/l (`0.15M`, `150mM`, `0.15` or `0`). Raises UnitError."""
     return 0.0 if text.strip() in ("0", "0M", "0mM") else _parse(text, _MOLAR, what, "0.15M")
+
+
+def parse_pressure_bar(text: str, what: str = "pressure") -> float:
+    """Return a pressure in bar (`1bar`, `1atm` or `1`). Raises UnitError."""
+    return _parse(text, _PRESSURE_BAR, what, "1bar")
+
+
+# By what a name ends in; the longest ending first: a friction ends in _ps, too.
+PARSERS: dict[str, Callable[[str, str], float]] = {
+    "_per_ps": parse_rate_per_ps,
+    "_ps": parse_time_ps,
+    "_k": parse_temperature_k,
+    "_da": parse_mass_da,
+    "_nm": parse_length_nm,
+    "_molar": parse_molar,
+    "_bar": parse_pressure_bar,
+    "_s": parse_wall_s,
+}
+
+
+@overload
+def quantity(name: str, value: Quantity) -> float: ...
+@overload
+def quantity(name: str, value: None) -> None: ...
+def quantity(name: str, value: Any) -> float | None:
+    """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
+
+    `value` is a number in that unit or a text with its own, such as '10ns'; None stays None. Raises UnitError for
+    another kind of value, and for a number that is negative or not finite.
+    """
+    if value is None:
+        return None
+    ending, parse = next(item for item in PARSERS.items() if name.endswith(item[0]))
+    if isinstance(value, str):
+        return parse(value, name)
+    unit = ending.strip("_").replace("per_", "1/")
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise UnitError(f"{name} = {value!r} must be a number in {unit}, or a text with its unit.")
+    number = float(value)
+    if not math.isfinite(number) or number < 0:
+        raise UnitError(f"{name} = {value!r} must be finite and not negative.")
+    return number
 
 
 def format_time_ps(time_ps: float) -> str:

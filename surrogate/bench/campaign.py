@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from md_reference.campaign import run_campaign
 from md_reference.campaign_cluster import open_client
 from md_reference.campaign_file import Campaign, read_campaign
+from systems import library
 from systems.errors import SurromdError
 from systems.manifest import COMPLETE, Manifest, campaign_trajectories, read_manifest
 
@@ -46,8 +47,12 @@ WORKERS = 2
 
 def campaign_text(time_ps: float) -> str:
     """Return the campaign's file. The Reference platform: its runs are bit-identical wherever they are resumed."""
+    tables = []
+    for name in SCENES:
+        protocol = "".join(f', protocol = "{one}"' for one in library.protocols(name))
+        tables.append(f'{{ scene = "{name}"{protocol} }}')
     return (
-        f"scenes = {json.dumps(SCENES)}\n"
+        f"scenes = [{', '.join(tables)}]\n"
         'temperatures = ["300K", "500K"]\n'
         "replicas = 2\n"
         f'time = "{time_ps:g}ps"\n'

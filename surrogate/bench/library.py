@@ -1,4 +1,6 @@
-"""Every scene of the library, run for 10 ps by its protocol and looked at: `python -m surrogate.bench.library`."""
+"""Every scene of the library, run for 10 ps by its paper's protocol, else by the defaults, and looked at:
+`python -m surrogate.bench.library`.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ class Outcome:
 
 
 def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
-    """Run one scene by its protocol, equilibrated for ten relaxation times of the bath, and check the file it wrote.
+    """Run one scene by its first protocol, if it has one, equilibrated for ten relaxation times of the bath, and check
+    the file it wrote.
 
     Frames must number what was asked for, pass the checks of `systems.validity`, and open in MDTraj and MDAnalysis with
     the same coordinates. `energy_spread`: in NVE, the standard deviation of the total energy over the mean kinetic one.
@@ -63,7 +66,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
     began = time.perf_counter()
     try:
         scene = library.load(name)
-        settings, _ = settle(scene, {})
+        settings, _ = settle(scene, {}, next(iter(library.protocols(name)), None))
         settings |= {
             "time_ps": time_ps,
             "equilibrate_ps": min(settings["equilibrate_ps"], 10.0 / settings["friction_per_ps"]),

@@ -32,7 +32,7 @@ def make_trajectories(
 ) -> dict[str, Path]:
     """Simulate molecules of the library without a bath, as MD17 was made; return their files, positions and velocities.
 
-    The library's protocol (GAFF2 in vacuum, 0.5 fs, frames every 5 fs), equilibrated at 500 K, then at constant energy:
+    MD17's protocol (GAFF2 in vacuum, 0.5 fs, frames every 5 fs), equilibrated at 500 K, then at constant energy:
     at a friction of 0.1/ps the bath alone moves a carbon by 0.08 Å in the 100 fs that are to be predicted. Finished
     files stay and interrupted ones go on. Raises InputError for files of other settings.
     """
@@ -45,7 +45,7 @@ def make_trajectories(
     paths = {name: folder / f"{name}.h5" for name in names}
     for k, (name, path) in enumerate(paths.items()):
         scene = library.load(name)
-        settings, _ = settle(scene, {"ensemble": "nve"})
+        settings, _ = settle(scene, {"ensemble": "nve"}, "md17")
         config = to_config(settings | {"time_ps": time_ps}, seed=seed)
         config = replace(config, force=resolve(scene, config.force), save_velocities=True)
 

@@ -17,6 +17,7 @@ from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.openmm_state import SurrogateState
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -43,7 +44,7 @@ class Simulation:
 
     def __init__(
         self,
-        scene: str | Scene,
+        scene: str | Path | Scene,
         weights: str | Path | Weights,
         *,
         seed: int = 0,
@@ -52,13 +53,13 @@ class Simulation:
         precision: str = "auto",
         energy_fn: EnergyFn | None = None,
         force: bool = False,
-        lag_ps: float | None = None,
+        lag_ps: Quantity | None = None,
     ) -> None:
         import openmm
         from openmm import unit
 
         scene, weights = _given(scene, weights)
-        weights, match = fit_weights(scene, weights, force=force, lag_ps=lag_ps)
+        weights, match = fit_weights(scene, weights, force=force, lag_ps=quantity("lag_ps", lag_ps))
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
         self.topology = scene.to_openmm_topology()
@@ -275,11 +276,11 @@ _PROPERTIES = {
 }  # fmt: skip
 
 
-def _given(scene: str | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
-    if isinstance(scene, str):
+def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
+    if isinstance(scene, str | Path):
         from systems.prepare import prepare
 
-        scene = prepare(scene)
+        scene = prepare(str(scene))
     if isinstance(weights, str | Path):
         from surrogate.data.shipped import weights_path
         from surrogate.data.weights import load_weights

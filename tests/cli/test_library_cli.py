@@ -1,4 +1,4 @@
-"""`surromd systems`, and the protocol of a library scene in `plan` and `reference`."""
+"""`surromd systems`, and protocols in `plan` and `reference`."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ def test_systems_lists_every_scene_in_its_group() -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("uracil", ["gaff2", "500", "0.0005", "natural", "MD17"]),
+        ("uracil", ["md17", "gaff2", "500", "0.0005", "natural"]),
         ("n-body-gravity:3", ["nve", "gravitational_constant", "softening_nm", "GeoTDM"]),
-        ("SDFS", ["SER-ASP-PHE-SER", "gbn2", "350", "MDGen"]),
+        ("SDFS", ["SER-ASP-PHE-SER", "mdgen", "gbn2", "350"]),
     ],
 )
-def test_systems_shows_a_scene_with_its_protocol(name: str, words: list[str]) -> None:
+def test_systems_shows_a_scene_with_its_protocols_or_its_own_settings(name: str, words: list[str]) -> None:
     printed = run("systems", name).stdout
     for word in words:
         assert word in printed
     described = json.loads(run("systems", name, "--json").stdout)[0]
-    expected = {key: "natural" if value is None else value for key, value in library.protocol(name).items()}
-    assert described["protocol"] == expected
+    assert list(described["protocols"]) == list(library.protocols(name))
+    assert described.get("settings", {}) == library.own_settings(name)
 
 
 def test_plan_takes_the_protocol_and_says_so() -> None:
-    told = json.loads(run("plan", "ethanol", "--json").stdout)
+    assert "300 K" in json.loads(run("plan", "ethanol", "--json").stdout)["integrator"]
+    told = json.loads(run("plan", "ethanol", "--protocol", "md17", "--json").stdout)
     assert "500 K" in told["protocol"]
     assert (told["force_field"], told["solvent"], told["constraints"]) == ("gaff2", "vacuum", "none")
     assert "0.5 fs" in told["integrator"]
     assert "500 K" in told["integrator"]
-    other = json.loads(run("plan", "ethanol", "--temperature", "300K", "--timestep", "2fs", "--json").stdout)
+    asked = ("--protocol", "md17", "--temperature", "300K", "--timestep", "2fs")
+    other = json.loads(run("plan", "ethanol", *asked, "--json").stdout)
     assert "2 fs, 300 K" in other["integrator"]
     assert "temperature" not in other["protocol"]
     assert other["constraints"] == "6 bonds to hydrogen"
@@ -56,7 +58,7 @@ def test_plan_takes_the_protocol_and_says_so() -> None:
         assert moved["integrator"] == f"{scheme}, 1 fs, no bath (started as the scene says)"
 
 
-def test_reference_takes_the_protocol_and_says_so(tmp_path: Path) -> None:
+def test_reference_takes_a_model_system_s_own_settings_and_says_so(tmp_path: Path) -> None:
     out = tmp_path / "a.h5"
     result = run("reference", "n-body-spring:5", "--time", "1ps", "-o", str(out))
     assert result.exit_code == 0, result.output
@@ -79,6 +81,8 @@ def test_reference_takes_the_protocol_and_says_so(tmp_path: Path) -> None:
     [
         (["systems", "asprin"], "Did you mean 'aspirin'?"),
         (["plan", "aspirin", "--temperature", "hot"], "--temperature"),
+        (["plan", "aspirin", "--protocol", "md71"], "Did you mean 'md17'?"),
+        (["plan", "double-well", "--protocol", "md17"], "leave --protocol out"),
         (["plan", "double-well", "--force-field", "ff14SB"], "its own law"),
     ],
 )

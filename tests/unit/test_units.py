@@ -14,6 +14,7 @@ from systems.units import (
     parse_temperature_k,
     parse_time_ps,
     parse_wall_s,
+    quantity,
     whole_steps,
 )
 
@@ -118,3 +119,28 @@ def test_whole_multiples_are_counted(n: int, step_ps: float) -> None:
 def test_uneven_divisions_are_refused_however_long_the_run(duration_ps: float, step_ps: float) -> None:
     with pytest.raises(UnitError, match="not a whole multiple"):
         whole_steps(duration_ps, step_ps, "save interval in time steps")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("time_ps", "10ns", 10_000.0),
+        ("time_ps", 3, 3.0),
+        ("friction_per_ps", "0.1/fs", 100.0),
+        ("budget_s", "30min", 1800.0),
+        ("temperature_k", "310K", 310.0),
+        ("padding_nm", "10A", 1.0),
+        ("ionic_strength_molar", "150mM", 0.15),
+        ("pressure_bar", "1atm", 1.01325),
+        ("equilibrate_ps", 0.0, 0.0),
+        ("lag_ps", None, None),
+    ],
+)
+def test_a_quantity_is_a_number_or_a_text_with_its_unit(name: str, value: float | str, expected: float) -> None:
+    assert quantity(name, value) == (None if expected is None else pytest.approx(expected))
+
+
+@pytest.mark.parametrize("value", ["10", "soon", -1.0, float("nan"), float("inf"), True, [1.0], b"10ns"])
+def test_what_is_no_quantity_is_refused_by_its_name(value: object) -> None:
+    with pytest.raises(UnitError, match="time_ps"):
+        quantity("time_ps", value)  # type: ignore[call-overload]

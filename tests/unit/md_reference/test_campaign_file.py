@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -173,15 +174,32 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         read_campaign(tmp_path / "none.toml")
 
 
-def test_a_library_scene_brings_its_protocol_which_the_file_outweighs(tmp_path: Path) -> None:
-    text = 'scenes = ["ethanol", "alanine-dipeptide", "smiles:CCO"]\ntime = "1ps"\n'
-    published, own, smiles = (run.config for run in _read(tmp_path, text).runs)
-    assert (published.temperature_k, published.timestep_ps, published.save_every_ps) == (500.0, 0.0005, 0.005)
-    assert (published.force.force_field, published.force.hydrogen_mass_da) == ("gaff2", None)
-    assert (own.temperature_k, own.timestep_ps) == (300.0, 0.004)
-    assert (smiles.force.force_field, smiles.force.solvent, smiles.timestep_ps) == ("auto", "auto", 0.004)
+def test_one_molecule_has_one_default_in_a_campaign_too(tmp_path: Path) -> None:
+    text = 'scenes = ["ethanol", "smiles:CCO", "alanine-dipeptide"]\ntime = "1ps"\n'
+    named, smiles, peptide = (replace(run.config, seed=0) for run in _read(tmp_path, text).runs)
+    assert named == smiles == peptide
+    assert (named.temperature_k, named.timestep_ps, named.force.force_field) == (300.0, 0.004, "auto")
+
+
+def test_a_campaign_s_protocol_is_outweighed_by_its_settings_and_outweighs_them_in_a_scene(tmp_path: Path) -> None:
+    text = 'scenes = ["ethanol", "smiles:CCO"]\ntime = "1ps"\nprotocol = "md17"\n'
+    for run in _read(tmp_path, text).runs:
+        config = run.config
+        assert (config.temperature_k, config.timestep_ps, config.save_every_ps) == (500.0, 0.0005, 0.005)
+        assert (config.force.force_field, config.force.hydrogen_mass_da) == ("gaff2", None)
     hot = _read(tmp_path, text + 'temperatures = ["400K"]\nsave_every = "100fs"\n').runs[0].config
     assert (hot.temperature_k, hot.save_every_ps, hot.timestep_ps) == (400.0, 0.1, 0.0005)
+
+    shared = 'time = "1ps"\ntimestep = "2fs"\nfriction = "2/ps"\ntemperatures = ["300K", "400K"]\n'
+    scenes = 'scenes = ["smiles:CC", { scene = "smiles:CCO", protocol = "md17", friction = "3/ps" }]\n'
+    *others, own = (run.config for run in _read(tmp_path, scenes + shared).runs)
+    assert [(c.temperature_k, c.timestep_ps, c.friction_per_ps) for c in others] == [
+        (300.0, 0.002, 2.0),
+        (400.0, 0.002, 2.0),
+    ]
+    assert (own.temperature_k, own.timestep_ps, own.friction_per_ps) == (500.0, 0.0005, 3.0)
+    own_axis = scenes.replace('"md17"', '"md17", temperatures = ["310K"]')
+    assert [run.config.temperature_k for run in _read(tmp_path, own_axis + shared).runs] == [300.0, 400.0, 310.0]
 
 
 def test_the_file_in_the_readme_is_one(tmp_path: Path, repository: Path) -> None:

@@ -1,8 +1,9 @@
-"""Scenes of the library run by their protocol, and its molecules need no AmberTools."""
+"""Scenes of the library run, under all names alike, or by a protocol; and its molecules need no AmberTools."""
 
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,16 @@ import numpy as np
 import pytest
 
 from md_reference import gaff
+from md_reference.campaign_settings import to_config
 from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system
+from md_reference.forcefield import ForceFieldSpec, build_system, resolve
 from md_reference.protocol import defaults, settle
 from surrogate.bench.library import run_scene
 from systems import library
-from systems.catalogue import MD17_PROTOCOL, MOLECULES
-from systems.errors import PreparationError
+from systems.catalogue import MOLECULES
+from systems.errors import InputError, PreparationError
+from systems.prepare import prepare
+from systems.protocols import find_protocol
 from systems.scene import Scene
 from systems.validity import check_frames, geometry_from_scene
 
@@ -86,43 +90,69 @@ def test_parameters_follow_the_molecule_into_another_atom_order() -> None:
 # ---- protocols -----------------------------------------------------------------------------------------------------
 
 
-def test_a_library_scene_runs_by_its_protocol_unless_told_otherwise() -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("ethanol", "smiles:CCO", "smiles:OCC"),
+        ("alanine-dipeptide", "ACE-ALA-NME", "sequence:ACE-ALA-NME"),
+        ("ac-ala3-nhme", "sequence:ACE-ALA-ALA-ALA-NME", "ACE-ALA-ALA-ALA-NME"),
+        ("ASFK", "ALA-SER-PHE-LYS", "sequence:ASFK"),
+    ],
+)
+def test_one_molecule_has_one_default_under_all_its_names(names: tuple[str, ...]) -> None:
+    scenes = [prepare(name) for name in names]
+    assert len({scene.molecule_key for scene in scenes}) == 1
+    found = []
+    for scene in scenes:
+        settings, said = settle(scene, {})
+        assert said == ""
+        config = to_config(settings | {"time_ps": 1.0}, seed=0)
+        found.append(replace(config, force=resolve(scene, config.force)))
+    assert found[0].temperature_k == 300.0
+    assert found == found[:1] * len(names)
+
+
+def test_a_protocol_is_asked_for_by_name_and_outweighed_by_what_is_given() -> None:
+    md17 = find_protocol("md17").settings
+    for name in ("aspirin", "smiles:CCO"):
+        scene = prepare(name)
+        settings, said = settle(scene, {}, "md17")
+        assert {key: settings[key] for key in md17} == md17
+        for word in ("by protocol md17", "500 K", "0.5 fs", "5 fs", "gaff2", "GAFF2 for their PBE"):
+            assert word in said
+        warmer, said = settle(scene, {"temperature_k": 600.0, "save_every_ps": 0.01}, "md17")
+        assert (warmer["temperature_k"], warmer["save_every_ps"], warmer["timestep_ps"]) == (600.0, 0.01, 0.0005)
+        assert "temperature" not in said
+        assert "saved" not in said
+
+
+def test_without_a_protocol_the_defaults_hold_and_nothing_is_said() -> None:
     scene = library.load("aspirin")
-    settings, said = settle(scene, {})
-    assert {key: settings[key] for key in MD17_PROTOCOL} == MD17_PROTOCOL
-    for word in ("500 K", "0.5 fs", "5 fs", "gaff2", "MD17"):
-        assert word in said
-    warmer, said = settle(scene, {"temperature_k": 600.0, "save_every_ps": 0.01})
-    assert (warmer["temperature_k"], warmer["save_every_ps"], warmer["timestep_ps"]) == (600.0, 0.01, 0.0005)
-    assert "temperature" not in said
-    assert "saved" not in said
-
-
-def test_other_scenes_run_by_the_defaults() -> None:
-    from dataclasses import replace
-
-    scene = replace(library.load("aspirin"), provenance={"source": "file"})
     assert settle(scene, {}) == (defaults(), "")
     assert settle(scene, {"temperature_k": 310.0})[0] == defaults() | {"temperature_k": 310.0}
 
 
-def test_the_first_peptide_runs_by_the_defaults_and_says_nothing() -> None:
-    settings, said = settle(library.load("alanine-dipeptide"), {})
-    assert said == ""
-    assert settings == defaults() | {"force_field": "ff14SB", "solvent": "obc2"}
+def test_model_systems_have_settings_of_their_own_and_take_no_protocol() -> None:
+    scene = library.load("n-body-spring")
+    settings, said = settle(scene, {})
+    assert (settings["ensemble"], settings["timestep_ps"]) == ("nve", 0.001)
+    assert "ensemble nve" in said and "GeoTDM" in said
+    with pytest.raises(InputError, match="leave --protocol out"):
+        settle(scene, {}, "md17")
 
 
 def test_flexible_bonds_end_above_one_femtosecond() -> None:
     scene = library.load("ethanol")
-    assert settle(scene, {"timestep_ps": 0.001})[0]["constrain_hydrogens"] is False
-    assert settle(scene, {"timestep_ps": 0.002})[0]["constrain_hydrogens"] is True
-    assert settle(scene, {"timestep_ps": 0.002, "constrain_hydrogens": False})[0]["constrain_hydrogens"] is False
+    assert settle(scene, {"timestep_ps": 0.001}, "md17")[0]["constrain_hydrogens"] is False
+    assert settle(scene, {"timestep_ps": 0.002}, "md17")[0]["constrain_hydrogens"] is True
+    given = {"timestep_ps": 0.002, "constrain_hydrogens": False}
+    assert settle(scene, given, "md17")[0]["constrain_hydrogens"] is False
 
 
 def test_another_force_field_leaves_the_protocol_s_solvent() -> None:
     scene = library.load("chignolin")
-    assert settle(scene, {"force_field": "gfn2-xtb"})[0]["solvent"] == "auto"
-    assert settle(scene, {"solvent": "vacuum"})[0]["force_field"] == "ff14SB"
+    assert settle(scene, {"force_field": "gfn2-xtb"}, "fast-folders")[0]["solvent"] == "auto"
+    assert settle(scene, {"solvent": "vacuum"}, "fast-folders")[0]["force_field"] == "ff14SB"
 
 
 # ---- runs ----------------------------------------------------------------------------------------------------------

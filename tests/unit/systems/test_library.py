@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from systems import library
-from systems.catalogue import ENTRIES, MD17_PROTOCOL
+from systems.catalogue import ENTRIES
 from systems.chemistry import backbone_torsions, match_atoms
 from systems.errors import UnknownNameError
 from systems.geometry import signed_volumes, torsion
 from systems.prepare import prepare
+from systems.protocols import PROTOCOLS, find_protocol
 from systems.validity import check_frames, geometry_from_scene
 
 MD17 = {"aspirin": ("C9H8O4", 21), "benzene": ("C6H6", 12), "ethanol": ("C2H6O", 9), "malonaldehyde": ("C3H4O2", 9),
@@ -133,21 +134,20 @@ def test_capped_dipeptides_are_made_from_their_name() -> None:
     scene = prepare("ACE-SER-GLY-NME")
     assert scene.residue_names == ("ACE", "SER", "GLY", "NME")
     assert scene.name == scene.provenance["library_name"] == "ACE-SER-GLY-NME"
-    assert library.protocol("ACE-SER-GLY-NME")["temperature_k"] == 300.0
+    assert library.protocols("ACE-SER-GLY-NME") == ()
 
 
 def test_tetrapeptides_are_made_from_one_letter_code() -> None:
     scene = prepare("SDFS")
     assert scene.residue_names == ("SER", "ASP", "PHE", "SER")
     assert int(scene.formal_charges.sum()) == -1
-    assert library.protocol("SDFS") == library.protocol("SER-ASP-PHE-SER")
-    assert library.protocol("SDFS")["temperature_k"] == 350.0
+    assert library.protocols("SDFS") == library.protocols("SER-ASP-PHE-SER") == ("mdgen",)
 
 
 def test_a_seed_may_follow_the_name_of_an_n_body_system() -> None:
     assert library.load("n-body-charged").name == "n-body-charged:0"
     assert prepare("n-body-charged:12").provenance["seed"] == 12
-    assert library.protocol("n-body-charged:12")["ensemble"] == "nve"
+    assert library.own_settings("n-body-charged:12")["ensemble"] == "nve"
 
 
 @pytest.mark.parametrize("name", ["n-body-charged:", "n-body-charged:x", "n-body-charged:-1", "harmonic-oscillator:1",
@@ -173,16 +173,28 @@ def test_protocols_name_settings_that_runs_have() -> None:
 
     known = {f.name for c in (MDConfig, ForceFieldSpec) for f in dataclasses.fields(c)} | {"ensemble"}
     for name in library.names():
-        assert set(library.protocol(name)) <= known, name
-        assert library.protocol_source(name), name
-        library.protocol(name).clear()  # a copy
-        assert library.protocol(name)
+        own = library.own_settings(name)
+        assert set(own) <= known, name
+        # Settings of its own has what no other name can ask for.
+        is_model = library.load(name).interactions is not None
+        assert bool(own) == is_model == bool(library.source_of_settings(name)), name
+        assert all(find_protocol(each) for each in library.protocols(name))
+        own.clear()  # a copy
+    for protocol in PROTOCOLS.values():
+        assert set(protocol.settings) <= known, protocol.name
+        assert protocol.source
+    assert library.own_settings("n-body-spring")
 
 
 def test_the_md17_protocol_is_the_published_one() -> None:
-    for name in MD17:
-        assert library.protocol(name) == MD17_PROTOCOL
+    assert all(library.protocols(name) == ("md17",) for name in MD17)
+    settings = find_protocol("md17").settings
     published = {"temperature_k": 500.0, "timestep_ps": 0.0005, "save_every_ps": 0.005}
-    assert {key: MD17_PROTOCOL[key] for key in published} == published
-    assert MD17_PROTOCOL["hydrogen_mass_da"] is None
-    assert MD17_PROTOCOL["constrain_hydrogens"] is False
+    assert {key: settings[key] for key in published} == published
+    assert settings["hydrogen_mass_da"] is None
+    assert settings["constrain_hydrogens"] is False
+
+
+def test_an_unknown_protocol_is_refused_with_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match=r"known: md17, md22, mdgen, fast-folders\. Did you mean 'md17'\?"):
+        find_protocol("MD17")
