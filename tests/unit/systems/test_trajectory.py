@@ -461,18 +461,19 @@ def test_kill_minus_nine(tmp_path: Path, repository: Path) -> None:
         "import numpy as np\nfrom pathlib import Path\n"
         "from test_trajectory import chain\nfrom systems.trajectory import open_writer\n"
         "w = open_writer(Path(sys.argv[1]), chain(50), {}, append=Path(sys.argv[1]).exists())\n"
-        "print('ready', flush=True)\n"
+        "begun = w.n_frames\n"
         "while True:\n"
         "    n = w.n_frames; k = n % 37 + 1\n"
         "    x = np.arange(n, n + k, dtype=np.float32)[:, None, None] * np.ones((1, 50, 3), dtype=np.float32)\n"
         "    w.append(x, np.arange(n, n + k), flags=np.zeros(k, dtype=int), chunk_idx=n)\n"
+        "    if n == begun: print('one append is on disk', flush=True)\n"
     )
     for suffix in SUFFIXES:
         path, last = tmp_path / f"a{suffix}", 0
         for trial in range(3):
             process = subprocess.Popen([sys.executable, str(program), str(path)], stdout=subprocess.PIPE)
             assert process.stdout is not None
-            assert process.stdout.readline() == b"ready\n"
+            assert process.stdout.readline() == b"one append is on disk\n"
             time.sleep(0.03 + 0.037 * trial)
             process.send_signal(signal.SIGKILL)
             process.wait()
