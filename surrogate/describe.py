@@ -42,7 +42,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "account": summary_lines(record.get("summary") or {}) + intervention_lines(record),
+        "account": summary_lines(record.get("summary") or {}) + precision_lines(record) + intervention_lines(record),
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
@@ -55,6 +55,12 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "size_mb": path.stat().st_size / 1e6,
         "record": record,
     }
+
+
+def precision_lines(record: dict[str, Any]) -> list[str]:
+    """Return the precision in which a rollout's network was evaluated, and why; nothing of other files."""
+    reason = record.get("precision_reason")
+    return [] if reason is None else [f"network in {record['precision']}: {reason}"]
 
 
 def intervention_lines(record: dict[str, Any]) -> list[str]:

@@ -27,6 +27,7 @@ from surrogate.bench.cost_error_report import markdown, write_cost_error
 from surrogate.bench.cost_error_settings import USUAL_BATCH, CostErrorConfig, Setting, choose_settings
 from surrogate.bench.cost_error_timing import chunk_ps, md_costs, roll_in_turns
 from surrogate.bench.held_out import refuse_trained_on
+from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.outputs import Trajectories, find_trajectories
 from surrogate.sampling.chunks import ChunkSampler
@@ -92,7 +93,7 @@ def run_cost_error(
     scene = weights[0].domain.scene
     report("reading the references")
     truth = read_truth(scene, reference, replicate)
-    result |= {"scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
+    result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with _threads(config.threads):
             if "md" not in result:
@@ -140,7 +141,7 @@ def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: Co
         return row | {"outcome": f"not run: {error}"}
     frames = np.concatenate(parts, axis=1)
     ns = 1e-3 * frames.shape[0] * frames.shape[1] * weights.domain.lag_ps
-    row |= {"bf16": sampler.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
+    row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
     if only_timed:
         return row | {"timed_only": True}
     errors, worth = judge_frames(frames, truth, seed=config.seed)

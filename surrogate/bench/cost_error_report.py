@@ -38,6 +38,7 @@ def markdown(result: dict[str, Any]) -> str:
         f"{1e-3 * md['length_ps']:g} ns; processor seconds on {config['threads']} thread(s), mean of "
         f"{config['rounds']} parts [least, greatest]; 95 % intervals in brackets elsewhere.",
         "",
+        *([result["machine"]["about"], ""] if "machine" in result else []),
         "## OpenMM",
         "",
         *table([_md_row(row, md) for row in md["cost"]]),

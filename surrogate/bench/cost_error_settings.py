@@ -66,7 +66,7 @@ def choose_settings(
     and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
     """
     from surrogate.models.lam_slide.flow import ADAPTIVE
-    from surrogate.sampling.chunks import bf16_in_hardware
+    from surrogate.models.precision import choose_precision
     from surrogate.sampling.settings import RolloutConfig
 
     known = weights.model.solvers
@@ -82,7 +82,7 @@ def choose_settings(
     ]
     usual = Setting(chosen[0], own if own in numbers else max(numbers))
     if not (precisions or batches):
-        with_bf16 = weights.model.bf16_by_default and bf16_in_hardware()
+        with_bf16 = choose_precision("auto", suits=weights.model.bf16_by_default).bf16
         found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
         found += [replace(usual, batch=1)]
     if compiled:

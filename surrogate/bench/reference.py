@@ -21,6 +21,7 @@ import numpy as np
 
 from md_reference.parent_watch import end_with_parent
 from md_reference.replicas import available_cores
+from surrogate.bench.machine import machine_facts
 from surrogate.bench.reference_setups import CASES, Case, Setup, ours, plain
 from systems.errors import InputError, SimulationError, SurromdError, nearest
 
@@ -72,6 +73,7 @@ def run_benchmark(
     n = cores or available_cores()
     rows: list[Row] = []
     left_out: list[str] = []
+    machine = machine_facts() | {"cores_used": n}
     with _Workers(n) as workers:
         for case in cases:
             try:
@@ -83,7 +85,7 @@ def run_benchmark(
                 continue
             if report is not None:
                 report(rows[-1])
-    return {"machine": _machine(n), "rounds": rounds, "seconds": seconds, "rows": [asdict(r) for r in rows],
+    return {"machine": machine, "rounds": rounds, "seconds": seconds, "rows": [asdict(r) for r in rows],
             "left_out": left_out}  # fmt: skip
 
 
@@ -295,15 +297,6 @@ def table_line(row: Row) -> str:
         f"{row.case:<18}{row.n_atoms:>6} {row.solvent:<8}{speeds}  {ratio:<20}"
         f"{by_cpu:<9}{f'x {row.gain_long_step[0]:.2f}':<11}{gap:>11}  {row.ours} / {row.plain}"
     )
-
-
-def _machine(cores: int) -> dict[str, Any]:
-    import os
-
-    from md_reference.timing import machine_name
-
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {"name": machine_name(), "cores_used": cores, "load_before": load}
 
 
 def write_json(result: dict[str, Any], path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surrogate.bench import stress_inputs, stress_settings
+from surrogate.bench.machine import machine_facts
 from surrogate.bench.stress_measures import Frames, measure_drift, measure_validity
 from surrogate.bench.stress_report import write_stress
 from systems.errors import InputError, SimulationError, StorageError, SurromdError, nearest
@@ -122,7 +122,7 @@ def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: 
         "domain": weights.domain.describe(),
         "scene": weights.domain.scene.name,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": platform.processor() or platform.machine(),
+        "machine": machine_facts(),
         "seed": config.seed,
     }
     sections = _earlier_sections(folder, weights)

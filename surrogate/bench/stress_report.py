@@ -43,6 +43,7 @@ def markdown(result: dict[str, Any]) -> str:
         "",
         f"{result['domain']}; {result['model']}, {result['made']}",
         "",
+        *([result["machine"]["about"], ""] if isinstance(result.get("machine"), dict) else []),
     ]
     for name, rows in result["sections"].items():
         lines += [f"## {TITLES[name]}", "", *table([_flat(row) for row in rows]), ""]

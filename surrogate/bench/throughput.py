@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from surrogate.bench.machine import machine_facts
 from surrogate.bench.plain_network import plain_network
 from surrogate.data.descriptions import describe
 from surrogate.data.shipped import weights_path
@@ -191,6 +192,8 @@ def main() -> None:
     weights = load_weights(weights_path(args.weights))
     assert isinstance(weights.model, LamSlide)
     molecule = describe(weights.model, weights.domain.scene)
+    facts = machine_facts()
+    sys.stdout.write(f"{facts['about']}\n")
     peaks, rates = {}, []
     for precision in ("fp32", "bf16") if args.repeats else ():
         peaks[precision] = peak = matrix_peak(precision)
@@ -213,7 +216,7 @@ def main() -> None:
                 f"[{low:.2f}, {high:.2f}]{differs}\n"
             )
     if args.json is not None:
-        record = {"threads": torch.get_num_threads(), "peak_gflops": peaks, "paper": sampled}
+        record = {"machine": facts, "threads": torch.get_num_threads(), "peak_gflops": peaks, "paper": sampled}
         args.json.write_text(json.dumps(record | {"rates": [asdict(r) for r in rates]}, indent=1))
 
 

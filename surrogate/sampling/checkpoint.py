@@ -67,6 +67,18 @@ def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
+def precision_of(path: Path) -> str:
+    """Return the precision, 'fp32' or 'bf16', of the rollout that a checkpoint is of; 'auto' where it cannot be read.
+
+    A rollout that goes on keeps it, whatever another processor would choose.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return "bf16" if json.loads(str(stored["header"]))["settings"]["bf16"] else "fp32"
+    except UNREADABLE:
+        return "auto"
+
+
 def read_checkpoint(path: Path, settings: dict[str, Any] | None) -> Progress:
     """Return where a rollout of these settings stood, or of any (None).
 

@@ -15,6 +15,7 @@ import torch
 from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
+from surrogate.models.precision import choose_precision
 from systems.errors import InputError, SimulationError
 from systems.geometry import superposition
 
@@ -47,8 +48,6 @@ class ChunkSampler:
         self, weights: Weights, *, solver_steps: int = 10, solver: str | None = None, precision: str = "auto",
         compile: bool = False,
     ) -> None:  # fmt: skip
-        if precision not in ("auto", "fp32", "bf16"):
-            raise InputError(f"precision {precision!r} is unknown; choose auto, fp32 or bf16.")
         model, template = weights.model, weights.domain.scene
         known = model.solvers
         if solver is not None and solver not in known:
@@ -58,11 +57,11 @@ class ChunkSampler:
             )
         self.solver = solver or (known[0] if known else None)
         self.solver_steps = solver_steps
-        self.bf16 = precision == "bf16" or (precision == "auto" and model.bf16_by_default and bf16_in_hardware())
+        self.precision = choose_precision(precision, suits=model.bf16_by_default)
         self.batch: int | None = None
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
-        self._model = with_bf16_weights(model) if self.bf16 else model
+        self._model = with_bf16_weights(model) if self.precision.bf16 else model
         self._compiled = with_compiled_parts(self._model) if compile else None
         self._compiled_rows: int | None = None
         self._molecule = describe(model, template)
@@ -138,7 +137,7 @@ class ChunkSampler:
         if self._compiled is not None:
             self._compiled_rows = self._compiled_rows or len(seeds)
             model = self._compiled if len(seeds) == self._compiled_rows else model
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.precision.bf16):
             chunk = model.next_chunk(
                 torch.from_numpy(canonical.astype(np.float32)),
                 self._molecule,
@@ -170,12 +169,6 @@ def with_bf16_weights(model: _Model) -> _Model:
         if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers):
             module.to(torch.bfloat16)
     return copied
-
-
-def bf16_in_hardware() -> bool:
-    """True where the processor has matrix units for bf16 (AMX); a fixed property, so a seed keeps its meaning."""
-    supported = getattr(torch.cpu, "_is_amx_tile_supported", None)
-    return bool(supported and supported())
 
 
 def _alike(velocities: FloatArray | None, n: int) -> list[npt.NDArray[np.int64]]:

@@ -68,7 +68,7 @@ def settle_plan(
     settings = {
         **asdict(config),
         "solver": sampler.solver,
-        "bf16": sampler.bf16,
+        "bf16": sampler.precision.bf16,
         "weights_hash": weights.hash,
         "replicas": n_replicas,
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],

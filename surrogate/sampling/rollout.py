@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.account import Clock, Tally
-from surrogate.sampling.checkpoint import Progress, checkpoint_path, read_checkpoint, write_checkpoint
+from surrogate.sampling.checkpoint import Progress, checkpoint_path, precision_of, read_checkpoint, write_checkpoint
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.domain import fit_weights
@@ -68,15 +68,16 @@ def rollout(
         lag_ps=config.lag_ps,
         save_every_ps=config.save_every_ps,
     )
+    state_path = checkpoint_path(outs[0])
+    begun = resume and config.precision == "auto" and state_path.exists()
     sampler = ChunkSampler(
         weights,
         solver_steps=config.solver_steps,
         solver=config.solver,
-        precision=config.precision,
+        precision=precision_of(state_path) if begun else config.precision,
         compile=config.compile,
     )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
-    state_path = checkpoint_path(outs[0])
     if resume and not state_path.exists() and _just_begun(outs):
         resume, overwrite = False, True
     resuming = resume and all(p.exists() for p in outs)

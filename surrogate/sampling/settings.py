@@ -16,7 +16,7 @@ class RolloutConfig:
     """One rollout. `save_every_ps` None keeps every model frame. `lag_ps` is the time between these, of weights that
     were trained for several; None is what `lags.choose_lag` says. `solver` None is the one that suits the weights, else
     one that its model knows. `precision`: 'fp32', 'bf16' (autocast of the network; coordinates and integration stay
-    fp32) or 'auto' (bf16 where the processor multiplies it in hardware). `compile`: by torch, which takes a minute.
+    fp32) or 'auto' (bf16 where the processor multiplies it faster). `compile`: by torch, which takes a minute.
 
     `guard`: see `surrogate.sampling.interventions`. `energy_every`: k, the energy of every k-th model frame is
     checked, after stiff bonds are relaxed; 0 checks none. `md_between_ps`: so much real MD after each chunk. `select`

@@ -160,7 +160,7 @@ class Simulation:
             "seed": self._seed,
             "solver": self._sampler.solver,
             "solver_steps": self._sampler.solver_steps,
-            "precision": "bf16" if self._sampler.bf16 else "fp32",
+            "precision": self._sampler.precision.name,
         }
 
     def _begin(self, positions_nm: npt.ArrayLike) -> None:

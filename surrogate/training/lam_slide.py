@@ -21,6 +21,7 @@ from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.heavy import on_heavy_atoms
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
@@ -287,6 +288,8 @@ def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
     held = {name: [_held_windows(subject, length, strides, kinds) for subject in some]
             for name, some in (("validation", subjects), ("unseen", unseen)) if some}  # fmt: skip
 
+    with_bf16 = stage.bf16 and bf16_pays(device.type)
+
     @torch.no_grad()
     def validate() -> dict[str, float]:
         found: dict[str, list[float]] = {}
@@ -295,7 +298,7 @@ def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
                 # The same noise and flow times each time, so that the curve shows the model and not the draw.
                 generator = torch.Generator().manual_seed(0)
                 tau = draw_flow_times(model, len(idx), generator).to(device)
-                with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
+                with torch.autocast(device.type, dtype=torch.bfloat16, enabled=with_bf16):
                     _, terms = loss_of(subject, idx, stride, tau, generator,
                                        kind=None if kind is None else kind.to(device))  # fmt: skip
                 for key, value in terms.items():

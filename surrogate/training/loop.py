@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.data.tensor_checksums import tensor_checksum
+from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
@@ -35,7 +36,7 @@ ProgressFn = Callable[[str, float, dict[str, float]], None]
 @dataclass(frozen=True)
 class StageConfig:
     """One stage's optimisation. Ends at `budget_s` of training time (summed over resumes) or at `steps`, whichever is
-    first; the learning rate follows the share of that budget which is spent."""
+    first; the learning rate follows the share of that budget which is spent. `bf16`: where it is faster."""
 
     name: str
     batch: int
@@ -122,7 +123,7 @@ def run_stage(
     `warn` hears of a gradient that has outgrown all others (stderr if None). Raises SimulationError when the loss stops
     being finite; the last saved state stays.
     """
-    fabric = open_fabric(device.type, config.bf16)
+    fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
     watch = Watch()
     decay: list[nn.Parameter] = []
     plain: list[nn.Parameter] = []

@@ -1,0 +1,120 @@
+"""bf16 where its products are faster, and said so; a rollout that goes on keeps what it began with."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.shipped import weights_path
+from surrogate.data.weights import Weights, load_weights
+from surrogate.describe import describe_file
+from surrogate.models import precision
+from surrogate.models.precision import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
+from surrogate.sampling.checkpoint import checkpoint_path, precision_of
+from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.trajectory import open_trajectory
+
+FAST = ProductSpeed("avx512_bf16", 70.0, 280.0, 1)
+SLOW = ProductSpeed("", 70.0, 14.0, 1)
+
+
+def processor(monkeypatch: pytest.MonkeyPatch, speed: ProductSpeed) -> None:
+    monkeypatch.setattr(precision, "product_speed", lambda: speed)
+
+
+def test_bf16_is_chosen_where_its_products_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    processor(monkeypatch, FAST)
+    chosen = choose_precision("auto")
+    assert (chosen.bf16, chosen.name) == (True, "bf16")
+    assert chosen.reason == "products in bf16 through avx512_bf16 are 4 times as fast as in fp32 here"
+    assert bf16_pays("cpu")
+    assert not choose_precision("auto", suits=False).bf16, "a model that is integrated is left alone"
+    processor(monkeypatch, SLOW)
+    chosen = choose_precision("auto")
+    assert (chosen.bf16, chosen.name) == (False, "fp32")
+    assert chosen.reason == "products in bf16 are 0.2 times as fast as in fp32 here"
+    assert not bf16_pays("cpu")
+    assert choose_precision("bf16").bf16 and choose_precision("bf16").reason == "as asked for"
+    with pytest.raises(InputError, match="precision 'fp16' is unknown"):
+        choose_precision("fp16")
+
+
+def test_a_processor_of_either_kind_is_told() -> None:
+    """Where oneDNN may use what torch knows of, products are faster; where it may not, they are not."""
+    here = product_speed()
+    assert here is product_speed(), "measured once"
+    assert here.fp32_gflops > 0 and here.bf16_gflops > 0 and here.unit == bf16_unit()
+    assert "GFLOP/s" in here.describe()
+    if here.unit and "ONEDNN_MAX_CPU_ISA" not in os.environ:
+        assert choose_precision("auto").bf16, here
+        code = "from surrogate.models.precision import choose_precision as c; print(c('auto').name)"
+        held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[3])}
+        said = subprocess.run([sys.executable, "-c", code], env=held_back, capture_output=True, text=True, check=True)
+        assert said.stdout == "fp32\n"
+
+
+def test_bf16_and_fp32_draw_the_same_chunk() -> None:
+    """Shipped weights: from one noise the frames differ by a hundredth of what they move by."""
+    weights = load_weights(weights_path("alanine-dipeptide"))
+    start = weights.domain.scene.positions_nm[None, None]
+    frames = {}
+    for name in ("fp32", "bf16"):
+        sampler = ChunkSampler(weights, precision=name)
+        last = np.repeat(start, sampler.n_conditioning, axis=1)
+        frames[name] = sampler.draw(np.repeat(last, 2, axis=0), [1, 2]).frames_nm
+    moved = np.sqrt(((frames["fp32"] - start) ** 2).mean())
+    apart = np.sqrt(((frames["bf16"] - frames["fp32"]) ** 2).mean())
+    assert moved > 0.02 and 1e-5 < apart / moved < 0.03, (moved, apart)
+
+
+def test_the_record_says_which_and_why_and_resume_keeps_it(
+    tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = RolloutConfig(time_ps=8.0 * small_weights.model.n_new * small_weights.domain.lag_ps, solver_steps=2)
+    begun, whole = tmp_path / "begun.h5", tmp_path / "whole.h5"
+    processor(monkeypatch, SLOW)
+    rollout(alanine_dipeptide, small_weights, [whole], config)
+
+    class Stop(BaseException):
+        pass
+
+    def stop(done: int, total: int, note: str | None = None) -> None:
+        if done >= total // 4:
+            raise Stop
+
+    with pytest.raises(Stop):
+        rollout(alanine_dipeptide, small_weights, [begun], config, progress=stop, flush_every_s=0.0)
+    assert precision_of(checkpoint_path(begun)) == "fp32"
+    processor(monkeypatch, FAST)
+    rollout(alanine_dipeptide, small_weights, [begun], config, resume=True)
+    with open_trajectory(begun) as ours, open_trajectory(whole) as undisturbed:
+        assert ours.record["precision"] == "fp32"
+        np.testing.assert_array_equal(ours.read(), undisturbed.read())
+    fresh = tmp_path / "fresh.h5"
+    rollout(alanine_dipeptide, small_weights, [fresh], config)
+    with open_trajectory(fresh) as reader:
+        assert reader.record["precision"] == "bf16"
+        assert "4 times as fast" in reader.record["precision_reason"]
+    assert "network in bf16: products in bf16 through avx512_bf16" in describe_file(fresh)["account"][0]
+
+
+def test_a_damaged_checkpoint_leaves_the_choice_open(tmp_path: Path) -> None:
+    (tmp_path / "x.checkpoint").write_bytes(b"nothing of ours")
+    assert precision_of(tmp_path / "x.checkpoint") == "auto"
+
+
+def test_measuring_leaves_random_numbers_alone() -> None:
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    product_speed.__wrapped__()
+    assert torch.equal(torch.rand(2), expected)
