@@ -33,6 +33,11 @@ def read_blocks(text: str, path: Path) -> Any:
         raise InputError(f"{path} is no whole CIF ({reason}); the file is cut or damaged, fetch it again.") from error
 
 
+def is_component(text: str) -> bool:
+    """Whether mmCIF text defines a component and holds no structure."""
+    return "_chem_comp_atom." in text and "_atom_site." not in text
+
+
 def read_mmcif(text: str, path: Path) -> StructureFile:
     """Return the first model of the first block that has atoms. Raises InputError for a row that cannot be read."""
     found = StructureFile([])

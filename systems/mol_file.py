@@ -31,11 +31,20 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
     if molecule is None:
         hint = " with SYBYL atom types" if suffix == ".mol2" else ""
         raise InputError(f"{path} holds no molecule that can be read as {suffix[1:].upper()}; write it again{hint}.")
+    settled = settle_molecule(molecule, notes)
+    if suffix == ".mol2":
+        _check_charge(block, molecule)
+    return settled
+
+
+def settle_molecule(molecule: Any, notes: list[str]) -> Any:
+    """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones.
+
+    Raises PreparationError for what is no molecule, or has atoms on one point.
+    """
     require(molecule)
     sanitise(molecule)
     drop_isotopes(molecule, notes)
-    if suffix == ".mol2":
-        _check_charge(block, molecule)
     return _with_geometry(molecule, notes)
 
 

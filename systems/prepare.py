@@ -14,9 +14,10 @@ from systems.bonding import Bonding, Residue, find_bonds
 from systems.errors import InputError, PreparationError
 from systems.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
 from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_waters
+from systems.mmcif_file import is_component
 from systems.modified_residues import describe_residue, standardise
 from systems.mol_file import SUFFIXES, suffix_of
-from systems.pdb_records import AtomRecord, read_structure
+from systems.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
 from systems.scene import Scene
 from systems.structure import scene_from_records
 
@@ -71,6 +72,10 @@ def prepare_file(
     path: Path, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, drop_water: bool = False
 ) -> Scene:
     """Return the scene of a PDB or mmCIF file; see `prepare`."""
+    if is_mmcif(path) and is_component(text := read_text(path)):
+        from systems.component_file import scene_from_component
+
+        return scene_from_component(text, path)
     try:
         return _prepare_file(path, ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
     except PreparationError as error:

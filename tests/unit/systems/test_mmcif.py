@@ -92,3 +92,55 @@ def test_a_cut_file_is_refused(tmp_path: Path) -> None:
     rows[-1] = rows[-1][:40]
     with pytest.raises(InputError, match="the file is cut"):
         prepare(_write(tmp_path / "x.cif", rows))
+
+
+COMPONENT = """data_TFA
+_chem_comp.id TFA
+loop_
+_chem_comp_atom.comp_id
+_chem_comp_atom.atom_id
+_chem_comp_atom.type_symbol
+_chem_comp_atom.charge
+_chem_comp_atom.model_Cartn_x
+_chem_comp_atom.model_Cartn_y
+_chem_comp_atom.model_Cartn_z
+_chem_comp_atom.pdbx_model_Cartn_x_ideal
+_chem_comp_atom.pdbx_model_Cartn_y_ideal
+_chem_comp_atom.pdbx_model_Cartn_z_ideal
+TFA "C1'" C  0 ? ? ? 0.00 0.00 0.00
+TFA O1    O  0 ? ? ? 1.21 0.00 0.00
+TFA O2    O -1 ? ? ? -0.62 1.10 0.00
+TFA H1    H  0 ? ? ? -0.60
+-0.92 0.00
+#
+loop_
+_chem_comp_bond.atom_id_1
+_chem_comp_bond.atom_id_2
+_chem_comp_bond.value_order
+"C1'" O1 DOUB
+"C1'" O2 SING
+"C1'" H1 SING
+"""
+
+
+def test_a_component_of_the_dictionary_is_a_molecule(tmp_path: Path) -> None:
+    path = tmp_path / "TFA.cif"
+    path.write_text(COMPONENT)
+    scene = prepare(str(path))
+    assert (scene.name, scene.atom_names, scene.residue_names) == ("TFA", ("C1'", "O1", "O2", "H1"), ("TFA",))
+    assert scene.formal_charges.tolist() == [0, 0, -1, 0] and scene.bond_orders.tolist() == [2.0, 1.0, 1.0]
+    assert scene.positions_nm[3].tolist() == pytest.approx([-0.06, -0.092, 0.0])
+    for wrong, match in (("DOUB", "QUUX"), ("H1    H ", "H1    Qq"), (" 0.00 0.00 0.00", " 0.00 0.00")):
+        path.write_text(COMPONENT.replace(wrong, match))
+        with pytest.raises(InputError, match=r"TFA.cif"):
+            prepare(str(path))
+
+
+def test_rows_wrapped_over_lines_uncertainties_and_links(tmp_path: Path) -> None:
+    rows = [row.replace(" ", "\n", 1) if i % 3 else row for i, row in enumerate(_peptide())]
+    rows[2] = rows[2].replace(" 1.00 20.0", "(4) 1.00 20.0")
+    assert prepare(_write(tmp_path / "x.cif", rows)).positions_nm == pytest.approx(ALA2.positions_nm, abs=1e-4)
+    for number in ("1_0.5", "0x1", "?", "1,5"):
+        wrong = [*rows[:5], rows[5].replace(rows[5].split()[10], number), *rows[6:]]
+        with pytest.raises(InputError, match="atom row 6: a coordinate is not a number"):
+            prepare(_write(tmp_path / "x.cif", wrong))
