@@ -145,14 +145,17 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
 def _choose(scene: Scene) -> str:
     from md_reference.mixture import is_water, molecules_of
+    from md_reference.nonstandard import find_chain
     from md_reference.templates import uncovered_residue
     from systems.selection import part_of
 
     rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene, m)]
-    known = [uncovered_residue(part_of(scene, m), "ff14SB") is None for m in rest]
-    if all(known):
+    others = [m for m in rest if uncovered_residue(part_of(scene, m), "ff14SB") is not None]
+    if not others:
         return "ff14SB"
-    return "ff14SB+gaff2" if any(known) else "gaff2"
+    if len(others) < len(rest) or any(find_chain(part_of(scene, m)) for m in others):
+        return "ff14SB+gaff2"
+    return "gaff2"
 
 
 def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
@@ -209,9 +212,10 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
 
 
 def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
-    """GAFF2 molecules, alone or beside peptides, water and ions."""
+    """GAFF2 molecules and chains with residues from GAFF2, alone or beside peptides, water and ions."""
     from md_reference import born
     from md_reference.mixture import is_water, merge, molecules_of
+    from md_reference.nonstandard import build_chain, find_chain
     from md_reference.templates import build_templated, uncovered_residue
     from systems.selection import part_of
 
@@ -229,15 +233,26 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         parts.append(
             (atoms, build_templated(part_of(scene, atoms), replace(spec, force_field=spec.protein, solvent=dry)))
         )
+    small: list[IntArray] = []
     for atoms in others:
-        parts.append((atoms, _build_molecule(part_of(scene, atoms), spec)))
+        part = part_of(scene, atoms)
+        chain = None if spec.force_field == "gaff2" else find_chain(part)
+        if chain is None:
+            small.append(atoms)
+        elif spec.protein != "ff14SB":
+            raise PreparationError(
+                f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
+                "residues are joined to ff14SB alone: use --force-field ff14SB+gaff2."
+            )
+        build = _build_molecule if chain is None else build_chain
+        parts.append((atoms, build(part, spec)))
     system = merge(scene.n_atoms, parts)
     if spec.is_explicit:
         _use_pme(system, spec)
     if spec.is_born:
         topology = scene.to_openmm_topology()
         if spec.solvent == "gbn2":
-            molecule_idx = np.sort(np.concatenate(others)) if others else np.empty(0, dtype=np.int64)
+            molecule_idx = np.sort(np.concatenate(small)) if small else np.empty(0, dtype=np.int64)
             system.addForce(born.gbn2(scene, topology, system, molecule_idx=molecule_idx))
         else:
             system.addForce((born.native_obc2 if native_gb else born.custom_obc2)(topology, system))

@@ -6,6 +6,7 @@ Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import networkx as nx
@@ -13,6 +14,7 @@ import numpy as np
 
 from md_reference import parameter_cache
 from md_reference.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
+from md_reference.charge_cost import announced
 from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.programs import scratch_folder
@@ -24,7 +26,7 @@ from systems.scene import FloatArray, Scene
 METHOD = "gaff2-am1bcc"
 ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
 _ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl": 17, "Br": 35, "I": 53}
-# SQM's cost grows with the third power: some seconds at 20 atoms, a quarter of an hour at 150.
+# `charge_cost` says how SQM's cost grows: hours from here on.
 LARGEST = 250
 _CHARGE_TOLERANCE_E = 0.01
 _BOND_STRETCH = 1.3
@@ -124,7 +126,8 @@ def _parametrise(scene: Scene) -> Entry:
     tools = ambertools()
     with scratch_folder("surromd-gaff-") as folder:
         try:
-            notes = _charges_and_types(scene, folder)
+            with announced(scene) as waiting:
+                notes = _charges_and_types(scene, folder, waiting)
             _missing_terms(scene, folder)
             text = _assemble(folder)
         except PreparationError as error:
@@ -144,19 +147,19 @@ def _parametrise(scene: Scene) -> Entry:
     return Entry(scene, made.text(), source)
 
 
-def _charges_and_types(scene: Scene, folder: Path) -> list[str]:
+def _charges_and_types(scene: Scene, folder: Path, waiting: Callable[[float], None] | None = None) -> list[str]:
     """Run antechamber: atom types, bond types and AM1-BCC charges into `typed.mol2`; return what was unusual."""
     (folder / "input.sdf").write_text(_sdf(scene))
     arguments = ["-i", "input.sdf", "-fi", "sdf", "-o", "typed.mol2", "-fo", "mol2", "-at", "gaff2", "-c", "bcc"]
     arguments += ["-nc", str(int(scene.formal_charges.sum())), "-m", "1", "-rn", "MOL", "-s", "2", "-dr", "no"]
-    printed = run("antechamber", arguments, folder)
+    printed = run("antechamber", arguments, folder, waiting=waiting)
     if not (folder / "typed.mol2").exists():
         raise PreparationError(f"antechamber failed: {complaint(printed)}")
     if not _rearranged(scene, folder / "sqm.pdb"):
         return []
     # AM1-BCC wants the AM1 minimum; where that is another molecule (a proton that hops), the scene's own geometry.
     keywords = "qm_theory='AM1', maxcyc=0, scfconv=1.d-10, ndiis_attempts=700,"
-    run("antechamber", [*arguments, "-ek", keywords], folder)
+    run("antechamber", [*arguments, "-ek", keywords], folder, waiting=waiting)
     if _rearranged(scene, folder / "sqm.pdb"):
         raise PreparationError("its positions do not fit its bonds; minimise or repair the structure first")
     return ["AM1 charges at the scene's own geometry: the isolated molecule rearranges when AM1 minimises it"]

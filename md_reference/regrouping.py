@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -18,19 +19,22 @@ from systems.scene import Scene
 IntArray = npt.NDArray[np.int64]
 
 
-def regroup(scene: Scene) -> tuple[Scene, IntArray]:
+def regroup(scene: Scene, *, uncut: Iterable[tuple[int, int]] = ()) -> tuple[Scene, IntArray]:
     """Return the scene with its atoms gathered into residues, and `order (n_atoms,)`: its atom k was atom `order[k]`.
 
-    Residues are what is left connected when the amide bonds of the backbone (C(=O)-N between carbons) and the disulfide
-    bonds are cut; they follow the chain from its N to its C terminus, atoms keep their order within one. Names come
-    from the first atom's residue. Force fields recognise residues by their bonds, so names need not be right: a whole
-    peptide in one residue 'UNL', or residues whose atoms lie mixed, become what OpenMM's templates know.
+    Residues are what is left connected when the amide bonds of the backbone (C(=O)-N between carbons, and that of an
+    NH2 that ends a chain) and the disulfide bonds are cut, except the bonds `uncut` (i < j); they follow the chain from
+    its N to its C terminus, atoms keep their order within one. Names come from the first atom's residue. Force fields
+    recognise residues by their bonds, so names need not be right: a whole peptide in one residue 'UNL', or residues
+    whose atoms lie mixed, become what OpenMM's templates know.
 
     Energies do not depend on the order of atoms for alanine dipeptide (to rounding); in residues with several equal
     neighbours about a planar atom (ARG, TRP, HIS) Amber's improper torsions depend on it, by some tenths of a kJ/mol.
     """
-    amides = backbone_torsions(scene)["omega"][:, 1:3]
-    cut = {(min(c, n), max(c, n)) for c, n in amides.tolist()}
+    torsions = backbone_torsions(scene)
+    ends = _amide_ends(scene)
+    amides = np.concatenate([torsions["omega"][:, 1:3], np.array(ends, dtype=np.int64).reshape(-1, 2)])
+    cut = {(min(c, n), max(c, n)) for c, n in amides.tolist()} - set(uncut)
     whole: nx.Graph = nx.Graph()
     whole.add_nodes_from(range(scene.n_atoms))
     whole.add_edges_from(scene.bonds.tolist())
@@ -38,13 +42,13 @@ def regroup(scene: Scene) -> tuple[Scene, IntArray]:
     pieces.remove_edges_from(
         (i, j)
         for i, j in scene.bonds.tolist()
-        if (i, j) in cut or (scene.elements[i] == "S" and scene.elements[j] == "S")
+        if (i, j) in cut or (scene.elements[i] == "S" and scene.elements[j] == "S" and (i, j) not in set(uncut))
     )
     residues = [sorted(part) for part in nx.connected_components(pieces)]
     of_atom = {atom: k for k, atoms in enumerate(residues) for atom in atoms}
     along: nx.DiGraph = nx.DiGraph()
     along.add_nodes_from(range(len(residues)))
-    along.add_edges_from((of_atom[c], of_atom[n]) for c, n in amides.tolist())
+    along.add_edges_from((of_atom[c], of_atom[n]) for c, n in amides.tolist() if of_atom[c] != of_atom[n])
     ranked: list[int] = []
     chains: list[str] = []
     for molecule in sorted(nx.connected_components(whole), key=min):
@@ -71,6 +75,22 @@ def regroup(scene: Scene) -> tuple[Scene, IntArray]:
         positions_nm=scene.positions_nm[order],
     )
     return regrouped, order
+
+
+def _amide_ends(scene: Scene) -> list[tuple[int, int]]:
+    """Return (C, N) of each NH2 on the carbonyl of a residue's backbone; NH2 of asparagine and glutamine is none."""
+    near, symbol = scene.neighbours(), scene.elements
+    found = []
+    for n in (i for i, e in enumerate(symbol) if e == "N" and len(near[i]) == 3):
+        carbons = [c for c in near[n] if symbol[c] == "C"]
+        if len(carbons) != 1 or sum(symbol[h] == "H" for h in near[n]) != 2:
+            continue
+        c = carbons[0]
+        if len(near[c]) == 3 and any(symbol[o] == "O" and len(near[o]) == 1 for o in near[c]):
+            alphas = [a for a in near[c] if symbol[a] == "C"]
+            if any(symbol[m] == "N" for a in alphas for m in near[a]):
+                found.append((c, n))
+    return found
 
 
 def permuted(system: Any, order: IntArray) -> Any:

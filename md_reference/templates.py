@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,13 @@ PROTEIN_FILES = {
     "ff99SB-ILDN": "amber99sbildn.xml",
     "charmm36": "charmm36.xml",
 }
+# ff14SB with what Amber pairs with it: phosphorylated residues (docs/studies/phosphorylated_residues.py), DNA and RNA.
+CHAIN_FILES = (
+    PROTEIN_FILES["ff14SB"],
+    str(files("systems") / "data" / "phosaa14SB.xml"),
+    "amber14/DNA.OL15.xml",
+    "amber14/RNA.OL3.xml",
+)
 _WATER_FILES = {
     "tip3p": {"ff14SB": "amber14/tip3p.xml", "ff19SB": "amber19/tip3p.xml", "ff99SB-ILDN": "amber14/tip3p.xml",
               "charmm36": "charmm36/water.xml"},
@@ -46,6 +54,11 @@ class Unmatched(Exception):
 def water_file(protein: str, solvent: str) -> str | None:
     """Return OpenMM's file of this water (TIP3P where the solvent is implicit) and its ions, or None."""
     return _WATER_FILES["opc" if solvent == "opc" else "tip3p"].get(protein)
+
+
+def chain_files(protein: str) -> tuple[str, ...]:
+    """Return the files of a protein force field: its own, and those of the other residues that it goes with."""
+    return CHAIN_FILES if protein == "ff14SB" else (PROTEIN_FILES[protein],)
 
 
 def cutoff_nm(protein: str) -> tuple[float, float | None]:
@@ -71,34 +84,35 @@ def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = Tru
         return permuted(_build(regrouped, spec, native_gb), order)
     except Unmatched as error:
         raise PreparationError(
-            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}; covered so far are "
-            "peptides of the standard amino acids with the caps ACE and NME, every hydrogen in place."
+            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, hydrogens as they are; "
+            "leave --force-field out, or give --force-field ff14SB+gaff2, for residues that it lacks."
         ) from error
 
 
 def uncovered_residue(scene: Scene, protein: str) -> str | None:
     """Return which residue the templates lack, in words, or None: the scene is covered, as it is or regrouped."""
-    force_field = _force_field((PROTEIN_FILES[protein],))
+    force_field = force_field_of(chain_files(protein))
     try:
-        found = _unmatched(scene, force_field)
+        found = unmatched_residues(scene, force_field)
     except InputError:
-        found = "residues that are not contiguous"
-    if found is not None:
-        found = _unmatched(regroup(scene)[0], force_field)
-    return found
+        found = [0]  # residues that are not contiguous
+    if found:
+        scene = regroup(scene)[0]
+        found = unmatched_residues(scene, force_field)
+    return _describe(scene, found[0]) if found else None
 
 
 @cache
-def _force_field(files: tuple[str, ...]) -> Any:
+def force_field_of(names: tuple[str, ...]) -> Any:
+    """Return OpenMM's force field of these files, read once."""
     from openmm import app
 
-    return app.ForceField(*files)
+    return app.ForceField(*names)
 
 
-def _unmatched(scene: Scene, force_field: Any) -> str | None:
-    for residue in force_field.getUnmatchedResidues(scene.to_openmm_topology()):
-        return _describe(scene, residue.index)
-    return None
+def unmatched_residues(scene: Scene, force_field: Any) -> list[int]:
+    """Return the residues whose bonds fit no template. Raises InputError for residues that are not contiguous."""
+    return [r.index for r in force_field.getUnmatchedResidues(scene.to_openmm_topology())]
 
 
 def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
@@ -108,16 +122,16 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     if spec.force_field == "charmm36":
         scene = _with_caps_joined(scene)
     topology = scene.to_openmm_topology()
-    files = [PROTEIN_FILES[spec.force_field]]
+    wanted = [*chain_files(spec.force_field)]
     needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene, m) for m in molecules_of(scene))
     water = water_file(spec.force_field, spec.solvent) if needs_water else None
     if water is not None:
-        files.append(water)
+        wanted.append(water)
     if spec.solvent == "amber99-obc":
-        files.append("amber99_obc.xml")
+        wanted.append("amber99_obc.xml")
     elif spec.solvent == "obc2" and not native_gb:
-        files.append("implicit/obc2.xml")
-    force_field = _force_field(tuple(files))
+        wanted.append("implicit/obc2.xml")
+    force_field = force_field_of(tuple(wanted))
     settings: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
     if spec.is_explicit:
         far_nm, near_nm = cutoff_nm(spec.force_field)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 from collections.abc import Callable
 from enum import StrEnum
 from typing import Annotated, Any, get_type_hints, is_typeddict
@@ -100,7 +101,15 @@ WantedTemperatureOpt = Annotated[
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
 ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
 OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
-QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.")]
+
+
+def _hush(quiet: bool) -> bool:
+    """Keep the lines of loggers, such as those about charges, from stderr."""
+    logging.getLogger("surromd").setLevel(logging.ERROR if quiet else logging.NOTSET)
+    return quiet
+
+
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.", callback=_hush)]
 JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 

@@ -1,0 +1,237 @@
+"""Chains with residues beyond the twenty: phosphorylated ones and nucleic acids by templates, others by GAFF2."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from md_reference import nonstandard
+from md_reference.ambertools import find_ambertools, run
+from md_reference.capped_residues import cap
+from md_reference.charge_cost import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
+from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.regrouping import regroup
+from md_reference.residue_templates import make_template
+from systems.bond_orders import perceive
+from systems.chemistry import backbone_torsions
+from systems.errors import PreparationError
+from systems.library import load
+from systems.molecule import scene_from_smiles
+from systems.scene import FloatArray, Scene
+
+needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
+
+
+def energies(system: Any, positions_nm: FloatArray) -> dict[str, float]:
+    """Energy in kJ/mol by force, in double precision."""
+    import openmm
+
+    for group, force in enumerate(system.getForces()):
+        force.setForceGroup(group)
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    context.setPositions(positions_nm)
+    return {
+        force.getName(): context.getState(energy=True, groups={group}).getPotentialEnergy()._value
+        for group, force in enumerate(system.getForces())
+    }
+
+
+def leap_scene(sequence: str, folder: Path, sources: tuple[str, ...]) -> tuple[Scene, Any]:
+    """A sequence as tleap builds it, 0.05 Å off its own geometry, and the System of tleap's prmtop."""
+    from openmm import app, unit
+
+    script = [f"source leaprc.{name}" for name in sources]
+    script += [f"x = sequence {{ {sequence} }}", "saveamberparm x x.prmtop x.inpcrd", "quit", ""]
+    (folder / "leap.in").write_text("\n".join(script))
+    run("tleap", ["-f", "leap.in"], folder)
+    prmtop = app.AmberPrmtopFile(str(folder / "x.prmtop"))
+    topology = prmtop.topology
+    residues = list(topology.residues())
+    elements = [a.element.symbol for a in topology.atoms()]
+    bonds = np.array(sorted(tuple(sorted((a.index, b.index))) for a, b in topology.bonds()), dtype=np.int64)
+    orders, charges = perceive(elements, bonds)
+    read = app.AmberInpcrdFile(str(folder / "x.inpcrd")).positions
+    positions_nm = np.array(read.value_in_unit(unit.nanometer))
+    positions_nm += 0.005 * np.random.default_rng(0).normal(size=positions_nm.shape)
+    scene = Scene(
+        name=sequence,
+        atom_names=tuple(a.name for a in topology.atoms()),
+        elements=tuple(elements),
+        residue_of_atom=np.array([a.residue.index for a in topology.atoms()], dtype=np.int64),
+        residue_names=tuple(r.name for r in residues),
+        residue_ids=tuple(str(r.index + 1) for r in residues),
+        chain_of_residue=tuple("A" for _ in residues),
+        bonds=bonds,
+        bond_orders=orders,
+        formal_charges=charges,
+        masses_da=np.array([a.element.mass._value for a in topology.atoms()]),
+        positions_nm=positions_nm,
+    )
+    return scene, prmtop.createSystem(nonbondedMethod=app.NoCutoff, constraints=None, removeCMMotion=False)
+
+
+@needs_ambertools
+@pytest.mark.parametrize("name", ["SEP", "S1P", "TPO", "T1P", "PTR", "Y1P", "H1D", "H2D", "H1E", "H2E"])
+def test_phosphorylated_residues_have_tleaps_energies(name: str, tmp_path: Path) -> None:
+    scene, theirs = leap_scene(f"ACE ALA {name} GLY NME", tmp_path, ("protein.ff14SB", "phosaa14SB"))
+    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
+    assert spec.force_field == "ff14SB"
+    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
+        assert ours[force] == pytest.approx(expected[force], abs=0.02), force
+    # Impropers of rings depend on the order of their atoms (`regrouping`): two of 4.6 kJ/mol in a tyrosine.
+    ring = 0.3 if name in ("PTR", "Y1P") or name.startswith("H") else 0.0
+    assert ours["PeriodicTorsionForce"] == pytest.approx(expected["PeriodicTorsionForce"], abs=0.02 + ring)
+
+
+# ---- residues from GAFF2 -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["aspirin", "uracil"])
+def test_a_template_gives_each_term_of_the_molecule_it_was_made_of(name: str) -> None:
+    import io
+
+    from openmm import app
+
+    scene = load(name)
+    template = make_template(cap(scene, 0), "MOL-1")
+    assert template.spread_e == pytest.approx(0.0, abs=1e-6)
+    ours = app.ForceField(io.StringIO(template.xml)).createSystem(scene.to_openmm_topology(), removeCMMotion=False)
+    x = scene.positions_nm + 0.005 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
+    theirs = energies(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
+    for force, energy in energies(ours, x).items():
+        assert energy == pytest.approx(theirs[force], abs=1e-4), force
+
+
+@pytest.fixture(scope="module")
+def aib_chain(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """ACE-ALA-AIB-ALA-NME, its chain and its System; one AM1-BCC calculation of 25 atoms."""
+    if find_ambertools() is None:
+        pytest.skip("AmberTools is not installed")
+    patch = pytest.MonkeyPatch()
+    patch.setenv("SURROMD_CACHE", str(tmp_path_factory.mktemp("cache")))
+    scene = scene_from_smiles("CC(=O)N[C@@H](C)C(=O)NC(C)(C)C(=O)N[C@@H](C)C(=O)NC")
+    chain = nonstandard.find_chain(scene)
+    assert chain is not None
+    yield scene, chain, build_system(scene, ForceFieldSpec("auto", "auto", None, False))
+    patch.undo()
+
+
+def test_only_the_residue_without_a_template_is_charged_anew(aib_chain: Any) -> None:
+    from openmm import NonbondedForce
+
+    scene, chain, system = aib_chain
+    assert resolve(scene, ForceFieldSpec("auto", "auto")).force_field == "ff14SB+gaff2"
+    assert len(chain.unknown) == 1
+    capped = cap(chain.scene, chain.unknown[0])
+    assert (capped.scene.formula, capped.n_own) == ("C7H14N2O2", 13)  # ACE-AIB-NME
+    force = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
+    charges_e = np.array([force.getParticleParameters(i)[0]._value for i in range(scene.n_atoms)])
+    residue = chain.scene.residue_of_atom[np.argsort(chain.order)]
+    for r in range(len(chain.scene.residue_names)):
+        assert charges_e[residue == r].sum() == pytest.approx(0.0, abs=1e-6)
+    alanine = Counter(np.round(charges_e[residue == 1], 4).tolist())
+    assert alanine[-0.4157] == alanine[0.5973] == alanine[-0.5679] == 1  # N, C and O of ff14SB
+
+
+def test_backbone_torsions_of_such_a_residue_are_those_of_alanine(aib_chain: Any) -> None:
+    from openmm import PeriodicTorsionForce
+
+    scene, _, system = aib_chain
+    force = next(f for f in system.getForces() if isinstance(f, PeriodicTorsionForce))
+    terms: dict[tuple[int, ...], set[tuple[float, ...]]] = {}
+    for k in range(force.getNumTorsions()):
+        i, j, m, n, period, phase, strength = force.getTorsionParameters(k)
+        row = (period, round(phase._value, 4), round(strength._value, 4))
+        for atoms in ((i, j, m, n), (n, m, j, i)):
+            terms.setdefault(atoms, set()).add(row)
+    torsions = backbone_torsions(scene)
+    for name in ("phi", "psi"):
+        alanine, aib, _ = [terms[tuple(row)] for row in torsions[name].tolist()]
+        assert len(alanine) > 1 and aib == alanine, name
+
+
+def test_such_a_chain_stays_whole_at_300_k(aib_chain: Any) -> None:
+    from md_reference.engine import Engine
+
+    scene, _, _ = aib_chain
+    spec = resolve(scene, ForceFieldSpec("auto", "auto"))
+    with Engine(scene, spec, temperature_k=300.0, friction_per_ps=1.0, timestep_ps=0.004, platform="CPU") as engine:
+        engine.minimise()
+        engine.thermalise()
+        engine.step(1000)
+        x = engine.state().positions_nm
+    i, j = scene.bonds.T
+    stretch = np.linalg.norm(x[i] - x[j], axis=1) / np.linalg.norm(
+        scene.positions_nm[i] - scene.positions_nm[j], axis=1
+    )
+    assert np.isfinite(x).all() and stretch.min() > 0.85 and stretch.max() < 1.15
+
+
+def test_a_missing_term_is_refused(aib_chain: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import re
+
+    from md_reference import nonstandard as module
+
+    def with_a_hole(capped: Any, name: str) -> Any:
+        made = make_template(capped, name)
+        return replace(made, xml=re.sub(r"<Angle [^>]*/>", "", made.xml, count=1))
+
+    monkeypatch.setattr(module, "make_template", with_a_hole)
+    with pytest.raises(PreparationError, match=r"no parameters for .* angles"):
+        build_system(aib_chain[0], ForceFieldSpec("auto", "auto"))
+
+
+def test_other_protein_force_fields_send_such_chains_to_ff14sb() -> None:
+    scene = scene_from_smiles("CC(=O)N[C@@H](C)C(=O)NC(C)(C)C(=O)N[C@@H](C)C(=O)NC")
+    with pytest.raises(PreparationError, match=r"use --force-field ff14SB\+gaff2"):
+        build_system(scene, ForceFieldSpec("ff19SB+gaff2", "vacuum"))
+    with pytest.raises(PreparationError, match=r"--force-field ff14SB\+gaff2"):
+        build_system(scene, ForceFieldSpec("ff14SB", "vacuum"))
+
+
+def test_the_amide_that_ends_a_chain_is_a_residue_and_asparagines_is_not() -> None:
+    scene = scene_from_smiles("CC(=O)N[C@@H](CC(N)=O)C(=O)N[C@@H](C)C(N)=O")  # ACE-ASN-ALA-NH2 in one residue
+    regrouped, _ = regroup(scene)
+    sizes = Counter(regrouped.residue_of_atom.tolist())
+    assert sorted(sizes.values()) == [3, 6, 10, 14]
+    assert resolve(scene, ForceFieldSpec("auto", "auto")).force_field == "ff14SB"
+
+
+# ---- nucleic acids -------------------------------------------------------------------------------------------------
+
+
+@needs_ambertools
+@pytest.mark.parametrize(("sequence", "source"), [("DA5 DT DG3", "DNA.OL15"), ("A5 U G C3", "RNA.OL3")])
+def test_nucleic_acids_have_tleaps_energies(sequence: str, source: str, tmp_path: Path) -> None:
+    scene, theirs = leap_scene(sequence, tmp_path, (source,))
+    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
+    assert spec.force_field == "ff14SB"
+    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    for force, energy in expected.items():
+        if force in ours:
+            assert ours[force] == pytest.approx(energy, rel=2e-4, abs=0.3), force
+
+
+# ---- what is said about charges ------------------------------------------------------------------------------------
+
+
+def test_the_cost_of_charges_grows_as_measured() -> None:
+    assert expected_s(30) == pytest.approx(SECONDS_AT_30_ATOMS)
+    assert 15 < expected_s(40) < 60 and expected_s(60) / expected_s(30) == pytest.approx(2**POWER)
+
+
+def test_charges_are_announced_where_they_take_long(caplog: pytest.LogCaptureFixture) -> None:
+    with announced(load("ethanol")) as waiting:
+        assert waiting is None
+    assert not caplog.records
+    with announced(replace(load("aspirin"), name="aspirin")):
+        pass
+    before, after = (record.getMessage() for record in caplog.records)
+    assert "aspirin: AM1-BCC charges of 21 atoms, about 2 s on an idle core" in before
+    assert "charges computed in" in after
