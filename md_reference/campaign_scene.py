@@ -44,13 +44,15 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     """
     if path.is_file():
         return load_prepared(path)
-    from md_reference.solvation import solvate
+    from md_reference.solvation import require_molecules, solvate
     from systems.prepare import prepare
     from systems.whole_file import create_whole
 
     switches = keyword_defaults(prepare)
     scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})
     force = resolve(scene, config.force)
+    if spec.preparation.get("keep_water"):
+        require_molecules(force)
     if force.is_explicit and scene.cell_nm is None:
         of_water = {key: value for key, value in spec.preparation.items() if key not in switches}
         scene = solvate(scene, force, seed=seed, **of_water)

@@ -79,6 +79,12 @@ def solvate(
     return _assembled(scene, solute, water, kinds, ions, cell, done, seed)
 
 
+def require_molecules(spec: ForceFieldSpec) -> None:
+    """Raise InputError where waters of a file are to be kept in a solvent that is none of molecules."""
+    if not spec.is_explicit:
+        raise InputError("--keep-water needs a solvent of molecules; give --solvent tip3p or opc, or leave it out.")
+
+
 def solvate_if_asked(
     scene: Scene,
     spec: ForceFieldSpec,

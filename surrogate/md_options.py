@@ -114,7 +114,8 @@ class Preparation(TypedDict, total=False):
         bool, Flag("--keep-ligand", "Simulate ligands and ions beside a peptide, too.", default=False)
     ]
     drop_ligand: Annotated[bool, Flag("--drop-ligand", "Leave ligands and ions beside a peptide out.", default=False)]
-    drop_water: Annotated[bool, Flag("--drop-water", "Leave the file's waters out.", default=False)]
+    drop_water: Annotated[bool, Flag("--drop-water", "Leave the file's waters out, as is usual.", default=False)]
+    keep_water: Annotated[bool, Flag("--keep-water", "Keep the file's waters, in explicit solvent.", default=False)]
 
 
 class MDOptions(MDSettings, Preparation, total=False):

@@ -77,7 +77,7 @@ def reference(
     `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name: `systems.protocols`), else
     ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps, 4 fs, 3 Da, 100 ps of
     equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked for by; model systems
-    bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `drop_water`: see `systems.prepare.prepare`.
+    bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `keep_water`: see `systems.prepare.prepare`.
     `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
@@ -138,7 +138,7 @@ def _settle(
     from md_reference.integrators import check_ensemble
     from md_reference.protocol import settle
     from md_reference.run_config import MDConfig
-    from md_reference.solvation import solvate_if_asked
+    from md_reference.solvation import require_molecules, solvate_if_asked
 
     given = {**options, "force_field": at_level(options["level"], options["force_field"])}
     given |= {"save_every_ps": save_every_ps}
@@ -149,6 +149,8 @@ def _settle(
     settings, protocol = settle(scene, asked, options["protocol"])
     config = to_config(settings | {"time_ps": time_ps}, seed=seed)
     config = replace(config, force=resolve(scene, config.force))
+    if options["keep_water"]:
+        require_molecules(config.force)
     dry = scene
     padding_nm, salt_molar = (
         quantity("padding_nm", options["padding_nm"]),

@@ -79,6 +79,7 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
         keep_ligand=options["keep_ligand"],
         drop_ligand=options["drop_ligand"],
         drop_water=options["drop_water"],
+        keep_water=options["keep_water"],
     )
     if not quiet:
         for line in prepared.provenance.get("repairs", []):

@@ -8,6 +8,8 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
+from systems.lewis import is_usual, lewis_structure
+
 _VALENCE = {"H": 1, "B": 3, "C": 4, "N": 3, "O": 2, "F": 1, "Si": 4, "P": 3, "S": 2, "Cl": 1, "Se": 2, "Br": 1, "I": 1}
 _IONS = {"Li": 1, "Na": 1, "K": 1, "Rb": 1, "Cs": 1, "Mg": 2, "Ca": 2, "Sr": 2, "Ba": 2, "Zn": 2, "F": -1, "Cl": -1,
          "Br": -1, "I": -1, "Cu": 2, "Fe": 2, "Mn": 2, "Co": 2, "Ni": 2, "Cd": 2}  # fmt: skip
@@ -27,20 +29,63 @@ def perceive(
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of one Kekulé structure.
 
     Every hydrogen must be present. Open valences are paired by a maximum matching (C=O before C=N before C=C); what
-    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium).
+    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium). Molecules
+    that this leaves with an atom in no usual state are given the Lewis structure of least penalty (`systems.lewis`).
     Raises ValenceError naming the atoms that fit nothing (missing hydrogens, wrong bonds, unknown elements).
     """
     neighbours: list[list[int]] = [[] for _ in elements]
     for i, j in bonds.tolist():
         neighbours[i].append(j)
         neighbours[j].append(i)
+    orders, charges, bad = _match(elements, bonds, neighbours)
+    valence = np.zeros(len(elements))
+    np.add.at(valence, bonds.ravel(), np.repeat(orders, 2))
+    doubtful = set(bad) | {
+        i
+        for i, q in enumerate(charges.tolist())
+        if neighbours[i] and not is_usual(elements, neighbours, i, round(valence[i]), q)
+    }
+    if not doubtful:
+        return orders, charges
+    graph = nx.Graph(bonds.tolist())
+    graph.add_nodes_from(range(len(elements)))
+    for molecule in nx.connected_components(graph):
+        if not molecule & doubtful:
+            continue
+        atoms = sorted(molecule)
+        rank = {i: k for k, i in enumerate(atoms)}
+        rows = [k for k, (i, _) in enumerate(bonds.tolist()) if i in rank]
+        own = np.array([[rank[i], rank[j]] for i, j in bonds[rows].tolist()], dtype=np.int64).reshape(-1, 2)
+        found = lewis_structure([elements[i] for i in atoms], own)
+        if found is None:
+            raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
+        orders[rows], charges[atoms] = found
+    return orders, charges
+
+
+def _match(
+    elements: Sequence[str], bonds: npt.NDArray[np.int64], neighbours: list[list[int]]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], list[int]]:
+    """Orders and charges by matching, and the atoms that fit nothing."""
     charges = np.zeros(len(elements), dtype=np.int64)
     order = {(min(i, j), max(i, j)): 1 for i, j in bonds.tolist()}
     open_valence = [_open_valence(elements, neighbours, i, charges) for i in range(len(elements))]
     bad = [i for i, u in enumerate(open_valence) if u < 0]
-    if bad:
-        raise ValenceError(bad)
-    _hypervalent(elements, neighbours, open_valence, order, charges)
+    if not bad:
+        _hypervalent(elements, neighbours, open_valence, order, charges)
+        _pair(elements, neighbours, open_valence, order)
+        _settle(elements, neighbours, open_valence, order, charges)
+        bad = [i for i, u in enumerate(open_valence) if u > 0]
+    orders = np.array([order[min(i, j), max(i, j)] for i, j in bonds.tolist()], dtype=np.float64)
+    return orders, charges, bad
+
+
+def _pair(
+    elements: Sequence[str],
+    neighbours: list[list[int]],
+    open_valence: list[int],
+    order: dict[tuple[int, int], int],
+) -> None:
     while True:  # a second round makes triple bonds
         graph = nx.Graph()
         for i, j in order:
@@ -53,12 +98,6 @@ def perceive(
             order[min(a, b), max(a, b)] += 1
             open_valence[a] -= 1
             open_valence[b] -= 1
-    _settle(elements, neighbours, open_valence, order, charges)
-    bad = [i for i, u in enumerate(open_valence) if u > 0]
-    if bad:
-        raise ValenceError(bad)
-    orders = np.array([order[min(i, j), max(i, j)] for i, j in bonds.tolist()], dtype=np.float64)
-    return orders, charges
 
 
 def _open_valence(elements: Sequence[str], neighbours: list[list[int]], i: int, charges: npt.NDArray[np.int64]) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from systems.element_data import covalent_radius_nm
+from systems.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.errors import PreparationError
 from systems.pdb_records import AtomRecord
 from systems.residues import ResidueTemplate, canonical_heavy_name, template_for
@@ -61,7 +61,8 @@ def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -
 
     Standard residues take heavy-atom bonds from their template, hydrogens go to the nearest heavy atom, peptide and
     disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
-    distances within 0.04 nm of the sum of covalent radii if not. Raises PreparationError for atoms that coincide and
+    distances within 0.04 nm of the sum of covalent radii if not; monatomic ions have no bonds by distance, and metal
+    ions none at all. Raises PreparationError for atoms that coincide and
     hydrogens far from everything.
     """
     from scipy.spatial import cKDTree
@@ -77,6 +78,7 @@ def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -
                 "remove one of them."
             )
     residues = _residues(atoms)
+    ions = {r.atoms[0] for r in residues if len(r.atoms) == 1 and is_lone_ion(atoms[r.atoms[0]].element)}
     of_atom = {i: r for r in residues for i in r.atoms}
     bonds: set[tuple[int, int]] = set()
     notes: list[str] = []
@@ -86,10 +88,10 @@ def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -
             bonds |= {_pair(residue.heavy[a], residue.heavy[b]) for a, b in names if {a, b} <= set(residue.heavy)}
     peptide = _peptide_bonds(near, length, of_atom)
     bonds |= {_pair(c, n) for c, n in peptide}
-    bonds |= _accepted_conect(atoms, x, conect, of_atom, notes)
+    bonds |= _accepted_conect(atoms, x, conect, of_atom, {i for i in ions if is_metal(atoms[i].element)}, notes)
     free = _free_atoms(residues, bonds, notes)
-    bonds |= _bonds_by_distance(atoms, near, length, free)
-    bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free)
+    bonds |= _bonds_by_distance(atoms, near, length, free, ions)
+    bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
     bonds |= _disulfides(atoms, near, length, bonds, of_atom)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
     _note_missing(residues, atoms, bonded)
@@ -140,13 +142,18 @@ def _accepted_conect(
     x: npt.NDArray[np.float64],
     conect: Sequence[tuple[int, int]],
     of_atom: dict[int, Residue],
+    metals: set[int],
     notes: list[str],
 ) -> set[tuple[int, int]]:
-    """CONECT pairs, but those that span impossible distances, and those inside standard residues (templates know)."""
+    """CONECT pairs, but those that span impossible distances, those to metal ions (which coordinate and do not bond),
+    and those inside standard residues (templates know)."""
     accepted = set()
-    too_long = 0
+    too_long = to_metals = 0
     for i, j in conect:
         if of_atom[i] is of_atom[j] and of_atom[i].heavy:
+            continue
+        if {i, j} & metals:
+            to_metals += 1
             continue
         limit = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _CONECT_SLACK_NM
         if float(np.linalg.norm(x[i] - x[j])) > limit:
@@ -155,6 +162,8 @@ def _accepted_conect(
             accepted.add(_pair(i, j))
     if too_long:
         notes.append(f"{too_long} CONECT bonds are impossibly long and are ignored")
+    if to_metals:
+        notes.append(f"{to_metals} CONECT bonds to metal ions are ignored: ions coordinate")
     return accepted
 
 
@@ -175,11 +184,15 @@ def _free_atoms(residues: list[Residue], bonds: set[tuple[int, int]], notes: lis
 
 
 def _bonds_by_distance(
-    atoms: Sequence[AtomRecord], near: npt.NDArray[np.int64], length: npt.NDArray[np.float64], free: set[int]
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    free: set[int],
+    ions: set[int],
 ) -> set[tuple[int, int]]:
     found = set()
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
-        if (i in free or j in free) and "H" not in (atoms[i].element, atoms[j].element):
+        if (i in free or j in free) and not {i, j} & ions and "H" not in (atoms[i].element, atoms[j].element):
             reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
             if d < reach:
                 found.add((i, j))
@@ -192,12 +205,13 @@ def _hydrogen_bonds_to_parents(
     bonds: set[tuple[int, int]],
     of_atom: dict[int, Residue],
     free: set[int],
+    ions: set[int],
 ) -> set[tuple[int, int]]:
     """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing."""
     from scipy.spatial import cKDTree
 
     bonded = {i for pair in bonds for i in pair}
-    heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H"], dtype=np.int64)
+    heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in ions], dtype=np.int64)
     tree = cKDTree(x[heavy]) if len(heavy) else None
     found = set()
     for i, atom in enumerate(atoms):

@@ -16,10 +16,14 @@ _TABLE: dict[str, tuple[float, float]] = {
     "Sb": (121.76, 0.139), "Te": (127.60, 0.138), "I": (126.90, 0.139), "Xe": (131.29, 0.140), "Cs": (132.91, 0.244),
     "Ba": (137.33, 0.215), "Pt": (195.08, 0.136), "Au": (196.97, 0.136), "Hg": (200.59, 0.132), "Pb": (207.2, 0.146),
 }  # fmt: skip
-_MONATOMIC_RESIDUES = {"CL": "Cl", "CLA": "Cl", "CL-": "Cl", "NA": "Na", "SOD": "Na", "NA+": "Na", "K": "K", "POT": "K",
-                       "K+": "K", "CA": "Ca", "CAL": "Ca", "MG": "Mg", "ZN": "Zn", "FE": "Fe", "CU": "Cu", "MN": "Mn",
-                       "BR": "Br", "IOD": "I", "CES": "Cs", "LI": "Li", "LIT": "Li", "CD": "Cd", "CO": "Co",
-                       "NI": "Ni", "HG": "Hg"}  # fmt: skip
+_NOT_METALS = frozenset(
+    ("H", "He", "B", "C", "N", "O", "F", "Ne", "Si", "P", "S", "Cl", "Ar", "Ge", "As", "Se", "Br", "Kr", "Sb", "Te", "I",
+     "Xe")
+)  # fmt: skip
+# Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
+_ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CIO": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
+              "BAR": "Ba", "CAD": "Cd", "IOD": "I", "BRO": "Br", "CU1": "Cu", "3CO": "Co", "3NI": "Ni"}  # fmt: skip
+_HALOGENS = ("F", "Cl", "Br", "I")
 _UNNAMED_RESIDUES = ("UNL", "UNK", "LIG", "MOL", "DRG")
 _TWO_LETTER_IN_LIGANDS = ("Cl", "Br", "Si", "Se", "Na", "Mg", "Zn", "Fe", "Li", "As")
 
@@ -27,6 +31,24 @@ _TWO_LETTER_IN_LIGANDS = ("Cl", "Br", "Si", "Se", "Na", "Mg", "Zn", "Fe", "Li", 
 def atomic_weight_da(symbol: str) -> float:
     """Standard atomic weight in dalton. Raises KeyError for a symbol the table lacks."""
     return _TABLE[symbol][0]
+
+
+def is_metal(symbol: str) -> bool:
+    """Whether this is a metal of the table."""
+    return symbol in _TABLE and symbol not in _NOT_METALS
+
+
+def is_lone_ion(symbol: str) -> bool:
+    """Whether a lone atom of this element is an ion: a metal or a halide."""
+    return is_metal(symbol) or symbol in _HALOGENS
+
+
+def ion_symbol(name: str) -> str | None:
+    """Return the element of a monatomic ion by its name (`SOD`, `Na+`, `CL-`, `ZN2`, `MG`), or None."""
+    upper = name.strip().upper()
+    bare = upper.rstrip("+-").rstrip("0123456789").rstrip("+-") or upper
+    symbol = _ION_NAMES.get(upper, bare.capitalize())
+    return symbol if is_lone_ion(symbol) else None
 
 
 def covalent_radius_nm(symbol: str) -> float:
@@ -38,8 +60,12 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     """Return the element of an atom from the element column or, failing this, from its PDB name; None when unknown.
 
     `written` is the element column, whatever its case; `name_field` the atom name, which may start with digits
-    (`1HH3`). `CA` is calcium in a residue called CA and carbon elsewhere.
+    (`1HH3`). `CA` is calcium in a residue called CA and carbon elsewhere; an atom called as its residue is the ion of
+    that name whatever the column says (programs that guess make sulfur of sodium's SOD).
     """
+    ion = ion_symbol(residue_name)
+    if ion is not None and ion == ion_symbol(name_field):
+        return ion
     symbol = written.strip("0123456789+- ").capitalize()
     if symbol == "D":
         return "H"
@@ -50,9 +76,6 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     if not letters or not letters[0].isalpha():
         return None
     residue = residue_name.upper()
-    monatomic = _MONATOMIC_RESIDUES.get(residue)
-    if monatomic and letters.rstrip("0123456789+-") in (residue.rstrip("+-"), monatomic.upper()):
-        return monatomic
     two = letters[:2].capitalize()
     if (hetero or residue in _UNNAMED_RESIDUES) and two in _TWO_LETTER_IN_LIGANDS:
         return two

@@ -1,34 +1,78 @@
-"""What stands beside the peptide in a structure file: waters, ions and ligands, kept or left out as the user says."""
+"""What stands beside the molecules of a structure file: waters, ions and ligands, kept or left out."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from itertools import groupby
 
 import networkx as nx
+import numpy as np
 
 from systems.bonding import Bonding
+from systems.element_data import is_lone_ion
 from systems.errors import PreparationError
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
-from systems.residues import is_water, template_for
+from systems.residues import is_water_name, template_for
+
+_WATER_BOND_ANGSTROM = 1.3
+_BOUND_ANGSTROM = 3.0
 
 
-def settle_waters(atoms: Sequence[AtomRecord], kept: list[int], drop: bool, notes: list[str]) -> list[int]:
-    """Indices that stay: all where there is nothing but water, none of the waters where `drop`.
+def is_water(atoms: Sequence[AtomRecord]) -> bool:
+    """Whether the atoms of a residue are one or more waters: told by elements and distances, never by name alone.
 
-    Raises PreparationError for waters beside something else that nobody said to drop.
+    Each oxygen has two hydrogens of its own within 1.3 Å; where hydrogens are left out (all, or one of two), the
+    residue's name must be one of water's.
     """
-    dry = [i for i in kept if not is_water(atoms[i].residue_name)]
-    if not dry or len(dry) == len(kept):
-        return kept
-    n = len({(atoms[i].chain, atoms[i].residue_id) for i in kept if is_water(atoms[i].residue_name)})
-    waters = f"{n} water molecule{'s' if n > 1 else ''}"
-    if not drop:
-        raise PreparationError(
-            f"it holds {waters}; add --drop-water to leave them out (a solvent model takes their place)."
-        )
-    notes.append(f"{waters} left out")
-    return dry
+    oxygens = [a.position_angstrom for a in atoms if a.element == "O"]
+    hydrogens = [a.position_angstrom for a in atoms if a.element == "H"]
+    if not oxygens or len(oxygens) + len(hydrogens) < len(atoms):
+        return False
+    if len(hydrogens) < 2 * len(oxygens):
+        return is_water_name(atoms[0].residue_name) and (not hydrogens or len(oxygens) == 1)
+    gaps = np.linalg.norm(np.subtract(np.array(hydrogens)[:, None], np.array(oxygens)[None]), axis=2)
+    owners = Counter(gaps.argmin(axis=1).tolist())
+    return bool((gaps.min(axis=1) < _WATER_BOND_ANGSTROM).all()) and set(owners.values()) == {2}
+
+
+def settle_solvent(
+    atoms: Sequence[AtomRecord], kept: Sequence[int], *, keep_water: bool, keep_ions: bool, notes: list[str]
+) -> tuple[list[int], list[int]]:
+    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out.
+
+    Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
+    within 3 Å. Of a file that holds nothing else, all stays.
+    """
+    runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
+    water = [run for run in runs if is_water([atoms[i] for i in run])]
+    ions = [run for run in runs if len(run) == 1 and is_lone_ion(atoms[run[0]].element)]
+    wet = {i for run in water for i in run}
+    apart = wet | {i for run in ions for i in run}
+    solute = [i for i in kept if i not in apart]
+    if not solute:
+        return list(kept), []
+    n_waters = sum(atoms[i].element == "O" for i in wet)
+    waters = [f"{n_waters} water molecule{'s' if n_waters > 1 else ''}"] if n_waters and not keep_water else []
+    free = set() if keep_ions else _free(atoms, [run[0] for run in ions], solute)
+    count = Counter(atoms[i].residue_name for i in kept if i in free)
+    names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
+    gone = [*waters, *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else [])]
+    if gone:
+        notes.append(f"{' and '.join(gone)} left out")
+    return [i for i in kept if i not in wet and i not in free], sorted(wet) if keep_water else []
+
+
+def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:
+    """Those of the ions that no N, O or S of the solute holds."""
+    from scipy.spatial import cKDTree
+
+    donors = [atoms[i].position_angstrom for i in solute if atoms[i].element in ("N", "O", "S")]
+    if not ions or not donors:
+        return set(ions)
+    gap, _ = cKDTree(np.array(donors)).query(np.array([atoms[i].position_angstrom for i in ions]))
+    return {i for i, d in zip(ions, np.atleast_1d(gap).tolist(), strict=True) if d > _BOUND_ANGSTROM}
 
 
 def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:

@@ -13,13 +13,14 @@ import numpy as np
 from systems.bonding import Bonding, Residue, find_bonds
 from systems.errors import InputError, PreparationError
 from systems.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
-from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_waters
+from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
 from systems.mmcif_file import is_component
 from systems.modified_residues import describe_residue, standardise
 from systems.mol_file import SUFFIXES, suffix_of
 from systems.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
 from systems.scene import Scene
 from systems.structure import scene_from_records
+from systems.waters import complete_waters
 
 _FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
 _OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
@@ -27,14 +28,22 @@ _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
 def prepare(
-    spec: str, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, drop_water: bool = False
+    spec: str,
+    *,
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    drop_water: bool = False,
+    keep_water: bool = False,
 ) -> Scene:
     """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
     `sequence:ACE-ALA-NME`.
 
     Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
     line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
-    missing. Ligands and ions beside a peptide, and waters, are refused until one says what becomes of them.
+    missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
+    them free ions, which no N, O or S of the rest holds, unless `keep_ligand`. Other ions and ligands beside a peptide
+    are refused until one says what becomes of them.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
     from systems import library
@@ -43,6 +52,8 @@ def prepare(
         raise InputError(f"pH {ph:g} lies outside 0 to 14.")
     if keep_ligand and drop_ligand:
         raise InputError("--keep-ligand and --drop-ligand exclude each other; choose one.")
+    if keep_water and drop_water:
+        raise InputError("--keep-water and --drop-water exclude each other; choose one.")
     text = str(spec).strip()
     kind, _, rest = text.partition(":")
     if kind.lower() == "sequence":
@@ -64,12 +75,12 @@ def prepare(
     if suffix in _OTHER_SUFFIXES:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
-        return prepare_file(path, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
+        return prepare_file(path, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, keep_water=keep_water)
     return library.load(text)
 
 
 def prepare_file(
-    path: Path, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, drop_water: bool = False
+    path: Path, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, keep_water: bool = False
 ) -> Scene:
     """Return the scene of a PDB or mmCIF file; see `prepare`."""
     if is_mmcif(path) and is_component(text := read_text(path)):
@@ -77,18 +88,18 @@ def prepare_file(
 
         return scene_from_component(text, path)
     try:
-        return _prepare_file(path, ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, drop_water=drop_water)
+        return _prepare_file(path, ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, keep_water=keep_water)
     except PreparationError as error:
         if str(path) in str(error):
             raise
         raise PreparationError(f"{path}: {error}") from error
 
 
-def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool, drop_water: bool) -> Scene:
+def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool, keep_water: bool) -> Scene:
     found = read_structure(path)
     repairs = list(found.notes)
     kept = _choose_alternates(found.atoms, repairs)
-    kept = settle_waters(found.atoms, kept, drop_water, repairs)
+    kept, wet = settle_solvent(found.atoms, kept, keep_water=keep_water, keep_ions=keep_ligand, notes=repairs)
     part = standardise([found.atoms[i] for i in kept], repairs)
     structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
     bonding = find_bonds(structure.atoms, structure.conect)
@@ -122,6 +133,10 @@ def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool
         bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
         atoms = [*atoms, *others.atoms]
         repairs += others_bonding.notes
+    if wet:
+        waters, water_bonds = complete_waters([found.atoms[i] for i in wet], atoms, repairs)
+        bonds = np.concatenate([bonds, water_bonds + len(atoms)])
+        atoms = [*atoms, *waters]
     scene = scene_from_records(
         atoms,
         bonds,

@@ -49,7 +49,11 @@ _ATOM_ALIASES: dict[str, dict[str, str]] = {
     "NH2": {"NT": "N"},
 }
 _TERMINAL_ALIASES = {"OT1": "O", "OC1": "O", "O1": "O", "OT2": "OXT", "OC2": "OXT", "O2": "OXT", "OT": "OXT"}
-_WATERS = {"HOH", "WAT", "H2O", "DOD", "SOL", "SPC", "TIP", "TIP3", "TIP4", "TIP5", "TP3", "TP4", "TP5", "T3P", "T4P"}
+_WATERS = {
+    "HOH", "WAT", "H2O", "DOD", "D2O", "SOL", "SPC", "SPCE", "TIP", "TIP3", "TIP4", "TIP5", "TIP3P", "TIP4P", "TIP5P",
+    "TP3", "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "T4H", "T4E", "TP3M", "OPC", "OPC3", "SWM", "SWM4", "SWM6", "HHO",
+    "OHH", "OH2", "W", "WATER",
+}  # fmt: skip
 ONE_LETTER = {
     "A": "ALA", "R": "ARG", "N": "ASN", "D": "ASP", "C": "CYS", "Q": "GLN", "E": "GLU", "G": "GLY", "H": "HIS",
     "I": "ILE", "L": "LEU", "K": "LYS", "M": "MET", "F": "PHE", "P": "PRO", "S": "SER", "T": "THR", "W": "TRP",
@@ -99,8 +103,8 @@ def canonical_heavy_name(template: ResidueTemplate, name: str) -> str | None:
     return None
 
 
-def is_water(residue_name: str) -> bool:
-    """Whether this is one of the usual names of water."""
+def is_water_name(residue_name: str) -> bool:
+    """Whether this is one of the usual names of water; what the residue is, its elements say."""
     return residue_name.upper() in _WATERS
 
 

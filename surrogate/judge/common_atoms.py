@@ -31,14 +31,14 @@ def solute_atoms(scene: Scene) -> IntArray:
     import networkx as nx
 
     from systems.chemistry import bonded_graph
-    from systems.residues import is_water
+    from systems.residues import is_water_name
 
     kept: list[int] = []
     largest = 0
     for component in nx.connected_components(bonded_graph(scene)):
         atoms = sorted(component)
         elements = sorted(scene.elements[i] for i in atoms)
-        named_water = is_water(scene.residue_names[int(scene.residue_of_atom[atoms[0]])])
+        named_water = is_water_name(scene.residue_names[int(scene.residue_of_atom[atoms[0]])])
         if len(atoms) > 1 and elements != ["H", "H", "O"] and not (named_water and set(elements) <= {"H", "O"}):
             kept += atoms
             largest = max(largest, sum(e != "H" for e in elements))

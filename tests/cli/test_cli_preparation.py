@@ -26,18 +26,21 @@ def wet(tmp_path: Path) -> str:
 
 
 @pytest.mark.parametrize("verb", ["plan", "reference", "rollout"])
-def test_water_and_ligands_wait_for_a_word_in_every_verb(tmp_path: Path, wet: str, verb: str) -> None:
+def test_bound_ions_wait_for_a_word_in_every_verb(tmp_path: Path, wet: str, verb: str) -> None:
     extra = {
         "plan": [],
         "reference": ["--time", "1ps", "-o", str(tmp_path / "x.h5")],
         "rollout": ["--weights", "alanine-dipeptide", "--time", "1ns", "-o", str(tmp_path / "x.h5")],
     }[verb]
+    path = Path(wet)
+    oxygen = library.load("alanine-dipeptide").positions_nm[5] * 10  # of the cap's carbonyl
+    place = "".join(f"{x:8.3f}" for x in oxygen + (0.0, 0.0, 2.9))
+    path.write_text(path.read_text().replace("  30.000  30.000  20.000", place))
     refused = RUNNER.invoke(app, [verb, wet, *extra])
-    assert refused.exit_code == 1
-    assert "add --drop-water" in refused.stderr and refused.stderr.count("\n") == 1
-    refused = RUNNER.invoke(app, [verb, wet, *extra, "--drop-water"])
-    assert refused.exit_code == 1
-    assert "--keep-ligand" in refused.stderr and "--drop-ligand" in refused.stderr
+    assert refused.exit_code == 1 and refused.stderr.count("\n") == 1
+    assert "CL A301" in refused.stderr and "--keep-ligand" in refused.stderr and "--drop-ligand" in refused.stderr
+    refused = RUNNER.invoke(app, [verb, wet, *extra, "--keep-water", "--drop-water"])
+    assert "exclude each other" in refused.stderr
     refused = RUNNER.invoke(app, [verb, wet, *extra, "--keep-ligand", "--drop-ligand"])
     assert "exclude each other" in refused.stderr
     assert RUNNER.invoke(app, [verb, wet, *extra, "--ph", "15"]).exit_code == 2
@@ -45,7 +48,8 @@ def test_water_and_ligands_wait_for_a_word_in_every_verb(tmp_path: Path, wet: st
 
 
 def test_what_was_left_out_is_said_once_a_line(tmp_path: Path, wet: str) -> None:
-    done = RUNNER.invoke(app, ["plan", wet, "--drop-water", "--drop-ligand", "--json"])
+    done = RUNNER.invoke(app, ["plan", wet, "--json"])
     assert done.exit_code == 0
-    assert f"{wet}: 1 water molecule left out\n" in done.stderr
-    assert f"{wet}: left out, as asked (--drop-ligand): CL A301\n" in done.stderr
+    assert done.stderr == f"{wet}: 1 water molecule and free ion CL left out\n"
+    refused = RUNNER.invoke(app, ["plan", wet, "--keep-water"])
+    assert refused.exit_code == 1 and "--keep-water needs a solvent of molecules" in refused.stderr

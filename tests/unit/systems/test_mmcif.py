@@ -76,11 +76,13 @@ def test_waters_ligands_and_alternates_as_in_pdb_files(tmp_path: Path) -> None:
     rows.append(_row(31, "O", "HOH", "301", (30, 30, 30), "O", group="HETATM"))
     rows.append(_row(32, "ZN", "ZN", "302", (30, 30, 36), "ZN", group="HETATM"))
     path = _write(tmp_path / "x.cif", rows)
-    with pytest.raises(PreparationError, match="--drop-water"):
-        prepare(path)
+    assert prepare(path).provenance["repairs"][1:] == ["1 water molecule and free ion ZN left out"]
+    x, y, z = ALA2.positions_nm[5] * 10 + (0.0, 0.0, 2.9)
+    rows[-1] = _row(32, "ZN", "ZN", "302", (x, y, z), "ZN", group="HETATM")
+    bound = _write(tmp_path / "bound.cif", rows)
     with pytest.raises(PreparationError, match=r"ZN X302; add --keep-ligand"):
-        prepare(path, drop_water=True)
-    scene = prepare(path, drop_water=True, keep_ligand=True)
+        prepare(bound)
+    scene = prepare(path, keep_ligand=True)
     assert scene.provenance["repairs"][:1] == [
         "alternate locations in 1 residues: the most occupied kept (X100:B), 1 atoms left out"
     ]

@@ -49,20 +49,18 @@ def _record(name: str, residue: str, number: str, x: float, y: float, z: float, 
 
 def test_what_stands_beside_the_peptide_is_refused_kept_or_dropped_as_told(tmp_path: Path) -> None:
     path = _write(tmp_path / "x.pdb", _peptide(), METHANE, CHLORIDE, WATER)
-    with pytest.raises(PreparationError, match=r"1 water molecule; add --drop-water"):
+    with pytest.raises(PreparationError, match=r"LIG A201; add --keep-ligand .* or --drop-ligand") as caught:
         prepare(path)
-    with pytest.raises(PreparationError, match=r"LIG A201, CL A301; add --keep-ligand .* or --drop-ligand") as caught:
-        prepare(path, drop_water=True)
     assert "\n" not in str(caught.value) and "x.pdb" in str(caught.value)
     with pytest.raises(InputError, match="exclude each other"):
         prepare(path, keep_ligand=True, drop_ligand=True)
-    bare = prepare(path, drop_water=True, drop_ligand=True)
+    bare = prepare(path, drop_ligand=True)
     assert bare.provenance["repairs"] == [
-        "1 water molecule left out",
-        "left out, as asked (--drop-ligand): LIG A201, CL A301",
+        "1 water molecule and free ion CL left out",
+        "left out, as asked (--drop-ligand): LIG A201",
     ]
     assert bare.molecule_key == ALA2.molecule_key
-    kept = prepare(path, drop_water=True, keep_ligand=True)
+    kept = prepare(path, keep_ligand=True)
     assert "kept beside the peptide: LIG A201, CL A301" in kept.provenance["repairs"]
     assert kept.residue_names == ("ACE", "ALA", "NME", "LIG", "CL")
     assert kept.positions_nm[:22] == pytest.approx(bare.positions_nm)

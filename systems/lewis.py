@@ -1,0 +1,199 @@
+"""The cheapest Lewis structure of a connectivity: bond orders and formal charges by integer programming."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import networkx as nx
+import numpy as np
+import numpy.typing as npt
+
+# (valence, charge, penalty) by element and number of neighbours. As in antechamber's bond type perception (Wang, Wang,
+# Kollman and Case, J. Mol. Graph. Model. 2006, 25, 247) a penalty says how unusual a state is; here every state is
+# closed-shell and carries its formal charge. Carbon has no charge of its own: a carbon without its hydrogen is missing it.
+_State = tuple[int, int, float]
+_ANY: dict[str, dict[int, tuple[_State, ...]]] = {
+    "H": {1: ((1, 0, 0.0),)},
+    "B": {3: ((3, 0, 0.0),), 4: ((4, -1, 0.0),)},
+    "C": {2: ((4, 0, 0.0),), 3: ((4, 0, 0.0),), 4: ((4, 0, 0.0),)},
+    "N": {1: ((3, 0, 0.0),), 2: ((3, 0, 0.0), (4, 1, 13.0), (2, -1, 14.0)), 3: ((3, 0, 0.0), (4, 1, 12.0)),
+          4: ((4, 1, 0.0),)},
+    "O": {1: ((2, 0, 0.0), (1, -1, 10.0)), 2: ((2, 0, 0.0),), 3: ((3, 1, 0.0),)},
+    "F": {1: ((1, 0, 0.0),)},
+    "Si": {4: ((4, 0, 0.0),), 5: ((5, -1, 0.0),), 6: ((6, -2, 0.0),)},
+    "P": {1: ((3, 0, 0.0),), 2: ((3, 0, 0.0),), 3: ((3, 0, 0.0), (5, 0, 5.0)), 4: ((5, 0, 0.0), (4, 1, 10.0)),
+          5: ((5, 0, 0.0),), 6: ((6, -1, 0.0),)},
+    "S": {1: ((2, 0, 0.0), (1, -1, 9.0)), 2: ((2, 0, 0.0), (4, 0, 15.0), (3, 1, 25.0)),
+          3: ((4, 0, 0.0), (3, 1, 6.0), (6, 0, 6.0)), 4: ((6, 0, 0.0), (5, 1, 6.0), (4, 0, 12.0)), 5: ((6, 0, 0.0),),
+          6: ((6, 0, 0.0),)},
+    "Cl": {1: ((1, 0, 0.0),), 2: ((3, 0, 5.0), (2, 1, 8.0)), 3: ((5, 0, 0.0), (3, 0, 5.0)), 4: ((7, 0, 0.0),)},
+}  # fmt: skip
+_ANY |= {"Se": _ANY["S"], "Br": _ANY["Cl"], "I": _ANY["Cl"]}
+_CARBENIUM: _State = (3, 1, 25.0)
+_CARBANION: _State = (3, -1, 25.0)
+_CYANIDE: _State = (3, -1, 20.0)
+_AZIDE_END: _State = (2, -1, 14.0)
+_OXONIUM: _State = (3, 1, 22.0)
+# Of a net charge on a group of conjugated atoms, an elementary charge; of one off the total that is said to be right.
+_NET_CHARGE = 4.0
+_OFF_TOTAL = 2.0
+# Ties: an order other than the file's, bonds that rarely are double, hydrogens on a nitrogen that takes a charge.
+_OTHER_ORDER = 0.3
+_UNUSUAL = {frozenset("CO"): 0.0, frozenset("NO"): 0.02, frozenset("CN"): 0.03, frozenset("C"): 0.04,
+            frozenset("CS"): 0.05}  # fmt: skip
+_HYDROGEN_ON_CATION = -0.02
+
+
+def is_usual(elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: int, valence: int, charge: int) -> bool:
+    """Whether atom `i` may have this valence and charge without a doubt: a state of the table, no anion of nitrogen."""
+    known = any(s[:2] == (valence, charge) for s in _ANY.get(elements[i], {}).get(len(neighbours[i]), ()))
+    return known and not (elements[i] == "N" and charge < 0)
+
+
+def lewis_structure(
+    elements: Sequence[str],
+    bonds: npt.NDArray[np.int64],
+    *,
+    stated: Mapping[tuple[int, int], int] | None = None,
+    total_charge: int | None = None,
+    carbon_ions: bool = False,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | None:
+    """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of the structure of least penalty, or None.
+
+    Every hydrogen must be present; no atom keeps an unpaired electron. `stated` holds orders that a file gives pairs
+    i < j, and `total_charge` a total it implies: both decide between structures that are otherwise alike.
+    `carbon_ions` admits carbocations and carbanions.
+    """
+    pairs = [(min(i, j), max(i, j)) for i, j in bonds.tolist()]
+    graph = nx.Graph(pairs)
+    graph.add_nodes_from(range(len(elements)))
+    neighbours = [sorted(graph[i]) for i in range(len(elements))]
+    rings = _oxonium_rings(elements, graph)
+    states = [_states(elements, neighbours, i, rings, carbon_ions) for i in range(len(elements))]
+    if not all(states):
+        return None
+    orders = np.ones(len(pairs))
+    charges = np.array([s[0][1] for s in states], dtype=np.int64)
+    unsettled = [i for i, s in enumerate(states) if len(s) > 1 or s[0][0] != len(neighbours[i])]
+    if not unsettled:
+        return orders, charges
+    room = {i for i in unsettled if max(s[0] for s in states[i]) > len(neighbours[i])}
+    open_bonds = [k for k, (i, j) in enumerate(pairs) if i in room and j in room]
+    solved = _solve(
+        elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {},
+        None if total_charge is None else total_charge - int(charges.sum() - charges[unsettled].sum()),
+    )  # fmt: skip
+    if solved is None:
+        return None
+    extra, chosen = solved
+    orders[open_bonds] += extra
+    charges[unsettled] = chosen
+    return orders, charges
+
+
+def _states(
+    elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: int, rings: set[int], carbon_ions: bool
+) -> tuple[_State, ...]:
+    symbol, near = elements[i], neighbours[i]
+    states = _ANY.get(symbol, {}).get(len(near), ())
+    around = [(elements[j], len(neighbours[j])) for j in near]
+    if symbol == "C" and len(near) == 1 and around[0] in (("N", 1), ("N", 2), ("O", 1)):
+        states = (_CYANIDE,)
+    elif symbol == "C" and carbon_ions:
+        states = (*states, _CARBANION, *((_CARBENIUM,) if len(near) == 3 else ()))
+    elif symbol == "N" and len(near) == 1 and around[0][0] in ("N", "P", "S"):
+        states = (*states, _AZIDE_END)
+    elif symbol == "O" and (i in rings or around == [("C", 1)]):
+        states = (*states, _OXONIUM)
+    return states
+
+
+def _oxonium_rings(elements: Sequence[str], graph: nx.Graph) -> set[int]:
+    """Oxygens of six-rings without a saturated member (pyrylium, flavylium), which may take a third bond."""
+    found: set[int] = set()
+    flat = graph.subgraph(
+        i for i in graph if (elements[i] in ("C", "N") and graph.degree(i) in (2, 3)) or
+        (elements[i] == "O" and graph.degree(i) == 2)
+    )  # fmt: skip
+    for i in flat:
+        if elements[i] == "O" and flat.degree(i) == 2:
+            a, b = flat[i]
+            rest = flat.subgraph(j for j in flat if j != i)
+            if nx.has_path(rest, a, b) and nx.shortest_path_length(rest, a, b) == 4:
+                found.add(i)
+    return found
+
+
+def _solve(
+    elements: Sequence[str],
+    neighbours: Sequence[Sequence[int]],
+    states: Sequence[tuple[_State, ...]],
+    atoms: Sequence[int],
+    bonds: Sequence[tuple[int, int]],
+    stated: Mapping[tuple[int, int], int],
+    total: int | None,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | None:
+    """Return the orders of `bonds` beyond one and the charges of `atoms` of least penalty, None where nothing fits."""
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import lil_matrix
+
+    choices = [(k, s) for k, i in enumerate(atoms) for s in states[i]]
+    conjugated = nx.Graph(bonds)
+    conjugated.add_nodes_from(atoms)
+    groups = [sorted(group) for group in nx.connected_components(conjugated)]
+    n_bonds, n_choices = len(bonds), len(choices)
+    n_sums = len(groups) + (total is not None)
+    n = 2 * n_bonds + n_choices + n_sums
+    row_of = {i: k for k, i in enumerate(atoms)}
+    cost = np.zeros(n)
+    # Rows: one state an atom; valence; a third bond needs a second; |charge| of each group and of all.
+    matrix = lil_matrix((2 * len(atoms) + n_bonds + 2 * n_sums, n))
+    low, high = np.zeros(matrix.shape[0]), np.zeros(matrix.shape[0])
+    low[: len(atoms)] = high[: len(atoms)] = 1.0
+    for k, (i, j) in enumerate(bonds):
+        pair = frozenset((elements[i], elements[j]))
+        wanted = stated.get((i, j))
+        cost[[k, n_bonds + k]] = _UNUSUAL.get(pair, 0.06)
+        if wanted is not None:
+            cost[k] += _OTHER_ORDER if wanted < 2 else -_OTHER_ORDER
+            cost[n_bonds + k] += _OTHER_ORDER if wanted < 3 else -_OTHER_ORDER
+        for i_end in (i, j):
+            matrix[len(atoms) + row_of[i_end], k] = matrix[len(atoms) + row_of[i_end], n_bonds + k] = 1.0
+        matrix[2 * len(atoms) + k, [k, n_bonds + k]] = (1.0, -1.0)
+        high[2 * len(atoms) + k] = 1.0
+    first_sum = 2 * n_bonds + n_choices
+    sums = [*((set(group), 0, _NET_CHARGE) for group in groups)]
+    if total is not None:
+        sums.append((set(atoms), total, _OFF_TOTAL))
+    for c, (k, (valence, charge, penalty)) in enumerate(choices):
+        i, column = atoms[k], 2 * n_bonds + c
+        on_cation = sum(elements[j] == "H" for j in neighbours[i]) if elements[i] == "N" and charge > 0 else 0
+        cost[column] = penalty + _HYDROGEN_ON_CATION * on_cation
+        matrix[k, column] = 1.0
+        matrix[len(atoms) + k, column] = len(neighbours[i]) - valence
+        for g, (group, _, _) in enumerate(sums):
+            if i in group:
+                matrix[2 * len(atoms) + n_bonds + 2 * g, column] = charge
+                matrix[2 * len(atoms) + n_bonds + 2 * g + 1, column] = -charge
+    for g, (_, target, weight) in enumerate(sums):
+        cost[first_sum + g] = weight
+        rows = 2 * len(atoms) + n_bonds + 2 * g + np.arange(2)
+        matrix[rows, first_sum + g] = -1.0
+        low[rows], high[rows] = -np.inf, (target, -target)
+    upper = np.ones(n)
+    upper[first_sum:] = np.inf
+    whole = np.ones(n)
+    whole[first_sum:] = 0
+    found = milp(
+        cost,
+        integrality=whole,
+        bounds=Bounds(np.zeros(n), upper),
+        constraints=LinearConstraint(matrix.tocsr(), low, high),
+    )
+    if found.x is None:
+        return None
+    x = np.round(found.x)
+    charges = np.zeros(len(atoms), dtype=np.int64)
+    for c, (k, (_, charge, _)) in enumerate(choices):
+        charges[k] += int(x[2 * n_bonds + c]) * charge
+    return x[:n_bonds] + x[n_bonds : 2 * n_bonds], charges

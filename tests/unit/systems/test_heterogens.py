@@ -1,0 +1,156 @@
+"""Waters and ions of a structure file: told by their elements, left out with a word, kept for explicit solvent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from systems import library
+from systems.bonding import find_bonds
+from systems.element_data import element_symbol, ion_symbol
+from systems.errors import InputError
+from systems.heterogens import is_water
+from systems.pdb_records import AtomRecord
+from systems.pdb_text import pdb_text
+from systems.prepare import prepare
+
+ALA2 = library.load("alanine-dipeptide")
+PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.startswith("ATOM"))
+
+
+def _atom(name: str, residue: str, number: int, at: tuple[float, float, float], element: str) -> AtomRecord:
+    return AtomRecord("1", name, "", residue, "W", str(number), at, 1.0, element, True)
+
+
+def _line(serial: int, name: str, residue: str, number: int, at: tuple[float, float, float], element: str = "") -> str:
+    x, y, z = at
+    return (
+        f"HETATM{serial:5d} {name:^4s} {residue:4s}W{number:4d}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00"
+        f"          {element:>2s}\n"
+    )
+
+
+def _water(number: int, at: tuple[float, float, float], residue: str = "HOH") -> str:
+    x, y, z = at
+    return (
+        _line(900, "O", residue, number, at, "O")
+        + _line(901, "H1", residue, number, (x + 0.96, y, z), "H")
+        + _line(902, "H2", residue, number, (x - 0.24, y + 0.93, z), "H")
+    )
+
+
+def _write(path: Path, *parts: str) -> str:
+    path.write_text("".join(parts) + "END\n")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "residue", "elements", "is_one"),
+    [
+        ("O H1 H2", "HOH", "OHH", True),
+        ("OW HW1 HW2", "SOL", "OHH", True),
+        ("O1 H1 H2", "LIG", "OHH", True),  # whatever it is called
+        ("O", "TIP3", "O", True),
+        ("O", "XYZ", "O", False),
+        ("O H1 H2 H3", "HOH", "OHHH", False),  # hydronium
+        ("O H", "OH", "OH", False),
+        ("C O H1", "SOL", "COH", False),
+    ],
+)
+def test_water_is_told_by_its_elements(names: str, residue: str, elements: str, is_one: bool) -> None:
+    places = [(0.0, 0.0, 0.0), (0.96, 0.0, 0.0), (-0.24, 0.93, 0.0), (-0.24, -0.93, 0.0)]
+    atoms = [_atom(n, residue, 1, at, e) for n, at, e in zip(names.split(), places, elements, strict=False)]
+    assert is_water(atoms) is is_one
+
+
+def test_two_waters_under_one_number_are_water_and_a_peroxide_is_none() -> None:
+    def at(x: float) -> list[AtomRecord]:
+        return [
+            _atom("O", "WAT", 1, (x, 0, 0), "O"), _atom("H1", "WAT", 1, (x + 0.96, 0, 0), "H"),
+            _atom("H2", "WAT", 1, (x - 0.24, 0.93, 0), "H"),
+        ]  # fmt: skip
+
+    assert is_water([*at(0.0), *at(5.0)])
+    peroxide = [_atom("O1", "WAT", 1, (0, 0, 0), "O"), _atom("O2", "WAT", 1, (1.4, 0, 0), "O"),
+                _atom("H1", "WAT", 1, (0, 0.96, 0), "H"), _atom("H2", "WAT", 1, (1.4, 0.96, 0), "H")]  # fmt: skip
+    assert not is_water(peroxide)
+
+
+def test_a_phenol_called_sol_stays(shared_data: Path, tmp_path: Path) -> None:
+    phenol = prepare("smiles:Oc1ccccc1")
+    lines = [
+        _line(k + 1, name, "SOL", 1, tuple(10 * phenol.positions_nm[k]), phenol.elements[k])
+        for k, name in enumerate(phenol.atom_names)
+    ]
+    scene = prepare(_write(tmp_path / "sol.pdb", *lines, _water(7, (30, 30, 30), "SOL")))
+    assert scene.formula == "C6H6O"
+    assert scene.provenance["repairs"][0] == "1 water molecule left out"
+
+
+@pytest.mark.parametrize(
+    ("name", "element"),
+    [("SOD", "Na"), ("CLA", "Cl"), ("POT", "K"), ("Na+", "Na"), ("NA", "Na"), ("CL-", "Cl"), ("K+", "K"), ("MG", "Mg"),
+     ("ZN", "Zn"), ("CA", "Ca"), ("CAL", "Ca"), ("ZN2", "Zn"), ("MG2+", "Mg"), ("LIT", "Li"), ("CES", "Cs"),
+     ("C", None), ("O", None), ("HOH", None), ("ALA", None), ("CO2", "Co")],
+)  # fmt: skip
+def test_ions_under_the_names_of_other_programs(name: str, element: str | None) -> None:
+    assert ion_symbol(name) == element
+    if element is not None:
+        for column in ("", name[0]):  # no element column, and one that was guessed from the first letter
+            assert element_symbol(f"{name:<4s}", name, column) == element
+
+
+def test_names_alone_make_no_ion_of_an_alpha_carbon() -> None:
+    assert element_symbol(" CA ", "ALA", "") == "C"
+    assert element_symbol(" C  ", "CO2", "") == "C"
+    assert element_symbol("CA  ", "CA", "") == "Ca"
+
+
+def test_free_ions_go_with_the_water_and_bound_ones_ask(tmp_path: Path) -> None:
+    far = [_line(910 + k, name, name, 10 + k, (30, 30, 30 + 5 * k)) for k, name in enumerate(("SOD", "SOD", "CLA"))]
+    scene = prepare(_write(tmp_path / "x.pdb", PEPTIDE, _water(1, (25, 25, 25)), *far))
+    assert scene.provenance["repairs"] == ["1 water molecule and free ions 2 SOD, CLA left out"]
+    assert scene.topology_hash == ALA2.topology_hash
+    oxygen = 10 * ALA2.positions_nm[5]
+    for gap, asks in ((2.5, True), (3.5, False)):
+        x, y, z = oxygen + (0.0, 0.0, gap)
+        path = _write(tmp_path / "y.pdb", PEPTIDE, _line(910, "SOD", "SOD", 10, (x, y, z)))
+        if asks:
+            with pytest.raises(InputError, match="SOD W10; add --keep-ligand"):
+                prepare(path)
+            kept = prepare(path, keep_ligand=True)
+            assert (kept.elements[-1], len(kept.bonds)) == ("Na", len(ALA2.bonds))
+        else:
+            assert prepare(path).n_atoms == 22
+
+
+def test_an_ion_is_bonded_to_nothing_by_distance_or_conect() -> None:
+    atoms = [_atom("O", "LIG", 1, (0, 0, 0), "O"), _atom("C", "LIG", 1, (1.2, 0, 0), "C"),
+             _atom("NA", "NA", 2, (0, 2.2, 0), "Na")]  # fmt: skip
+    assert find_bonds(atoms, []).bonds.tolist() == [[0, 1]]
+    found = find_bonds(atoms, [(0, 1), (0, 2)])
+    assert found.bonds.tolist() == [[0, 1]]
+    assert any("ions coordinate" in note for note in found.notes)
+
+
+def test_waters_alone_are_the_scene(tmp_path: Path) -> None:
+    scene = prepare(_write(tmp_path / "w.pdb", _water(1, (0, 0, 0)), _water(2, (5, 0, 0))))
+    assert (scene.formula, scene.n_atoms) == ("H4O2", 6)
+
+
+def test_kept_waters_are_completed_beside_the_peptide(tmp_path: Path) -> None:
+    bare = _line(950, "O", "HOH", 3, (24, 25, 27.8), "O")
+    path = _write(tmp_path / "x.pdb", _water(1, (25, 25, 25)), PEPTIDE, bare)
+    scene = prepare(path, keep_water=True)
+    assert scene.provenance["repairs"][-1] == "2 water molecules kept, hydrogens placed on 1"
+    assert scene.elements[22:] == ("O", "H", "H") * 2
+    assert scene.bonds[-4:].tolist() == [[22, 23], [22, 24], [25, 26], [25, 27]]
+    new = 10 * scene.positions_nm[25:]
+    assert np.linalg.norm(new[1:] - new[0], axis=1) == pytest.approx([0.9572] * 2, abs=1e-4)
+    others = np.delete(10 * scene.positions_nm, [26, 27], axis=0)
+    gaps = np.linalg.norm(new[1:, None] - others[None], axis=2)
+    assert np.sort(gaps, axis=1)[:, 1].min() > 1.5  # but for its own oxygen
+    with pytest.raises(InputError, match="exclude each other"):
+        prepare(path, keep_water=True, drop_water=True)
