@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import networkx as nx
 import numpy as np
@@ -14,6 +14,10 @@ _VALENCE = {"H": 1, "B": 3, "C": 4, "N": 3, "O": 2, "F": 1, "Si": 4, "P": 3, "S"
 _IONS = {"Li": 1, "Na": 1, "K": 1, "Rb": 1, "Cs": 1, "Mg": 2, "Ca": 2, "Sr": 2, "Ba": 2, "Zn": 2, "F": -1, "Cl": -1,
          "Br": -1, "I": -1, "Cu": 2, "Fe": 2, "Mn": 2, "Co": 2, "Ni": 2, "Cd": 2}  # fmt: skip
 
+# |triple product| of three unit vectors (0.77 in a tetrahedron), and the cosine between two (-0.5 at 120 degrees).
+_FLAT = 0.45
+_STRAIGHT = -0.8
+
 
 class ValenceError(ValueError):
     """Connectivity that fits no Lewis structure; `atoms` lists the atoms at fault."""
@@ -24,13 +28,18 @@ class ValenceError(ValueError):
 
 
 def perceive(
-    elements: Sequence[str], bonds: npt.NDArray[np.int64]
+    elements: Sequence[str],
+    bonds: npt.NDArray[np.int64],
+    positions_nm: npt.NDArray[np.float64] | None = None,
+    trusted: Collection[int] = (),
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of one Kekulé structure.
 
     Every hydrogen must be present. Open valences are paired by a maximum matching (C=O before C=N before C=C); what
-    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium). Molecules
-    that this leaves with an atom in no usual state are given the Lewis structure of least penalty (`systems.lewis`).
+    stays open is an anion on O and S, a cation on a nitrogen beside an open carbon (guanidinium, imidazolium). A
+    molecule that this leaves with an atom in no usual state is given the Lewis structure of least penalty
+    (`systems.lewis`). With `positions_nm` `(n_atoms, 3)`, carbons that such a structure, a charge beside them or a C=C
+    makes unsaturated must be flat or straight: one that is not misses a hydrogen, unless it is `trusted` to have all.
     Raises ValenceError naming the atoms that fit nothing (missing hydrogens, wrong bonds, unknown elements).
     """
     neighbours: list[list[int]] = [[] for _ in elements]
@@ -45,6 +54,11 @@ def perceive(
         for i, q in enumerate(charges.tolist())
         if neighbours[i] and not is_usual(elements, neighbours, i, round(valence[i]), q)
     }
+    if positions_nm is not None:
+        cations = [i for i in np.flatnonzero((charges > 0) & (valence == 4)) if elements[i] == "N"]
+        double = [k for k, order in enumerate(orders) if order > 1 and all(elements[i] == "C" for i in bonds[k])]
+        doubted = [*(j for i in cations for j in neighbours[i]), *bonds[double].ravel().tolist()]
+        _refuse_bent(elements, neighbours, set(doubted) - set(trusted), positions_nm)
     if not doubtful:
         return orders, charges
     graph = nx.Graph(bonds.tolist())
@@ -59,8 +73,31 @@ def perceive(
         found = lewis_structure([elements[i] for i in atoms], own)
         if found is None:
             raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
+        if positions_nm is not None:
+            _refuse_bent(elements, neighbours, molecule - set(trusted), positions_nm)
         orders[rows], charges[atoms] = found
     return orders, charges
+
+
+def _refuse_bent(
+    elements: Sequence[str],
+    neighbours: Sequence[Sequence[int]],
+    atoms: Collection[int],
+    positions_nm: npt.NDArray[np.float64],
+) -> None:
+    """Raise ValenceError naming carbons with three neighbours that are not flat, or with two not in a line."""
+    bent = []
+    for i in atoms:
+        if elements[i] != "C" or len(neighbours[i]) not in (2, 3):
+            continue
+        arms = positions_nm[neighbours[i]] - positions_nm[i]
+        arms = arms / np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-9)
+        if (len(arms) == 3 and abs(float(np.linalg.det(arms))) > _FLAT) or (
+            len(arms) == 2 and float(arms[0] @ arms[1]) > _STRAIGHT
+        ):
+            bent.append(i)
+    if bent:
+        raise ValenceError(sorted(bent))
 
 
 def _match(

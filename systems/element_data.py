@@ -17,8 +17,8 @@ _TABLE: dict[str, tuple[float, float]] = {
     "Ba": (137.33, 0.215), "Pt": (195.08, 0.136), "Au": (196.97, 0.136), "Hg": (200.59, 0.132), "Pb": (207.2, 0.146),
 }  # fmt: skip
 _NOT_METALS = frozenset(
-    ("H", "He", "B", "C", "N", "O", "F", "Ne", "Si", "P", "S", "Cl", "Ar", "Ge", "As", "Se", "Br", "Kr", "Sb", "Te", "I",
-     "Xe")
+    ("H", "He", "B", "C", "N", "O", "F", "Ne", "Si", "P", "S", "Cl", "Ar", "Ge", "As", "Se", "Br", "Kr", "Sb", "Te",
+     "I", "Xe")
 )  # fmt: skip
 # Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
 _ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CIO": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 # (valence, charge, penalty) by element and number of neighbours. As in antechamber's bond type perception (Wang, Wang,
 # Kollman and Case, J. Mol. Graph. Model. 2006, 25, 247) a penalty says how unusual a state is; here every state is
-# closed-shell and carries its formal charge. Carbon has no charge of its own: a carbon without its hydrogen is missing it.
+# closed-shell and carries its formal charge. Carbon carries none: one that seems to be charged misses a hydrogen.
 _State = tuple[int, int, float]
 _ANY: dict[str, dict[int, tuple[_State, ...]]] = {
     "H": {1: ((1, 0, 0.0),)},
     "B": {3: ((3, 0, 0.0),), 4: ((4, -1, 0.0),)},
     "C": {2: ((4, 0, 0.0),), 3: ((4, 0, 0.0),), 4: ((4, 0, 0.0),)},
-    "N": {1: ((3, 0, 0.0),), 2: ((3, 0, 0.0), (4, 1, 13.0), (2, -1, 14.0)), 3: ((3, 0, 0.0), (4, 1, 12.0)),
+    "N": {1: ((3, 0, 0.0),), 2: ((3, 0, 0.0), (4, 1, 18.0), (2, -1, 14.0)), 3: ((3, 0, 0.0), (4, 1, 12.0)),
           4: ((4, 1, 0.0),)},
     "O": {1: ((2, 0, 0.0), (1, -1, 10.0)), 2: ((2, 0, 0.0),), 3: ((3, 1, 0.0),)},
     "F": {1: ((1, 0, 0.0),)},
@@ -29,17 +29,19 @@ _ANY: dict[str, dict[int, tuple[_State, ...]]] = {
     "Cl": {1: ((1, 0, 0.0),), 2: ((3, 0, 5.0), (2, 1, 8.0)), 3: ((5, 0, 0.0), (3, 0, 5.0)), 4: ((7, 0, 0.0),)},
 }  # fmt: skip
 _ANY |= {"Se": _ANY["S"], "Br": _ANY["Cl"], "I": _ANY["Cl"]}
+# Nitrogen between a heavy atom and a terminal one: of azides, diazo groups, nitrile oxides, diazonium.
+_MIDDLE: tuple[_State, ...] = ((3, 0, 0.0), (4, 1, 12.0), (2, -1, 14.0))
 _CARBENIUM: _State = (3, 1, 25.0)
 _CARBANION: _State = (3, -1, 25.0)
 _CYANIDE: _State = (3, -1, 20.0)
-_AZIDE_END: _State = (2, -1, 14.0)
+_AZIDE_END: _State = (2, -1, 13.0)
 _OXONIUM: _State = (3, 1, 22.0)
 # Of a net charge on a group of conjugated atoms, an elementary charge; of one off the total that is said to be right.
 _NET_CHARGE = 4.0
 _OFF_TOTAL = 2.0
 # Ties: an order other than the file's, bonds that rarely are double, hydrogens on a nitrogen that takes a charge.
 _OTHER_ORDER = 0.3
-_UNUSUAL = {frozenset("CO"): 0.0, frozenset("NO"): 0.02, frozenset("CN"): 0.03, frozenset("C"): 0.04,
+_UNUSUAL = {frozenset("NO"): 0.0, frozenset("CO"): 0.02, frozenset("CN"): 0.03, frozenset("C"): 0.04,
             frozenset("CS"): 0.05}  # fmt: skip
 _HYDROGEN_ON_CATION = -0.02
 
@@ -69,7 +71,7 @@ def lewis_structure(
     graph.add_nodes_from(range(len(elements)))
     neighbours = [sorted(graph[i]) for i in range(len(elements))]
     rings = _oxonium_rings(elements, graph)
-    states = [_states(elements, neighbours, i, rings, carbon_ions) for i in range(len(elements))]
+    states = [_states(elements, graph, neighbours, i, rings, carbon_ions) for i in range(len(elements))]
     if not all(states):
         return None
     orders = np.ones(len(pairs))
@@ -78,7 +80,9 @@ def lewis_structure(
     if not unsettled:
         return orders, charges
     room = {i for i in unsettled if max(s[0] for s in states[i]) > len(neighbours[i])}
-    open_bonds = [k for k, (i, j) in enumerate(pairs) if i in room and j in room]
+    open_bonds = [
+        k for k, (i, j) in enumerate(pairs) if i in room and j in room and not _is_ylide(elements, neighbours, i, j)
+    ]
     solved = _solve(
         elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {},
         None if total_charge is None else total_charge - int(charges.sum() - charges[unsettled].sum()),
@@ -92,20 +96,43 @@ def lewis_structure(
 
 
 def _states(
-    elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: int, rings: set[int], carbon_ions: bool
+    elements: Sequence[str],
+    graph: nx.Graph,
+    neighbours: Sequence[Sequence[int]],
+    i: int,
+    rings: set[int],
+    carbon_ions: bool,
 ) -> tuple[_State, ...]:
     symbol, near = elements[i], neighbours[i]
     states = _ANY.get(symbol, {}).get(len(near), ())
     around = [(elements[j], len(neighbours[j])) for j in near]
+    if symbol == "C" and len(near) == 2 and _in_small_ring(graph, i):
+        return ()  # as bent as no triple bond or cumulene is: a ring that misses a hydrogen
     if symbol == "C" and len(near) == 1 and around[0] in (("N", 1), ("N", 2), ("O", 1)):
         states = (_CYANIDE,)
     elif symbol == "C" and carbon_ions:
         states = (*states, _CARBANION, *((_CARBENIUM,) if len(near) == 3 else ()))
+    elif symbol == "N" and len(near) == 2 and any(e != "H" and degree == 1 for e, degree in around):
+        states = _MIDDLE
     elif symbol == "N" and len(near) == 1 and around[0][0] in ("N", "P", "S"):
         states = (*states, _AZIDE_END)
     elif symbol == "O" and (i in rings or around == [("C", 1)]):
         states = (*states, _OXONIUM)
     return states
+
+
+def _is_ylide(elements: Sequence[str], neighbours: Sequence[Sequence[int]], i: int, j: int) -> bool:
+    """Whether a double bond between these would be one of carbon and hypervalent S, Se or P."""
+    return any(
+        elements[a] == "C" and elements[b] in ("S", "Se", "P") and len(neighbours[b]) >= 3 for a, b in ((i, j), (j, i))
+    )
+
+
+def _in_small_ring(graph: nx.Graph, i: int) -> bool:
+    """Whether an atom with two neighbours is in a ring of fewer than eight."""
+    a, b = graph[i]
+    near = nx.single_source_shortest_path_length(nx.restricted_view(graph, [i], []), a, cutoff=5)
+    return b in near
 
 
 def _oxonium_rings(elements: Sequence[str], graph: nx.Graph) -> set[int]:

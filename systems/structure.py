@@ -13,6 +13,7 @@ from systems.bond_orders import ValenceError, perceive
 from systems.element_data import atomic_weight_da
 from systems.errors import PreparationError
 from systems.pdb_records import AtomRecord, read_structure
+from systems.residues import template_for
 from systems.scene import Scene
 
 
@@ -34,8 +35,10 @@ def scene_from_records(
     elements = [a.element for a in atoms]
     bonds = np.sort(bonds.reshape(-1, 2), axis=1)
     bonds = bonds[np.lexsort((bonds[:, 1], bonds[:, 0]))]
+    positions_nm = np.array([a.position_angstrom for a in atoms], dtype=np.float64).reshape(-1, 3) / 10.0
     try:
-        orders, charges = perceive(elements, bonds)
+        standard = [i for i, a in enumerate(atoms) if template_for(a.residue_name) is not None]
+        orders, charges = perceive(elements, bonds, positions_nm, trusted=standard)
     except ValenceError as error:
         faulty = ", ".join(atom_label(atoms[i]) for i in error.atoms[:4])
         more = f" and {len(error.atoms) - 4} more" if len(error.atoms) > 4 else ""
@@ -56,7 +59,7 @@ def scene_from_records(
         bond_orders=orders,
         formal_charges=charges,
         masses_da=np.array([atomic_weight_da(e) for e in elements]),
-        positions_nm=np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0,
+        positions_nm=positions_nm,
         provenance=provenance,
     )
 

@@ -40,7 +40,7 @@ def complete_waters(
     crowd = cKDTree(around)
     rng = np.random.default_rng(0)
     for k in bare:
-        near = around[[i for i in crowd.query_ball_point(places[k], _SEEN_ANGSTROM)]]
+        near = around[crowd.query_ball_point(places[k], _SEEN_ANGSTROM)]
         pair = _freest(places[k], near, rng)
         own[k] = [
             replace(oxygens[k], serial="", name=name, element="H", position_angstrom=(x, y, z))

@@ -29,7 +29,9 @@ from systems.chemistry import (
 from systems.errors import OutOfDomainError
 from systems.geometry import signed_volumes, superpose, torsion
 from systems.library import load
+from systems.molecule import n_unpaired_electrons
 from systems.scene import Scene
+from systems.selection import part_of
 
 ALA2 = load("alanine-dipeptide")
 MAKE = Callable[..., Scene]
@@ -288,6 +290,51 @@ def test_perceived_orders_and_charges_equal_rdkit(from_smiles: MAKE, smiles: str
     assert sorted(orders) == sorted(scene.bond_orders)
     assert charges.sum() == scene.formal_charges.sum()
     assert sorted(charges) == sorted(scene.formal_charges)
+
+
+@pytest.mark.parametrize(
+    ("smiles", "charge"),
+    [
+        ("NC(=[NH2+])c1ccccc1", 1),
+        ("C[N+]([O-])=Cc1ccccc1", 0),
+        ("c1ccc(cc1)-c1ccc2ccccc2[o+]1", 1),
+        ("[O-]c1ccccc1", -1),
+        ("[C-]#N", -1),
+        ("CC[N+]#[C-]", 0),
+        ("CC#[N+][O-]", 0),
+        ("[O-]c1ccc(cc1)[N+](=O)[O-]", -1),
+        ("CN=[N+]=[N-]", 0),
+        ("C=[N+]=[N-]", 0),
+        ("N#[N+]c1ccccc1", 1),
+        ("[O-][n+]1ccccc1", 0),
+        ("Cc1ccc(cc1)-c1nn[n-]n1", -1),
+        ("O=C1[N-]S(=O)(=O)c2ccccc12", -1),
+        ("CS(C)(=O)=N", 0),
+        ("C[S+](C)(C)=O", 1),
+        ("[O-]Cl(=O)(=O)=O", -1),
+        ("F[P-](F)(F)(F)(F)F", -1),
+        ("CN(C)c1ccc(cc1)C(=C1C=CC(=[N+](C)C)C=C1)c1ccccc1", 1),
+        ("O=C1N(C)C(C)=NC1=Cc1ccc([O-])cc1", -1),
+    ],
+)
+def test_charges_that_no_matching_finds_are_those_of_the_cheapest_lewis_structure(
+    from_smiles: MAKE, smiles: str, charge: int
+) -> None:
+    scene = from_smiles(smiles)
+    orders, charges = perceive(scene.elements, scene.bonds, scene.positions_nm)
+    assert charges.sum() == charge
+    assert n_unpaired_electrons(replace(scene, bond_orders=orders, formal_charges=charges)) == 0
+
+
+@pytest.mark.parametrize("smiles", ["Cc1ccccc1C(N)=[NH2+]", "Cc1ccc([O-])cc1", "CSC", "CCN=[N+]=[N-]", "CNC(=O)C"])
+def test_no_structure_is_found_for_a_carbon_without_its_hydrogen(from_smiles: MAKE, smiles: str) -> None:
+    scene = from_smiles(smiles)
+    hydrogens = [j for i, j in scene.bonds.tolist() if (scene.elements[i], scene.elements[j]) == ("C", "H")]
+    assert hydrogens
+    for hydrogen in hydrogens:
+        part = part_of(scene, np.delete(np.arange(scene.n_atoms), hydrogen))
+        with pytest.raises(ValenceError):
+            perceive(part.elements, part.bonds, part.positions_nm)
 
 
 def test_missing_hydrogen_is_named(from_smiles: MAKE) -> None:
