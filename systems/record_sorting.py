@@ -12,7 +12,7 @@ import numpy as np
 from systems.errors import InputError
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord, StructureFile
-from systems.residues import is_water, template_for
+from systems.residues import is_water_name, template_for
 
 # Massless sites of water models (MW, M, EP, OM, LP1), lone pairs (LPOA) and dummy masses (MCH3, MN1): no elements.
 _SITE = re.compile(r"M(W\d?|\d*|N\d|C[BH]\d?|TRP\d?)|EPW?\d?|[LV]P?S?\d|L[PL]\w*|OM|VS\w*|IW")
@@ -117,7 +117,7 @@ def _told_apart(atoms: Sequence[AtomRecord], chain_ends: set[int], notes: list[s
         names = {a.name for a in atoms[start:stop] if a.element != "H" and not a.altloc}
         again = bool(names & seen.get(key, set()))
         peptide = template_for(first.residue_name) is not None
-        if start - 1 not in chain_ends and not is_water(first.residue_name):
+        if start - 1 not in chain_ends and not is_water_name(first.residue_name):
             # Other residues may come in parts, and Open Babel calls every carbon C.
             again = again and peptide and bool(_TELLING_NAMES & seen[key])
         elif peptide and start - 1 in chain_ends and not first.altloc:
@@ -143,7 +143,7 @@ def _runs(atoms: Sequence[AtomRecord], chain_ends: set[int]) -> Iterator[tuple[i
     start = 0
     for i in range(1, len(atoms)):
         begins = atoms[i].residue_key != atoms[start].residue_key or i - 1 in chain_ends
-        next_water = is_water(atoms[i].residue_name) and atoms[i].name == atoms[start].name and not atoms[i].altloc
+        next_water = is_water_name(atoms[i].residue_name) and atoms[i].name == atoms[start].name and not atoms[i].altloc
         if begins or next_water:
             yield start, i
             start = i
