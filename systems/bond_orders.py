@@ -55,7 +55,7 @@ def perceive(
         if neighbours[i] and not is_usual(elements, neighbours, i, round(valence[i]), q)
     }
     if positions_nm is not None:
-        cations = [i for i in np.flatnonzero((charges > 0) & (valence == 4)) if elements[i] == "N"]
+        cations = [i for i in np.flatnonzero((charges > 0) & (valence == 4)).tolist() if elements[i] == "N"]
         double = [k for k, order in enumerate(orders) if order > 1 and all(elements[i] == "C" for i in bonds[k])]
         doubted = [*(j for i in cations for j in neighbours[i]), *bonds[double].ravel().tolist()]
         _refuse_bent(elements, neighbours, set(doubted) - set(trusted), positions_nm)
