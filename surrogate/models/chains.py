@@ -1,0 +1,202 @@
+"""Peptides in internal coordinates, residue by residue: an exact code of frames that knows nothing of the sequence.
+
+Every atom is placed by a bond length, a bond angle and a dihedral on three atoms before it (Parsons et al., J. Comput.
+Chem. 26, 1063 (2005)), from a root in the first residue onwards. One dihedral about each bond that can turn is the
+torsion, told by cosine and sine; the others about that bond are told by how far they are from it. These, lengths and
+angles hardly vary: they are told in standard deviations from their mean, which the data of all peptides give for each
+residue type, and those that references hold rigid are constants. Whatever numbers a network returns, every frame is
+one of the right molecule with bonds, angles and handedness as MD has them, and no error grows with chain length.
+
+Each number belongs to one residue and has a place (slot) in that residue's token, the same for every residue of a type.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+# A number told in standard deviations, a torsion's cosine and sine, or what never changes.
+STIFF, TURNING, RIGID = 0, 1, 2
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class ChainLayout:
+    """How the `n_atoms` atoms of a peptide follow from internal coordinates.
+
+    `root`: three bonded atoms. `placed`: rows (atom, b, c, d), each after those that it is placed by. `primary`: for
+    each of them the row whose dihedral its own is counted from (itself where it stands alone). `residue_of`: of the
+    coordinates, three for the root (two lengths, an angle) and three for each row (length, angle, dihedral), the
+    residue they belong to; `keys`: their names, equal for residues of one type; `kinds`: STIFF, TURNING or RIGID.
+    `types`: of the residues, by name.
+    """
+
+    n_atoms: int
+    root: tuple[int, int, int]
+    placed: tuple[tuple[int, int, int, int], ...]
+    primary: tuple[int, ...]
+    residue_of: tuple[int, ...]
+    keys: tuple[str, ...]
+    kinds: tuple[int, ...]
+    types: tuple[str, ...]
+
+    @property
+    def n_coordinates(self) -> int:
+        return 3 + 3 * len(self.placed)
+
+
+@dataclass(frozen=True)
+class ChainScale:
+    """Mean and standard deviation of each stiff coordinate by its key, nm or rad; of a rigid one the deviation is 0.
+
+    `slots`: the place of each coordinate's number in its residue's token of `n_slots`; a torsion takes two.
+    """
+
+    mean: dict[str, float]
+    deviation: dict[str, float]
+    slots: dict[str, int]
+    n_slots: int
+
+    @staticmethod
+    def of(record: ChainScale | dict[str, Any]) -> ChainScale:
+        """Rebuild it from a weights file's record."""
+        if isinstance(record, ChainScale):
+            return record
+        return ChainScale(**record)
+
+
+class ChainCode(nn.Module):
+    """Frames of one peptide into tokens of its residues and back, exactly but for what is rigid."""
+
+    rows: Tensor
+    primary: Tensor
+    mean: Tensor
+    deviation: Tensor
+    stiff: Tensor
+    turning: Tensor
+    stiff_at: Tensor
+    turning_at: Tensor
+    filled: Tensor
+
+    def __init__(self, layout: ChainLayout, scale: ChainScale) -> None:
+        super().__init__()
+        self.layout, self.n_slots, self.n_residues = layout, scale.n_slots, len(layout.types)
+        kinds = torch.tensor(layout.kinds)
+        at = torch.tensor(layout.residue_of) * self.n_slots
+        slots = torch.tensor([scale.slots.get(key, 0) for key in layout.keys])
+        stiff, turning = kinds == STIFF, kinds == TURNING
+        fixed = {
+            "rows": torch.tensor(layout.placed, dtype=torch.long).reshape(-1, 4),
+            "primary": torch.tensor(layout.primary, dtype=torch.long),
+            "mean": torch.tensor([scale.mean.get(key, 0.0) for key in layout.keys], dtype=torch.float64),
+            "deviation": torch.tensor([scale.deviation.get(key, 1.0) for key in layout.keys], dtype=torch.float64),
+            "stiff": stiff.nonzero()[:, 0],
+            "turning": turning.nonzero()[:, 0],
+            "stiff_at": (at + slots)[stiff],
+            "turning_at": (at + slots)[turning],
+        }
+        for name, tensor in fixed.items():
+            self.register_buffer(name, tensor, persistent=False)
+        filled = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
+        filled[self.stiff_at] = True
+        filled[self.turning_at] = True
+        filled[self.turning_at + 1] = True
+        self.register_buffer("filled", filled.reshape(self.n_residues, self.n_slots), persistent=False)
+        self.levels = _levels(layout)
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""
+        values = internal_coordinates(frames.double(), self.layout.root, self.rows, self.primary)
+        tokens = frames.new_zeros(*frames.shape[:-2], self.n_residues * self.n_slots, dtype=torch.float64)
+        stiff = values[..., self.stiff] - self.mean[self.stiff]
+        # Dihedrals are angles: the nearest way round. Lengths and bond angles never differ by half a turn.
+        stiff = (stiff + torch.pi) % (2 * torch.pi) - torch.pi
+        tokens[..., self.stiff_at] = stiff / self.deviation[self.stiff]
+        tokens[..., self.turning_at] = values[..., self.turning].cos()
+        tokens[..., self.turning_at + 1] = values[..., self.turning].sin()
+        return tokens.float().unflatten(-1, (self.n_residues, self.n_slots))
+
+    def decode(self, tokens: Tensor) -> Tensor:
+        """Tokens `(..., n_residues, n_slots)` -> frames `(..., n_atoms, 3)` nm in the pose that the root has; what
+        stands in empty places plays no part, and cosine and sine need not have unit norm. float32."""
+        flat = tokens.flatten(-2).double()
+        values = self.mean.expand(*flat.shape[:-1], -1).clone()
+        values[..., self.stiff] += flat[..., self.stiff_at] * self.deviation[self.stiff]
+        values[..., self.turning] = torch.atan2(flat[..., self.turning_at + 1], flat[..., self.turning_at])
+        return self._place(values).float()
+
+    def _place(self, values: Tensor) -> Tensor:
+        lengths, angles, dihedrals = (values[..., 3 + k :: 3] for k in range(3))
+        own = torch.arange(len(self.primary), device=values.device) == self.primary
+        dihedrals = torch.where(own, dihedrals, dihedrals + dihedrals[..., self.primary])
+        x = values.new_zeros(*values.shape[:-1], self.layout.n_atoms, 3)
+        a, _, c = self.layout.root
+        # The middle atom of the root in the origin, the first on the x axis, the third in the plane.
+        x[..., a, 0] = values[..., 0]
+        x[..., c, 0] = values[..., 1] * values[..., 2].cos()
+        x[..., c, 1] = values[..., 1] * values[..., 2].sin()
+        for level in self.levels:
+            which = torch.tensor(level, device=values.device)
+            atom, b_, c_, d_ = self.rows[which].T
+            x[..., atom, :] = extend(
+                x[..., d_, :], x[..., c_, :], x[..., b_, :],
+                lengths[..., which], angles[..., which], dihedrals[..., which],
+            )  # fmt: skip
+        return x
+
+
+def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, primary: Tensor) -> Tensor:
+    """Return lengths, angles and dihedrals `(..., 3 + 3 n_placed)` of frames `(..., n_atoms, 3)`; dihedrals that are
+    counted from another one as the difference, all in (-π, π] or a full turn beside."""
+    a, b, c = root
+    head = torch.stack(
+        [(x[..., a, :] - x[..., b, :]).norm(dim=-1), (x[..., c, :] - x[..., b, :]).norm(dim=-1),
+         _angle(x[..., a, :], x[..., b, :], x[..., c, :])], dim=-1,
+    )  # fmt: skip
+    atom, near, next_, last = (x[..., rows[:, k], :] for k in range(4))
+    dihedrals = dihedral(atom, near, next_, last)
+    own = torch.arange(len(primary), device=x.device) == primary
+    dihedrals = torch.where(own, dihedrals, dihedrals - dihedrals[..., primary])
+    body = torch.stack([(atom - near).norm(dim=-1), _angle(atom, near, next_), dihedrals], dim=-1)
+    return torch.cat([head, body.flatten(-2)], dim=-1)
+
+
+def dihedral(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Return torsion angles `(...)` of atoms `(..., 3)`, signs by the IUPAC convention."""
+    middle = c - b
+    first, second = torch.linalg.cross(b - a, middle), torch.linalg.cross(middle, d - c)
+    sine = ((b - a) * second).sum(-1) * middle.norm(dim=-1)
+    return torch.atan2(sine, (first * second).sum(-1))
+
+
+def extend(a: Tensor, b: Tensor, c: Tensor, length: Tensor, angle: Tensor, torsion: Tensor) -> Tensor:
+    """Return the atom `(..., 3)` bonded to c at this length, angle to b, and torsion about b-c from a."""
+    along = _unit(c - b)
+    normal = _unit(torch.linalg.cross(b - a, along))
+    across = torch.linalg.cross(normal, along)
+    flat, up = length * angle.sin() * torsion.cos(), length * angle.sin() * torsion.sin()
+    return c - (length * angle.cos())[..., None] * along + flat[..., None] * across + up[..., None] * normal
+
+
+def _angle(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    u, v = a - b, c - b
+    return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1))
+
+
+def _unit(x: Tensor) -> Tensor:
+    return x / (x.square().sum(-1, keepdim=True) + _TINY).sqrt()
+
+
+def _levels(layout: ChainLayout) -> list[list[int]]:
+    """Return rows of `placed` in groups that can be placed at once, one after the other."""
+    level_of = dict.fromkeys(layout.root, 0)
+    found: list[list[int]] = []
+    for k, (atom, *refs) in enumerate(layout.placed):
+        level_of[atom] = 1 + max(level_of[i] for i in refs)
+        while len(found) < level_of[atom]:
+            found.append([])
+        found[level_of[atom] - 1].append(k)
+    return found

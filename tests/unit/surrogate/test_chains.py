@@ -1,0 +1,132 @@
+"""Peptides in internal coordinates: the code is exact, shared between sequences, and cannot make a wrong molecule."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from surrogate.data.chains import chain_layout, chain_scale, settled
+from surrogate.models.chains import RIGID, STIFF, TURNING, ChainCode, ChainLayout, ChainScale
+from systems.errors import InputError
+from systems.molecule import scene_from_smiles
+from systems.scene import Scene
+from systems.sequence import build_peptide
+from systems.validity import INVALID, check_frames, geometry_from_frames
+
+SEQUENCES = ("ACE-PRO-TRP-NME", "ACE-LEU-SER-NME", "LYS-ASP")
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, Scene]:
+    return {name: build_peptide(name) for name in SEQUENCES}
+
+
+def shaken(scene: Scene, n: int = 64, size_nm: float = 0.003) -> npt.NDArray[np.float32]:
+    rng = np.random.default_rng(0)
+    return (scene.positions_nm + size_nm * rng.normal(size=(n, scene.n_atoms, 3))).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scale(scenes: dict[str, Scene]) -> ChainScale:
+    return chain_scale((chain_layout(s), shaken(s)) for s in scenes.values())
+
+
+def code_of(scene: Scene, scale: ChainScale) -> ChainCode:
+    return ChainCode(settled(chain_layout(scene), scale), scale)
+
+
+def distances(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    i, j = np.triu_indices(x.shape[1], 1)
+    return np.linalg.norm(x[:, i] - x[:, j], axis=-1)
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_frames_come_back_as_they_were_but_for_their_pose(
+    name: str, scenes: dict[str, Scene], scale: ChainScale
+) -> None:
+    x = shaken(scenes[name])
+    code = code_of(scenes[name], scale)
+    tokens = code.encode(torch.from_numpy(x))
+    back = code.decode(tokens).double().numpy()
+    assert np.abs(distances(back) - distances(x.astype(np.float64))).max() < 5e-6
+    # Distances do not tell a mirror image; tokens do.
+    again = code.encode(torch.from_numpy(back))
+    assert float((again - tokens).abs().max()) < 2e-3
+    mirrored = code.encode(torch.from_numpy(x * np.array([1, 1, -1], dtype=np.float32)))
+    assert float((mirrored - tokens).abs().max()) > 10
+
+
+def test_numbers_are_of_order_one_and_empty_places_stay_empty(scenes: dict[str, Scene], scale: ChainScale) -> None:
+    code = code_of(scenes["ACE-LEU-SER-NME"], scale)
+    tokens = code.encode(torch.from_numpy(shaken(scenes["ACE-LEU-SER-NME"])))
+    assert 0.3 < float(tokens[..., code.filled].square().mean()) < 3
+    assert not tokens[..., ~code.filled].any()
+
+
+def test_whatever_the_stiff_numbers_are_the_molecule_is_the_right_one(
+    scenes: dict[str, Scene], scale: ChainScale
+) -> None:
+    """Drawn independently: bonds, handedness and planes hold; wild numbers are seen to be wrong (the control)."""
+    scene = scenes["ACE-LEU-SER-NME"]
+    x = shaken(scene)
+    code = code_of(scene, scale)
+    tokens = code.encode(torch.from_numpy(x))
+    stiff = torch.zeros(code.n_residues * code.n_slots, dtype=torch.bool)
+    stiff[code.stiff_at] = True
+    drawn = torch.randn(tokens.flatten(1).shape, generator=torch.Generator().manual_seed(1))
+    geometry = geometry_from_frames(scene, x.astype(np.float64))
+
+    def invalid(size: float) -> float:
+        mixed = torch.where(stiff, size * drawn, tokens.flatten(1)).unflatten(1, tokens.shape[1:])
+        flags = check_frames(code.decode(mixed).double().numpy(), geometry)
+        return float(((flags & INVALID) > 0).mean())
+
+    assert invalid(1.0) < 0.05
+    assert invalid(20.0) > 0.9
+
+
+def test_residues_of_one_type_share_their_coordinates_wherever_they_stand() -> None:
+    layouts = {n: chain_layout(build_peptide(n)) for n in ("ACE-LEU-SER-NME", "ACE-SER-LEU-NME")}
+
+    def of(layout: ChainLayout, name: str) -> set[tuple[str, int]]:
+        residue = layout.types.index(name)
+        return {(k, t) for k, r, t in zip(layout.keys, layout.residue_of, layout.kinds, strict=True) if r == residue}
+
+    first, second = layouts.values()
+    for name in ("LEU", "SER", "NME", "ACE"):
+        assert of(first, name) == of(second, name)
+    assert len(of(first, "LEU")) == 3 * 19  # each atom its three; N is the one before's, the next N its own
+
+
+def test_torsions_are_told_by_cosine_and_sine_and_rings_are_not(scenes: dict[str, Scene]) -> None:
+    layout = chain_layout(scenes["ACE-PRO-TRP-NME"])
+    turning = {key for key, kind in zip(layout.keys, layout.kinds, strict=True) if kind == TURNING}
+    assert "TRP dihedral C CA N C-1" in turning and "TRP dihedral N+1 C CA N" in turning
+    assert "PRO dihedral CA N C-1 CA-1" in turning  # omega, cis or trans
+    assert not any(key.startswith(("PRO dihedral C CA", "PRO dihedral CG", "TRP dihedral CZ2")) for key in turning)
+
+
+def test_what_a_reference_holds_rigid_is_a_constant() -> None:
+    scene = build_peptide("ACE-ALA-NME")
+    x = shaken(scene)
+    for i, j in scene.bonds:
+        hydrogen, heavy = (i, j) if scene.elements[i] == "H" else (j, i)
+        if scene.elements[hydrogen] == "H":
+            bond = x[:, hydrogen] - x[:, heavy]
+            x[:, hydrogen] = x[:, heavy] + 0.1 * bond / np.linalg.norm(bond, axis=-1, keepdims=True)
+    scale = chain_scale([(chain_layout(scene), x)])
+    layout = settled(chain_layout(scene), scale)
+    assert {RIGID, STIFF, TURNING} == set(layout.kinds)
+    rigid = [key for key, kind in zip(layout.keys, layout.kinds, strict=True) if kind == RIGID]
+    assert len(rigid) == 12 and all(" length H" in key or " H" in key.split("length")[1] for key in rigid)
+    code = ChainCode(layout, scale)
+    assert torch.isfinite(code.encode(torch.from_numpy(x))).all()
+
+
+def test_what_no_data_tell_of_is_refused(scale: ChainScale) -> None:
+    with pytest.raises(InputError, match=r"occur in no training molecule.*GLY"):
+        settled(chain_layout(build_peptide("ACE-GLY-NME")), scale)
+    with pytest.raises(InputError, match="no single peptide chain"):
+        chain_layout(scene_from_smiles("CCO"))
