@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from systems.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.errors import PreparationError
+from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
 from systems.residues import ResidueTemplate, canonical_heavy_name, template_for
 from systems.structure import atom_label
@@ -17,6 +18,10 @@ from systems.structure import atom_label
 _PEPTIDE_NM = 0.20
 _DISULFIDE_NM = 0.25
 _HYDROGEN_NM = 0.16
+_AMINE_NM = 0.16
+_PHOSPHATE_NM = 0.175
+_THIOETHER_NM = 0.19
+_GLYCOSIDE_NM = 0.155
 _TOLERANCE_NM = 0.04
 _COINCIDENT_NM = 0.03
 _CONECT_SLACK_NM = 0.1
@@ -56,14 +61,17 @@ class Bonding:
         return not any(r.missing or r.lacks_hydrogens for r in self.residues)
 
 
-def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -> Bonding:
+def find_bonds(
+    atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]], chain_ends: Collection[int] = ()
+) -> Bonding:
     """Return the bonds of these atoms.
 
     Standard residues take heavy-atom bonds from their template, hydrogens go to the nearest heavy atom, peptide and
     disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
-    distances within 0.04 nm of the sum of covalent radii if not; monatomic ions have no bonds by distance, and metal
-    ions none at all. Raises PreparationError for atoms that coincide and
-    hydrogens far from everything.
+    distances within 0.04 nm of the sum of covalent radii if not; to other residues only the bonds that link polymers.
+    Monatomic ions have no bonds by distance, and metal ions none at all. Peptide bonds across one of the `chain_ends`
+    (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide and hydrogens far from
+    everything.
     """
     from scipy.spatial import cKDTree
 
@@ -90,7 +98,8 @@ def find_bonds(atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]]) -
     bonds |= {_pair(c, n) for c, n in peptide}
     bonds |= _accepted_conect(atoms, x, conect, of_atom, {i for i in ions if is_metal(atoms[i].element)}, notes)
     free = _free_atoms(residues, bonds, notes)
-    bonds |= _bonds_by_distance(atoms, near, length, free, ions)
+    _note_bonds_across_ends(peptide, of_atom, chain_ends, notes)
+    bonds |= _bonds_by_distance(atoms, near, length, free, ions, bonds, notes)
     bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
     bonds |= _disulfides(atoms, near, length, bonds, of_atom)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
@@ -189,14 +198,52 @@ def _bonds_by_distance(
     length: npt.NDArray[np.float64],
     free: set[int],
     ions: set[int],
+    known: set[tuple[int, int]],
+    notes: list[str],
 ) -> set[tuple[int, int]]:
+    """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers."""
     found = set()
+    apart = []
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
         if (i in free or j in free) and not {i, j} & ions and "H" not in (atoms[i].element, atoms[j].element):
             reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
-            if d < reach:
+            if d >= reach:
+                continue
+            if atoms[i].residue_key == atoms[j].residue_key or _links_residues(atoms[i], atoms[j], d):
                 found.add((i, j))
+            elif (i, j) not in known:
+                apart.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+    if apart:
+        notes.append(f"near and not bonded, as no CONECT or LINK record says so: {listed(apart, 3)}")
     return found
+
+
+def _links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
+    """Whether a distance between residues is one of the bonds that link them in polymers: amides, disulfides,
+    thioethers, the phosphates of nucleic acids, and sugars at their anomeric carbons."""
+    a, b = sorted((first, second), key=lambda atom: atom.element)
+    pair = (a.element, b.element)
+    if pair == ("C", "N"):
+        return length_nm < (_PEPTIDE_NM if (a.name, b.name) == ("C", "N") else _AMINE_NM)
+    if pair == ("S", "S"):
+        return length_nm < _DISULFIDE_NM
+    if pair == ("C", "S"):
+        return length_nm < _THIOETHER_NM
+    if pair == ("O", "P"):
+        return length_nm < _PHOSPHATE_NM
+    return pair == ("C", "O") and a.name in ("C1", "C2") and length_nm < _GLYCOSIDE_NM
+
+
+def _note_bonds_across_ends(
+    peptide: set[tuple[int, int]], of_atom: dict[int, Residue], chain_ends: Collection[int], notes: list[str]
+) -> None:
+    across = [
+        f"{of_atom[c].label} - {of_atom[n].label}"
+        for c, n in sorted(peptide)
+        if any(min(c, n) <= end < max(c, n) for end in chain_ends if of_atom.get(end) in (of_atom[c], of_atom[n]))
+    ]
+    if across:
+        notes.append(f"peptide bonds across the end of a chain (TER): {listed(across)}")
 
 
 def _hydrogen_bonds_to_parents(

@@ -56,6 +56,15 @@ def covalent_radius_nm(symbol: str) -> float:
     return _TABLE[symbol][1]
 
 
+def repeats_name(name_field: str, residue_name: str, symbol: str) -> bool:
+    """Whether an element column repeats the atom's name: Ca for the alpha carbon, Hg for a hydrogen of a side chain."""
+    from systems.residues import template_for
+
+    if len(symbol) < 2 or symbol == "Se" or not name_field.strip().upper().startswith(symbol.upper()):
+        return False
+    return template_for(residue_name) is not None
+
+
 def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: bool = False) -> str | None:
     """Return the element of an atom from the element column or, failing this, from its PDB name; None when unknown.
 
@@ -69,7 +78,7 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     symbol = written.strip("0123456789+- ").capitalize()
     if symbol == "D":
         return "H"
-    if symbol in _TABLE:
+    if symbol in _TABLE and not repeats_name(name_field, residue_name, symbol):
         return symbol
     name = name_field.strip().upper()
     letters = name.lstrip("0123456789'\"*")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from systems.element_data import element_symbol
+from systems.element_data import element_symbol, repeats_name
 from systems.errors import InputError
 from systems.hybrid36 import decode
 from systems.pdb_records import AtomRecord, StructureFile, coordinates
@@ -32,7 +32,7 @@ def read_pdb(text: str, path: Path) -> StructureFile:
     conect_lines: list[str] = []
     header: list[str] = []
     model_ended = structure_ended = False
-    n_models = n_beyond = 0
+    n_models = n_beyond = n_misread = 0
     segment = ""
     for number, line in enumerate(text.splitlines(), start=1):
         record = line[:6]
@@ -54,6 +54,7 @@ def read_pdb(text: str, path: Path) -> StructureFile:
             if atom.serial in index_of:
                 repeated.add(atom.serial)
             index_of[atom.serial] = len(found.atoms)
+            n_misread += repeats_name(atom.name, atom.residue_name, line[76:78].strip().capitalize())
             if not atom.element:
                 found.unknown[len(found.atoms)] = where
             segment, before = "" if atom.chain else line[72:76].strip(), segment
@@ -77,6 +78,8 @@ def read_pdb(text: str, path: Path) -> StructureFile:
                 f"{path}, line {number}: {record!r} is no record of the PDB format, but the line looks like an atom; "
                 "write ATOM or HETATM there, or take the line out."
             )
+    if n_misread:
+        found.notes.append(f"{n_misread} atoms whose element column repeats the atom's name: elements taken from names")
     if n_models > 1:
         found.notes.append(f"{n_models} models in the file: the first is taken")
     if n_beyond:
@@ -163,6 +166,6 @@ def _links(header: list[str], atoms: list[AtomRecord]) -> set[tuple[int, int]]:
     ends = [
         tuple((p.chain_name, str(p.res_id.seqid), p.res_id.name, p.atom_name) for p in (link.partner1, link.partner2))
         for link in structure.connections
-        if link.asu != gemmi.Asu.Different
+        if link.asu != gemmi.Asu.Different and link.type in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf)
     ]
     return addressed(ends, atoms)

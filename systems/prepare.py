@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from systems.bonding import Bonding, Residue, find_bonds
+from systems.clashes import check_contacts
 from systems.errors import InputError, PreparationError
 from systems.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
 from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
@@ -102,7 +103,7 @@ def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool
     kept, wet = settle_solvent(found.atoms, kept, keep_water=keep_water, keep_ions=keep_ligand, notes=repairs)
     part = standardise([found.atoms[i] for i in kept], repairs)
     structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
-    bonding = find_bonds(structure.atoms, structure.conect)
+    bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
     ligands = ligand_atoms(structure.atoms, bonding)
     if ligands:
         stays = settle_ligands(structure.atoms, ligands, keep=keep_ligand, drop=drop_ligand, notes=repairs)
@@ -111,7 +112,7 @@ def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool
             refuse_bare_ligands(structure.atoms, ligands)
             others = structure.only(ligands)
             others_bonding = find_bonds(others.atoms, others.conect)
-        structure, bonding = rest, find_bonds(rest.atoms, rest.conect)
+        structure, bonding = rest, find_bonds(rest.atoms, rest.conect, rest.chain_ends)
     repairs += bonding.notes
     _refuse_gaps(bonding, structure.atoms, structure.chain_ends)
     repairs += _disulfides(bonding, structure.atoms)
@@ -137,6 +138,7 @@ def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool
         waters, water_bonds = complete_waters([found.atoms[i] for i in wet], atoms, repairs)
         bonds = np.concatenate([bonds, water_bonds + len(atoms)])
         atoms = [*atoms, *waters]
+    repairs += check_contacts(atoms, bonds)
     scene = scene_from_records(
         atoms,
         bonds,
@@ -173,7 +175,8 @@ def _reindexed(
     conect: Sequence[tuple[int, int]], chain_ends: set[int], kept: Sequence[int]
 ) -> tuple[list[tuple[int, int]], set[int]]:
     new = {old: k for k, old in enumerate(kept)}
-    return [(new[i], new[j]) for i, j in conect if i in new and j in new], {new[i] for i in chain_ends if i in new}
+    ends = {int(k) - 1 for k in np.searchsorted(kept, sorted(chain_ends), side="right")} - {-1}
+    return [(new[i], new[j]) for i, j in conect if i in new and j in new], ends
 
 
 def _handedness(bonding: Bonding, atoms: Sequence[AtomRecord]) -> Handedness:

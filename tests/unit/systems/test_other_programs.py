@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from systems import library
+from systems.clashes import check_contacts
 from systems.errors import InputError, PreparationError
+from systems.pdb_records import AtomRecord
 from systems.prepare import prepare
 from systems.scene import Scene
 
@@ -98,3 +100,48 @@ def test_numbers_beyond_five_figures_and_a_byte_order_mark(tmp_path: Path) -> No
     scene = read(tmp_path, ["\ufeffREMARK", *wide])
     assert (scene.n_atoms, said(scene)) == (22, "")
     assert np.abs(scene.positions_nm - ALA2.positions_nm).max() < 1e-4
+
+
+def test_bonds_between_residues_are_those_of_polymers_or_stated(tmp_path: Path) -> None:
+    """A carbon of a ligand 1.7 Å from a side chain is a contact; a CONECT record makes it a bond."""
+    record = "HETATM  9{:02d}  {:<3s} LIG A 101    {:8.3f}{:8.3f}{:8.3f}  1.00  0.00           {}"
+    beta = np.array([float(ROWS[10][k : k + 8]) for k in (30, 38, 46)])
+    away = beta - ALA2.positions_nm[8] * 10
+    away /= np.linalg.norm(away)
+    side = np.cross(away, [0.0, 0.0, 1.0])
+    places = [beta + 1.75 * away, beta + 2.85 * away, beta + 1.75 * away + 1.1 * side, beta + 1.75 * away - 1.1 * side]
+    names = ("C1", "H1", "H2", "H3")
+    ligand = [record.format(k, n, *p, n[0]) for k, (n, p) in enumerate(zip(names, places, strict=True))]
+    with pytest.raises(PreparationError, match="LIG A101"):
+        read(tmp_path, [*ROWS, *ligand])
+    scene = read(tmp_path, [*ROWS, *ligand, "END"], drop_ligand=True)
+    assert (scene.n_atoms, "left out" in said(scene)) == (22, True)
+
+
+def test_a_peptide_bond_across_ter_is_noted(tmp_path: Path) -> None:
+    last = max(k for k, line in enumerate(ROWS) if line[17:20] == "ALA")
+    scene = read(tmp_path, [*ROWS[: last + 1], "TER", *ROWS[last + 1 :]])
+    assert said(scene) == "peptide bonds across the end of a chain (TER): ALA A2 - NME A3"
+    assert scene.molecule_key == ALA2.molecule_key
+
+
+def test_an_element_column_that_repeats_the_name_is_no_metal(tmp_path: Path) -> None:
+    lines = [line[:76] + "CA" if line[12:16] == " CA " else line for line in ROWS]
+    scene = read(tmp_path, lines)
+    assert "Ca" not in scene.elements and "element column repeats the atom's name" in said(scene)
+
+
+@pytest.mark.parametrize(("gap", "elements", "expected"), [
+    (1.6, "CO", ""), (1.4, "CO", "minimising"), (0.95, "CO", "refused"), (1.0, "CH", "minimising"),
+    (0.85, "CH", "refused"), (0.8, "HH", "minimising"), (0.6, "HH", "refused"),
+])  # fmt: skip
+def test_atoms_in_each_other_are_refused_and_close_ones_said(gap: float, elements: str, expected: str) -> None:
+    atoms = [
+        AtomRecord(str(k), e, "", "LIG", "A", str(k), (k * gap, 0.0, 0.0), 1.0, e, True) for k, e in enumerate(elements)
+    ]
+    if expected == "refused":
+        with pytest.raises(PreparationError, match=f"{gap:.2f} Å apart.*stand in each other"):
+            check_contacts(atoms, np.empty((0, 2), dtype=np.int64))
+    else:
+        assert expected in " ".join(check_contacts(atoms, np.empty((0, 2), dtype=np.int64)))
+    assert check_contacts(atoms, np.array([[0, 1]])) == []
