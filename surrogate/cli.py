@@ -34,6 +34,7 @@ from surrogate.cli_options import (
     SeedOpt,
     SelectOpt,
     Solver,
+    Stiff,
     ValidationOpt,
     VelocitiesOpt,
     WantedTemperatureOpt,
@@ -340,6 +341,9 @@ def rollout(
     compile_: Annotated[
         bool, typer.Option("--compile", help="Compile the network: a minute, a C++ compiler; for long rollouts.")
     ] = False,
+    stiff: Annotated[
+        Stiff | None, typer.Option("--stiff", help="Bonds and angles. Default: imposed, where the weights know how.")
+    ] = None,
     guard: GuardOpt = Guard.flag,
     energy_every: EnergyEveryOpt = 0,
     md_between: MdBetweenOpt = None,
@@ -370,6 +374,7 @@ def rollout(
         solver_steps=solver_steps,
         precision=precision.value,
         compile=compile_,
+        stiff=None if stiff is None else stiff.value,
         guard=guard.value,
         energy_every=energy_every,
         md_between_ps=0.0 if md_between is None else parse_time_ps(md_between, "--md-between"),

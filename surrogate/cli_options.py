@@ -27,6 +27,11 @@ class Solver(StrEnum):
     dopri5 = "dopri5"
 
 
+class Stiff(StrEnum):
+    modelled = "modelled"
+    imposed = "imposed"
+
+
 class Precision(StrEnum):
     auto = "auto"
     fp32 = "fp32"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,7 +127,7 @@ def average(before: Path, after: Path, share: float, out: Path) -> Path:
               for name, value in found.items() if name in begun}  # fmt: skip
     new.model.load_state_dict(found)
     provenance = {**new.provenance, "average": {"of": [old.hash, new.hash], "share": share}}
-    save_weights(out, new.model, new.domain, provenance)
+    save_weights(out, new.model, new.domain, provenance, stiff=new.stiff)
     return out
 
 
@@ -143,12 +144,20 @@ def _train(out: Path, references: list[Path], config: TrainingConfig, start: Wei
         return train_lam_slide(frames, out, LamSlideConfig(), config, start=start, resume=True, progress=report)
 
 
-def ship(source: Path, target: Path) -> Path:
-    """Round weights to float16 (half the size; a test holds the two together) and write them to `target`."""
+def ship(source: Path, target: Path, references: Sequence[Path] = ()) -> Path:
+    """Round weights to float16 (half the size; a test holds the two together) and write them to `target`, with the
+    stiff terms of `references` (models.stiff) where these are given, else those that they have."""
+    from surrogate.data.frames import collect_frames
+    from surrogate.data.stiff import drawn_terms
     from surrogate.data.weights import load_weights, save_weights
 
     weights = load_weights(source)
-    save_weights(target, weights.model, weights.domain, weights.provenance, half=True)
+    provenance, stiff = weights.provenance, weights.stiff
+    if references:
+        frames = collect_frames(list(references))
+        measured = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
+        provenance, stiff = {**provenance, "stiff_terms": measured}, drawn_terms(frames)
+    save_weights(target, weights.model, weights.domain, provenance, stiff=stiff, half=True)
     return target
 
 
@@ -282,7 +291,7 @@ def main() -> None:
     budgets_s = (parse_wall_s(args.budget), parse_wall_s(args.further), parse_wall_s(args.kinds))
     train(paths, references, further, budgets_s, compile_=args.compile)
     if not paths.shipped.exists():
-        ship(paths.weights, paths.shipped)
+        ship(paths.weights, paths.shipped, [*references, *further])
     steps = args.solver_steps
     figures: dict[str, Any] = {}
     figures["rollout"] = judge(paths.shipped, held, paths.folder, "rollout", total_ps=REPLICA_PS, solver_steps=steps)

@@ -68,8 +68,8 @@ class Row:
 
 def measure(scene: Scene, reference_nm: FloatArray, replicas_nm: Sequence[FloatArray], model: str) -> Row:
     """Hold replicas' frames `(n, n_atoms, 3)` nm each against the reference's."""
+    from surrogate.data.stiff import RIGID_NM
     from surrogate.judge.distributions import distance
-    from surrogate.training.lam_slide import RIGID_NM
     from systems.chemistry import rotatable_torsions
     from systems.geometry import torsion
 

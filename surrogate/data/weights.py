@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,13 @@ import torch
 from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.architectures import architecture
 from surrogate.models.interface import Surrogate
+from surrogate.models.stiff import StiffPlan, StiffTerms
 from systems.errors import InputError, UnknownNameError, WeightsError
 from systems.scene import Scene
 from systems.whole_file import create_whole
 
 FORMAT = "surromd-weights-1"
+_STIFF = "stiff."
 
 
 @dataclass(frozen=True)
@@ -80,19 +82,23 @@ class TrainingDomain:
 
 @dataclass(frozen=True)
 class Weights:
-    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
+    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes; `stiff`: terms
+    that its frames get from the reference (models.stiff), where it has any."""
 
     model: Surrogate
     domain: TrainingDomain
     provenance: dict[str, Any]
     hash: str
     path: Path
+    stiff: StiffTerms | None = None
 
 
 def save_weights(
-    path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *, half: bool = False
-) -> None:
-    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
+    path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *,
+    stiff: StiffTerms | None = None, half: bool = False,
+) -> None:  # fmt: skip
+    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping, but for the
+    numbers of `stiff` terms, which are few."""
     from safetensors.torch import save_file
 
     header = {
@@ -103,6 +109,9 @@ def save_weights(
     }
     dtype = torch.float16 if half else torch.float32
     tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
+    if stiff is not None:
+        header["stiff"] = asdict(stiff.plan)
+        tensors |= {_STIFF + name: values.float().contiguous() for name, values in stiff.numbers.items()}
     text = json.dumps(header)
     metadata = {"format": FORMAT, "surromd": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
@@ -158,6 +167,7 @@ def load_weights(path: str | Path) -> Weights:
     except UnknownNameError as error:
         raise WeightsError(f"{path} is of another version of surromd: {error}") from error
     model = arch.model(arch.config(header["config"]))
+    stiff = _stiff_terms(path, header.get("stiff"), state)
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
@@ -173,4 +183,17 @@ def load_weights(path: str | Path) -> Weights:
         provenance=header["provenance"],
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,
+        stiff=stiff,
     )
+
+
+def _stiff_terms(path: Path, record: dict[str, Any] | None, state: dict[str, torch.Tensor]) -> StiffTerms | None:
+    """Take the tensors of stiff terms out of a file's. Raises WeightsError where they are not those of its record."""
+    numbers = {name: state.pop(_STIFF + name).double() for name in StiffTerms.NAMES if _STIFF + name in state}
+    if record is None:
+        return None
+    plan = StiffPlan.of(record)
+    expected = StiffTerms.NAMES if plan.rows else StiffTerms.NAMES[:1]
+    if sorted(numbers) != sorted(expected) or not all(torch.isfinite(values).all() for values in numbers.values()):
+        raise WeightsError(f"{path} is damaged: its stiff terms are not whole; restore it from a whole copy.")
+    return StiffTerms(plan, numbers)

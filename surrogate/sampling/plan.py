@@ -74,7 +74,7 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    for key in ("lag_ps", "compile"):
+    for key in ("lag_ps", "compile", "stiff"):
         if not settings[key]:
             del settings[key]  # as checkpoints of earlier versions have it
     return Plan(

@@ -17,6 +17,7 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk
 from surrogate.sampling.plan import Plan
+from systems.imposed import KEY
 from systems.trajectory_types import TrajectoryWriter
 from systems.units import format_time_ps
 
@@ -45,6 +46,8 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         **weights.domain.conditions,
         "interventions": _interventions(plan, Tally(), {}, checks),
     }
+    if sampler.imposed:
+        record[KEY] = list(sampler.imposed)
     if not plan.match.seen:
         record["unseen_molecule"] = True
     if plan.match.deviations:

@@ -76,6 +76,7 @@ def rollout(
         solver=config.solver,
         precision=precision_of(state_path) if begun else config.precision,
         compile=config.compile,
+        stiff=config.stiff,
     )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     if resume and not state_path.exists() and _just_begun(outs):

@@ -18,6 +18,9 @@ class RolloutConfig:
     one that its model knows. `precision`: 'fp32', 'bf16' (autocast of the network; coordinates and integration stay
     fp32) or 'auto' (bf16 where the processor multiplies it faster). `compile`: by torch, which takes a minute.
 
+    `stiff`: bonds and angles 'modelled' by the network or 'imposed' from the weights' reference; None is what the
+    weights can.
+
     `guard`: see `surrogate.sampling.interventions`. `energy_every`: k, the energy of every k-th model frame is
     checked, after stiff bonds are relaxed; 0 checks none. `md_between_ps`: so much real MD after each chunk. `select`
     (MDTraj's language) and `atoms` ('all' or 'heavy') say which atoms are written; all are computed. `force` rolls
@@ -32,6 +35,7 @@ class RolloutConfig:
     solver: str | None = None
     precision: str = "auto"
     compile: bool = False
+    stiff: str | None = None
     guard: str = "flag"
     energy_every: int = 0
     md_between_ps: float = 0.0
@@ -49,6 +53,8 @@ class RolloutConfig:
             raise UnknownNameError(
                 f"guard {self.guard!r} is unknown; choose {', '.join(GUARDS)}.{nearest(self.guard, list(GUARDS))}"
             )
+        if self.stiff not in (None, "modelled", "imposed"):
+            raise InputError(f"stiff {self.stiff!r} is unknown; choose modelled or imposed.")
         if self.atoms not in ("all", "heavy"):
             raise InputError(f"atoms {self.atoms!r} is unknown; choose all or heavy.")
         if self.energy_every < 0 or self.md_between_ps < 0:

@@ -17,11 +17,13 @@ from torch import Tensor, nn
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
+from surrogate.data.stiff import drawn_terms, rigid_hydrogens, rigid_terms
 from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.precision import bf16_pays
+from surrogate.models.stiff import StiffTerms
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.heavy import on_heavy_atoms
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
@@ -33,9 +35,6 @@ from systems.units import whole_steps
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
 LATENT_CACHE_BYTES = 2_000_000_000
-# Bonds that a reference holds rigid vary by less, by rounding alone; others by ten times as much.
-RIGID_NM = 2e-4
-_LOOKED_AT = 1000
 # Share of the whole budget that stage one gets.
 STAGE_ONE_SHARE = 0.2
 
@@ -68,6 +67,13 @@ class TrainingConfig:
     rare_kinds: bool = False
     # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
     longest_lag_ps: float | None = None
+    # What rollouts take from the reference (models.stiff): 'held', the bonds that it holds rigid; 'drawn', the width of
+    # its other bonds and of its angles too; 'modelled', nothing. A --graph model holds bonds to hydrogen by itself.
+    stiff: str = "held"
+
+    def __post_init__(self) -> None:
+        if self.stiff not in ("held", "drawn", "modelled"):
+            raise InputError(f"training.stiff = {self.stiff!r} is unknown; choose held, drawn or modelled.")
 
     def stages(self, *, with_autoencoder: bool = True) -> tuple[StageConfig, StageConfig]:
         """Return both stages; stage two gets the whole budget where there is no autoencoder to train."""
@@ -105,6 +111,11 @@ def train_lam_slide(
     """
     out = Path(out)
     heavy = None
+    stiff = None
+    if not model_config.graph:
+        stiff = _stiff_terms(frames.trained[0] if isinstance(frames, FrameSets) else frames, config, start)
+    elif config.stiff == "drawn":
+        raise InputError("training.stiff = 'drawn' is for one molecule; leave it out with --graph.")
     if model_config.on_heavy_atoms:
         heavy = on_heavy_atoms(frames, model_config, start, several_lags=config.longest_lag_ps is not None)
         frames, model_config, start = heavy.frames, heavy.config, heavy.start
@@ -147,7 +158,8 @@ def train_lam_slide(
 
     def write(spent_s: float) -> None:
         whole, of = (model, domain) if heavy is None else heavy.dressed(model)
-        save_weights(out, whole, of, _provenance(sets, config, spent_one, spent_s, start))
+        save_weights(out, whole, of, _provenance(sets, config, spent_one, spent_s, start),
+                     stiff=stiff)  # fmt: skip
 
     spent_two = _stage_two(model, subjects, unseen, two, states[1], log_path, resume, progress, write, config, kinds,
                            strides)  # fmt: skip
@@ -185,10 +197,16 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
 
 def holds_hydrogens(frames: TrainingFrames) -> bool:
     """Return whether bonds to hydrogen keep their length in these frames, as a reference with constraints has them."""
-    idx = np.linspace(0, frames.n_frames - 1, min(_LOOKED_AT, frames.n_frames)).astype(int)
-    x, is_hydrogen = frames.positions_nm(idx), np.array(frames.scene.elements) == "H"
-    i, j = frames.scene.bonds[is_hydrogen[frames.scene.bonds].any(axis=1)].T
-    return bool((np.linalg.norm(x[:, i] - x[:, j], axis=-1).std(axis=0) < RIGID_NM).all())
+    is_hydrogen = np.array(frames.scene.elements) == "H"
+    return len(rigid_hydrogens(frames)) == int(is_hydrogen[frames.scene.bonds].any(axis=1).sum())
+
+
+def _stiff_terms(frames: TrainingFrames, config: TrainingConfig, start: Weights | None) -> StiffTerms | None:
+    """Return the stiff terms that the weights are to have: drawn where they are asked for, or were before."""
+    before = None if start is None else start.stiff
+    if config.stiff == "drawn" or (before is not None and before.plan.rows):
+        return drawn_terms(frames)
+    return rigid_terms(frames) if config.stiff == "held" else None
 
 
 def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from surrogate.models.lam_slide.further_noise import REDRAWS, generators
 from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
 from systems.errors import InputError
+from systems.imposed import RIGID_BONDS
 
 # Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all
 # others.
@@ -103,6 +104,10 @@ class LamSlide(Surrogate):
         model = copy.copy(self)
         model.lag_ps = lag_ps
         return model
+
+    @property
+    def imposed(self) -> tuple[str, ...]:
+        return (RIGID_BONDS,) if self.config.graph and self.config.atoms.rigid_hydrogens else ()
 
     @property
     def knows_bonds(self) -> bool:
