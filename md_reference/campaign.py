@@ -7,7 +7,6 @@ checkpoint. `manifest.json` says what is done; it is written by this process alo
 from __future__ import annotations
 
 import queue
-import shutil
 import threading
 import time
 import uuid
@@ -19,8 +18,9 @@ from typing import Any
 
 from md_reference.campaign_file import JOB_LOGS, Campaign, Run, first_seed
 from md_reference.campaign_manifest import check_same_campaign, new_manifest
-from md_reference.campaign_worker import LOCKS, RunTask, SceneTask, poll, prepare_scene, simulate_run, stop
-from systems.errors import InputError, SimulationError
+from md_reference.campaign_worker import RunTask, SceneTask, poll, prepare_scene, simulate_run, stop
+from systems.claim import Claim
+from systems.errors import InputError, SimulationError, TrajectoryError
 from systems.interrupts import deferred_interrupt
 from systems.manifest import (
     COMPLETE,
@@ -122,8 +122,6 @@ def run_campaign(
                     progress(job.progress())
             finally:
                 write_manifest(campaign.folder, state.manifest)
-        if all(run.status == COMPLETE for run in state.manifest.runs.values()):
-            shutil.rmtree(campaign.folder / LOCKS, ignore_errors=True)
     return state.manifest
 
 
@@ -315,24 +313,17 @@ def _result_of(future: Any) -> dict[str, Any]:
 
 @contextmanager
 def _only_process(folder: Path) -> Iterator[None]:
-    """Hold the campaign's lock. Raises InputError when another process runs the campaign."""
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system
-        yield
-        return
+    """Hold the campaign's claim. Raises InputError when another process runs the campaign."""
     existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    lock = folder / ".lock"
-    with open(lock, "a") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{folder}: another process runs this campaign; wait for it, or stop it first.") from None
-        try:
+    try:
+        claim = Claim(folder / MANIFEST_NAME)
+    except TrajectoryError:
+        raise InputError(f"{folder}: another process runs this campaign; wait for it, or stop it first.") from None
+    try:
+        with claim:
             yield
-        finally:
-            if not existed and not (folder / MANIFEST_NAME).exists():
-                lock.unlink(missing_ok=True)
-                with suppress(OSError):
-                    folder.rmdir()
+    finally:
+        if not existed and not (folder / MANIFEST_NAME).exists():
+            with suppress(OSError):
+                folder.rmdir()

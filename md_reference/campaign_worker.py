@@ -1,7 +1,7 @@
 """What a campaign's workers do: prepare a scene, simulate one run from wherever it stands, say how far they are, stop.
 
-A run's file belongs to one task at a time (a lock beside the campaign), and a task stops by itself, with a checkpoint,
-when the campaign that started it has not been heard of for a minute.
+A run's file belongs to one task at a time (systems.claim), and a task stops by itself, with a checkpoint, when the
+campaign that started it has not been heard of for a minute.
 """
 
 from __future__ import annotations
@@ -12,22 +12,21 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from md_reference.campaign_file import Run, SceneSpec
-from systems.errors import InputError, SimulationError, StorageError, SurromdError
+from systems.errors import InputError, StorageError, SurromdError
 from systems.interrupts import stop_when
 from systems.manifest import MANIFEST_NAME, file_sha256, frames_sha256
 
-LOCKS = ".locks"
 # Without a word from the campaign for so long its runs stop.
 LEASE_S = 60.0
 # So long a task waits for another one, which is about to end, to let go of its file.
-_LOCK_PATIENCE_S = 2 * LEASE_S
+_CLAIM_PATIENCE_S = 2 * LEASE_S
 
 
 @dataclass
@@ -120,7 +119,7 @@ def simulate_run(task: RunTask) -> dict[str, Any]:
         os.environ["OPENMM_CPU_THREADS"] = "1"
         session.frames[task.run.name] = 0
         try:
-            with _claimed(folder / LOCKS / task.run.name, session.should_stop), stop_when(session.should_stop):
+            with stop_when(session.should_stop):
                 return _simulate(task, folder, session)
         finally:
             session.frames.pop(task.run.name, None)
@@ -148,8 +147,8 @@ def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> di
 
 def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     from md_reference.campaign_scene import load_prepared
-    from md_reference.simulate import checkpoint_path, simulate
-    from systems.trajectory import open_trajectory
+    from md_reference.simulate import simulate
+    from systems.trajectory import companions, open_trajectory
 
     def report(done: int, _: int) -> None:
         session.frames[task.run.name] = done
@@ -158,14 +157,12 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     config = replace(task.run.config, force=prepared.force)
     out = folder / task.run.file
     out.parent.mkdir(parents=True, exist_ok=True)
-    # Killed between its first byte and its first checkpoint, a run has nothing to go on from.
-    husk = out.exists() and not checkpoint_path(out).exists() and not _is_complete(out, config.n_frames)
     simulate(
         prepared.scene,
         config,
         out,
-        resume=not husk,
-        overwrite=husk,
+        resume=True,
+        patience_s=_CLAIM_PATIENCE_S,
         progress=report,
         checkpoint_every_s=task.checkpoint_every_s,
         choice=prepared.platform,
@@ -178,7 +175,7 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
             f"{out} is not what this campaign once wrote there (its frames differ from {MANIFEST_NAME}); delete it to "
             "have the run made again."
         )
-    files = [path for path in (out, *_companions(out)) if path.is_file()]
+    files = [path for path in (out, *companions(out)) if path.is_file()]
     return {
         "n_frames": n_frames,
         "size_bytes": out.stat().st_size,
@@ -189,48 +186,3 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
         "host": socket.gethostname(),
         "wall_s": round(float(record.get("cost", {}).get("wall_s", 0.0)), 3),
     }
-
-
-def _companions(out: Path) -> list[Path]:
-    if out.suffix.lower() != ".dcd":
-        return []
-    from systems.dcd_file import companions
-
-    return list(companions(out))
-
-
-def _is_complete(out: Path, n_frames: int) -> bool:
-    from systems.trajectory import open_trajectory
-
-    with open_trajectory(out) as reader:
-        return bool(reader.record.get("completed")) and reader.n_frames == n_frames
-
-
-@contextmanager
-def _claimed(path: Path, stopped: Callable[[], bool]) -> Iterator[None]:
-    """Hold the lock of a run: a task that Dask gave up for lost may still be writing.
-
-    Raises SimulationError when another holds it for too long, KeyboardInterrupt when asked to stop.
-    """
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system
-        yield
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a") as handle:
-        deadline = time.monotonic() + _LOCK_PATIENCE_S
-        while True:
-            try:
-                # Unlike lockf, it holds between two threads of one process, too.
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if stopped():
-                    raise KeyboardInterrupt from None
-                if time.monotonic() > deadline:
-                    raise SimulationError(
-                        f"another process is still working on {path.name}; try again later."
-                    ) from None
-                time.sleep(0.5)
-        yield

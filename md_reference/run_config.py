@@ -11,7 +11,7 @@ from md_reference.forcefield import ForceFieldSpec, resolve
 from md_reference.integrators import check_ensemble
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.units import whole_steps
+from systems.units import format_time_ps, whole_steps
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ def settings_of(config: MDConfig) -> dict[str, Any]:
 def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
     """Raise InputError unless a record or a checkpoint states the settings of `config`.
 
-    A setting that an older version did not know counts as its default. A run may be resumed to become longer.
+    A setting that an older version did not know counts as its default. A run may be resumed to become longer, never
+    shorter.
     """
     before = settings_of(MDConfig(time_ps=config.time_ps)) | old
     for key, value in json.loads(json.dumps(settings_of(config))).items():
@@ -70,6 +71,11 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
                 f"{out} was started with {key} = {before.get(key)!r}, not {value!r}; resume with the same settings "
                 "or write to another file."
             )
+    if config.time_ps < before["time_ps"]:
+        raise InputError(
+            f"{out} was started for {format_time_ps(before['time_ps'])} and cannot become shorter; resume with as much "
+            "or more, or write to another file."
+        )
 
 
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:

@@ -11,17 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
 from md_reference.engine import Engine, State
 from md_reference.forcefield import build_system
 from md_reference.integrators import integrator_name
 from md_reference.platforms import PlatformChoice, measured_platform
 from md_reference.run_config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.summary import summarise
-from systems.errors import InputError, SimulationError, TrajectoryError
+from systems.checkpoint import (
+    FLUSH_SHARE,
+    Checkpoint,
+    checkpoint_path,
+    last_supported,
+    new_header,
+    write_checkpoint,
+    writer_at,
+)
+from systems.checksums import packed
+from systems.claim import claimed_outputs
+from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory import open_trajectory
 from systems.trajectory_types import TrajectoryWriter
 from systems.units import format_time_ps
 
@@ -50,14 +60,17 @@ def simulate(
     checkpoint_every_s: float = 20.0,
     max_threads: int = 1,
     choice: PlatformChoice | None = None,
+    patience_s: float = 0.0,
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
 
-    A checkpoint stands behind every block of frames on disk and, in frames that take longer, every
-    `checkpoint_every_s` of wall time, when it is also forced onto the medium. So a `kill -9` or a full disk loses at
-    most one save interval, or half a second of work where that is more; `resume=True` goes on from there with the same
-    random stream, on the same platform. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with
-    a checkpoint, inside a frame if need be: KeyboardInterrupt.
+    A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
+    time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure
+    loses at most one save interval, half a second of work, or fifty times what it takes to write, whichever is the
+    longest; `resume=True` goes on from there with the same random stream, on the same platform, if the frames are still
+    those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
+    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile; for one that does,
+    `patience_s` is waited.
 
     With `platform='auto'` the platform is measured (`platforms.measured_platform`, at most `max_threads`), unless
     `choice` says what has been. Raises SimulationError when coordinates stop being finite or the system blows up
@@ -66,29 +79,20 @@ def simulate(
     out = Path(out)
     config = check_run(scene, config, out)
     chk = checkpoint_path(out)
-    if resume and not chk.exists() and out.exists():
-        return _already_complete(out, config)
-    if out.exists() and not (resume or overwrite):
-        raise TrajectoryError(f"{out} exists already; overwrite it, resume it, or choose another name.")
-    header, blob = read_checkpoint(chk) if resume and chk.exists() else ({}, b"")
-    equilibrating = "equilibrated_steps" in header
-    if header and not equilibrating and not out.exists():
-        header = {}
-    if header:
-        check_same_run(header["config"], config, out)
-        choice = _recorded_platform(header, out)
-        overwrite = overwrite or bool(header.get("overwrite"))
-    run = _Run(scene, config, out, checkpoint_every_s, header, overwrite=overwrite)
-    with deferred_interrupt() as asked_to_stop:
+    with (
+        deferred_interrupt() as asked_to_stop,
+        claimed_outputs([out], may_exist=resume or overwrite, patience_s=patience_s, stopped=asked_to_stop),
+    ):
+        if resume and out.exists() and not chk.exists():
+            return _already_complete(out, config)
+        kept = last_supported(chk, [out]) if resume and chk.exists() else None
+        run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
         run.asked_to_stop = asked_to_stop
         run.preparing = preparing or run.preparing
         run.prepare(choice, max_threads)
-        engine = run.resumed(blob) if header and not equilibrating else run.equilibrated(blob)
-        with engine, open_writer(
-            out, scene, run.record(engine), append=run.resuming, overwrite=overwrite, columns=config.columns
-        ) as writer:  # fmt: skip
+        with run.engine_at_start() as engine, run.writer(engine) as writer:
             run.produce(engine, writer, progress)
-    chk.unlink(missing_ok=True)
+        chk.unlink(missing_ok=True)
     return out
 
 
@@ -101,19 +105,22 @@ class _Run:
         config: MDConfig,
         out: Path,
         checkpoint_every_s: float,
-        header: dict[str, Any],
+        kept: Checkpoint | None,
         *,
         overwrite: bool,
     ) -> None:
         self.scene, self.config, self.out = scene, config, out
-        self.checkpoint_every_s, self.header, self.overwrite = checkpoint_every_s, header, overwrite
-        self.resuming = bool(header) and "equilibrated_steps" not in header
+        self.checkpoint_every_s, self.resumed = checkpoint_every_s, kept is not None
+        self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
+        if kept is not None:
+            check_same_run(self.header["config"], config, out)
+        self.last_state = packed(*kept) if kept else b""
         self.asked_to_stop: Callable[[], bool] = lambda: False
         self.preparing: PreparingFn = lambda _: None
-        self.done = int(header.get("n_frames", 0))
-        self.steps_into_frame = int(header.get("steps_into_frame", 0))
-        self.spent_s = float(header.get("wall_s", 0.0))
-        self.started = self.synced_at = time.monotonic()
+        self.done = int(self.header["files"][0]["n_frames"])
+        self.steps_into_frame = int(self.header.get("steps_into_frame", 0))
+        self.spent_s = float(self.header.get("wall_s", 0.0))
+        self.started = self.saved_at = time.monotonic()
         self.piece = 10
         self.system: Any = None
 
@@ -124,6 +131,8 @@ class _Run:
     def prepare(self, choice: PlatformChoice | None, max_threads: int) -> None:
         """Build the forces and settle the platform."""
         self.system = build_system(self.scene, self.config.force)
+        if self.resumed:
+            choice = PlatformChoice(self.header["platform"], self.header["threads"], "as before it was resumed")
         self.choice = choice or measured_platform(
             self.scene,
             self.config.force,
@@ -150,12 +159,24 @@ class _Run:
             system=self.system,
         )
 
-    def resumed(self, blob: bytes) -> Engine:
-        engine = self.engine(self.config.ensemble)
-        engine.restore(blob)
+    def engine_at_start(self) -> Engine:
+        """Return the engine where the run was left, or at time 0."""
+        if self.resumed and "equilibrated_steps" not in self.header:
+            engine = self.engine(self.config.ensemble)
+            engine.restore(self.blob)
+        else:
+            engine = self._equilibrated()
+        if not self.done:
+            # Before there is a file, so that a run killed at any later moment can be resumed like any other.
+            self.save(engine)
         return engine
 
-    def equilibrated(self, blob: bytes) -> Engine:
+    def writer(self, engine: Engine) -> TrajectoryWriter:
+        """Return the writer of the trajectory, which holds the frames that are done."""
+        columns = self.config.columns
+        return writer_at(self.out, self.scene, self._record(engine), self.header, resumed=self.resumed, columns=columns)
+
+    def _equilibrated(self) -> Engine:
         """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
 
         A model system that brings its own velocities starts from them as it stands, if nothing is to heat it.
@@ -167,25 +188,24 @@ class _Run:
             return engine
         bath = self.engine("nvt" if config.ensemble == "nve" else config.ensemble)
         try:
-            self._equilibrate(bath, blob)
+            self._equilibrate(bath)
             if config.ensemble != "nve":
                 bath.reset_clock()
                 return bath
             state = bath.state(velocities=True)
         except SimulationError as error:
-            checkpoint_path(self.out).unlink(missing_ok=True)
             raise SimulationError(f"{self.scene.name}: {error} before the first frame. {_advice(config)}") from error
         bath.close()
         engine = self.engine("nve")
         engine.take_over(state)
         return engine
 
-    def _equilibrate(self, engine: Engine, blob: bytes) -> None:
+    def _equilibrate(self, engine: Engine) -> None:
         n_steps = max(1, round(self.config.equilibrate_ps / self.config.timestep_ps))
         done = int(self.header.get("equilibrated_steps", 0))
         self.preparing(done / n_steps)
-        if blob:
-            engine.restore(blob)
+        if self.blob:
+            engine.restore(self.blob)
         else:
             engine.minimise()
             engine.thermalise()
@@ -193,8 +213,8 @@ class _Run:
             done += self._advance(engine, n_steps - done)
             self.preparing(done / n_steps)
             stop = self.asked_to_stop()
-            if stop or time.monotonic() - self.synced_at > self.checkpoint_every_s:
-                self.save(engine, sync=True, equilibrated_steps=done, overwrite=self.overwrite)
+            if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
+                self.save(engine, equilibrated_steps=done)
             if stop:
                 raise KeyboardInterrupt
         engine.state()
@@ -208,35 +228,31 @@ class _Run:
         self.piece = max(1, min(2 * self.piece, math.ceil(taken * _SIGNAL_S / seconds), 100_000))
         return taken
 
-    def save(self, engine: Engine, *, sync: bool, **more: Any) -> None:
-        """Write the checkpoint."""
-        header = {
+    def save(self, engine: Engine, **more: Any) -> None:
+        """Write the checkpoint, which keeps the state before this one, too."""
+        said = {
             "config": settings_of(self.config),
-            "n_frames": self.done,
             "wall_s": self.wall_s,
             "platform": engine.platform_name,
             "threads": engine.threads,
-            **more,
         }
-        write_checkpoint(checkpoint_path(self.out), header, engine.checkpoint(), sync=sync)
-        if sync:
-            self.synced_at = time.monotonic()
+        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
+        path = checkpoint_path(self.out)
+        self.last_state = write_checkpoint(path, self.header, engine.checkpoint(), before=self.last_state)
+        self.saved_at = time.monotonic()
 
     def produce(self, engine: Engine, writer: TrajectoryWriter, progress: ProgressFn | None) -> None:
         """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
         config, n_frames = self.config, self.config.n_frames
-        if self.resuming:
-            writer.truncate(self.done)
-        else:
-            # At once, so that a run killed in its first seconds can be resumed like any other.
-            self.save(engine, sync=True)
         block = 1
         while self.done < n_frames:
             size = min(block, n_frames - self.done)
             began = time.monotonic()
             states, failure = self._frames(engine, size)
+            computed = time.monotonic()
             self._write(writer, states)
             self.done += len(states)
+            self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()}]
             if failure:
                 writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
                 raise SimulationError(
@@ -245,15 +261,15 @@ class _Run:
                 )
             stop = self.asked_to_stop() and self.done < n_frames
             if self.done < n_frames:
-                due = time.monotonic() - self.synced_at > self.checkpoint_every_s
-                self.save(engine, sync=stop or due, steps_into_frame=self.steps_into_frame)
+                self.save(engine, steps_into_frame=self.steps_into_frame)
+            flushed_s = time.monotonic() - computed
             if progress is not None:
                 progress(self.done, n_frames)
             if stop:
                 writer.update_record({"cost": self.cost()})
                 raise KeyboardInterrupt
-            per_frame_s = max((time.monotonic() - began) / max(len(states), 1), 1e-6)
-            block = min(max(1, round(_BLOCK_S / per_frame_s)), 1000, 2 * block)
+            per_frame_s = max((computed - began) / max(len(states), 1), 1e-6)
+            block = min(max(1, round(max(_BLOCK_S, FLUSH_SHARE * flushed_s) / per_frame_s)), 1000, 2 * block)
         time_ps, scalars = writer.series()
         summary = summarise(
             self.scene,
@@ -276,8 +292,8 @@ class _Run:
                     if self.asked_to_stop():
                         return states, ""
                     self.steps_into_frame += self._advance(engine, per_frame - self.steps_into_frame)
-                    if not states and time.monotonic() - self.synced_at > self.checkpoint_every_s:
-                        self.save(engine, sync=True, steps_into_frame=self.steps_into_frame)
+                    if not states and time.monotonic() - self.saved_at > self.checkpoint_every_s:
+                        self.save(engine, steps_into_frame=self.steps_into_frame)
                 states.append(engine.state(velocities=config.save_velocities, forces=config.save_forces))
                 self.steps_into_frame = 0
             except SimulationError as error:
@@ -313,7 +329,7 @@ class _Run:
             "ns_per_day": simulated_ps * 1e-3 / self.wall_s * 86400.0,
         }
 
-    def record(self, engine: Engine) -> dict[str, Any]:
+    def _record(self, engine: Engine) -> dict[str, Any]:
         import openmm
 
         return {
@@ -327,15 +343,6 @@ class _Run:
             "threads": engine.threads,
             "platform_reason": self.choice.reason,
         }
-
-
-def _recorded_platform(header: dict[str, Any], out: Path) -> PlatformChoice:
-    """Return the platform of the run that wrote a checkpoint; older ones leave it to the trajectory's record."""
-    name = header.get("platform")
-    if name is None:
-        with open_trajectory(out) as reader:
-            name = reader.record["platform"]
-    return PlatformChoice(str(name), int(header.get("threads", 1)), "as before it was resumed")
 
 
 def _advice(config: MDConfig) -> str:

@@ -1,4 +1,4 @@
-"""Files that verbs write and read: checked before the work starts, no husks left behind, replicas found by pattern."""
+"""Files that verbs write and read: checked before the work starts, told of at its end, replicas found by pattern."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from systems.errors import InputError, StorageError, SurromdError
+from systems.checkpoint import checkpoint_path
+from systems.claim import frames_in
+from systems.errors import InputError
 from systems.manifest import campaign_folder, campaign_trajectories
 
 PathLike = str | Path
@@ -38,28 +40,16 @@ def check_outputs(
 
 
 @contextmanager
-def guarded_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
-    """Run a verb that writes trajectories: on failure remove files without frames; on Ctrl-C say what is kept.
+def accounted_outputs(paths: Sequence[Path], *, resumable: str = "") -> Iterator[None]:
+    """Run a verb that writes trajectories; on Ctrl-C say what is kept, as the message of KeyboardInterrupt.
 
-    A checkpoint of an equilibration is kept on Ctrl-C, too, and on a full disk.
-
-    `resumable`: what the user does to go on, said when there is something to go on from. Files that were there before
-    are never removed. Raises KeyboardInterrupt with the account as its message.
+    `resumable`: what the user does to go on, said when there is something to go on from.
     """
-    before = {p for path in paths for p in _family(path) if p.exists()}
     try:
         yield
     except KeyboardInterrupt:
-        counts = {path: frames for path in paths if (frames := _sweep(path, before, resumable=True)) is not None}
+        counts = {path: frames_in(path) for path in paths if path.exists() or checkpoint_path(path).exists()}
         raise KeyboardInterrupt(f"{_kept(counts)}; {resumable}" if counts else "nothing was written") from None
-    except StorageError:
-        for path in paths:
-            _sweep(path, before, resumable=True)
-        raise
-    except BaseException:
-        for path in paths:
-            _sweep(path, before)
-        raise
 
 
 def _kept(counts: dict[Path, int]) -> str:
@@ -69,44 +59,6 @@ def _kept(counts: dict[Path, int]) -> str:
     fewest, most = min(counts.values()), max(counts.values())
     frames = str(most) if fewest == most else f"{fewest} to {most}"
     return f"{first} to {last.name} hold {frames} frames each"
-
-
-def _sweep(path: Path, before: set[Path], *, resumable: bool = False) -> int | None:
-    """Return the number of frames of a trajectory, or remove it and its companions (None) if it holds none.
-
-    With `resumable` a checkpoint keeps them: there are no frames, and something to go on from.
-    """
-    from systems.trajectory import open_trajectory
-
-    if not path.exists():
-        n_frames = 0
-    else:
-        try:
-            with open_trajectory(path) as reader:
-                n_frames = reader.n_frames
-        except SurromdError:
-            n_frames = 0
-    if n_frames or (resumable and checkpoint_of(path).exists()):
-        return n_frames
-    for member in _family(path):
-        if member not in before:
-            member.unlink(missing_ok=True)
-    return None
-
-
-def checkpoint_of(path: Path) -> Path:
-    """Where a reference run keeps what it goes on from (`md_reference.checkpoint`)."""
-    return path.with_name(path.name + ".checkpoint")
-
-
-def _family(path: Path) -> list[Path]:
-    """A trajectory file and what the writers put beside it."""
-    members = [path, checkpoint_of(path)]
-    if path.suffix.lower() == ".dcd":
-        from systems.dcd_file import companions
-
-        members += companions(path)
-    return members
 
 
 def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]:

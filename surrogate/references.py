@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from surrogate.md_options import MDOptions, takes
-from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, guarded_outputs
+from surrogate.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.progress import progress_bar
 from surrogate.scenes import prepare_scene, tell
 from systems.units import Quantity, quantity
@@ -96,7 +96,7 @@ def reference(
         tell(molecule.name, protocol)
     label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
     with (
-        guarded_outputs(outs, resumable="the same command with --resume goes on"),
+        accounted_outputs(outs, resumable="the same command with --resume goes on"),
         progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from surrogate.data.shipped import weights_path
 from surrogate.md_options import Preparation, takes
-from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs, guarded_outputs
+from surrogate.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.progress import progress_bar
 from surrogate.scenes import prepare_scene
 from systems.units import Quantity, quantity
@@ -106,7 +106,7 @@ def rollout(
     label = f"surrogate {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
     saved_ps = choose_lag(loaded, lag_ps, save_every_ps) if save_every_ps is None else save_every_ps
     with (
-        guarded_outputs(outs, resumable="the same command with --resume goes on"),
+        accounted_outputs(outs, resumable="the same command with --resume goes on"),
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=quiet, ps_per_frame=saved_ps * replicas) as progress,
     ):

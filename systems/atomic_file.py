@@ -1,68 +1,98 @@
-"""A file that HDF5 writes through, and that reaches the disk one whole transaction at a time."""
+"""A file that HDF5 writes through, and that changes by whole transactions: a journal takes an unfinished one back."""
 
 from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from systems.errors import StorageError, TrajectoryError
+from systems.checksums import packed, unpacked
+from systems.errors import InputError
+from systems.whole_file import force_out, storage_error, write_whole
 
+_MAGIC = b"surromd journal 1\n"
+_Writes = list[tuple[int, bytes]]
 _BTREE, _SYMBOLS = b"TREE", b"SNOD"
 
 
-def storage_error(path: str | os.PathLike[str], error: OSError, kept: str) -> StorageError:
-    """Return the StorageError to raise for a failed write; `kept` says what stays readable."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        reason = "the disk (or its quota) is full"
-    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        reason = "the folder or the file is not writable"
-    elif error.errno in (errno.ENOENT, errno.ENOTDIR):
-        reason = "its folder does not exist"
-    else:
-        reason = error.strerror or str(error)
-    return StorageError(f"Cannot write {os.fspath(path)}: {reason}; {kept}.")
-
-
-def write_whole(descriptor: int, data: bytes | memoryview, offset: int) -> None:
-    """Write all of `data` at `offset`; OSError (ENOSPC, EFBIG) when the disk takes only part of it."""
-    view = memoryview(data)
-    while len(view):
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written
+def journal_path(path: Path) -> Path:
+    """Where the journal of a file lies while it is written."""
+    return path.with_name(path.name + ".journal")
 
 
 class AtomicFile:
-    """A seekable binary file whose writes wait in memory until `commit`.
+    """A seekable binary file whose writes wait in memory until `commit`, which makes all of them or none.
 
-    HDF5 has no transactions: a process killed, or a disk filled, between two of its writes can leave metadata that name
-    data which never arrived, and then the whole file is lost. Given to h5py as its file object, this class collects the
-    writes of one append and puts them out in an order in which every prefix is a readable file: first what lies beyond
-    the old end of the file (nothing refers to it yet; if the disk fills here, the file is cut back and is byte for byte
-    what it was), then the superblock (end of file), then index nodes from the root down, then data inside old chunks
-    and the object headers, which hold the lengths, and names last. No space is needed after the first step. A
-    transaction that shortens the file (`shrinks`) goes the other way: lengths first.
+    HDF5 has no transactions: a process killed, a disk filled or the power lost between two of its writes can leave
+    metadata that name data which never arrived, and then the whole file is lost. Given to h5py as its file object, this
+    class collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium,
+    then the writes to the file; when these are on the medium, too, the journal is void. A journal that is not void is
+    from a transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees
+    them in their place. Other programs read such a file as well after a kill: in-place writes are made in an order in
+    which every prefix is readable (superblock, index nodes from the root down, data and object headers, names last).
 
-    One writer at a time: an advisory POSIX lock, which leaves HDF5 readers of the running file alone.
-    Raises TrajectoryError when another process writes the file, StorageError when it cannot be opened for writing.
+    `key`: where in the file bytes lie that no other file has, and that no transaction changes; by them a journal knows
+    its file. One writer at a time is for the caller to see to. Raises StorageError when the file cannot be opened,
+    InputError where another file lies in the journal's place.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
-        self._pending: list[tuple[int, bytes]] = []
+    key: tuple[int, int] = (0, 0)
+
+    def __init__(self, path: Path, *, writable: bool) -> None:
+        self.path = path
+        self._journal = journal_path(path)
+        self._pending: _Writes = []
         self._position = 0
-        self._dead = False
+        self._dead = not writable
+        self._fd = self._journal_fd = -1
         try:
-            self._fd = os.open(self.path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
+            self._fd = os.open(path, (os.O_RDWR if writable else os.O_RDONLY) | getattr(os, "O_CLOEXEC", 0))
+            self._committed_size = self._size = os.fstat(self._fd).st_size
+            unfinished = self._unfinished()
+            if unfinished is not None and writable:
+                self._put_back(*unfinished)
+            elif unfinished is not None:
+                self._size, self._pending = unfinished
+            if writable:
+                # O_EXCL: never through a link, never another's file.
+                self._journal.unlink(missing_ok=True)
+                flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0)
+                self._journal_fd = os.open(self._journal, flags, 0o666)
+                force_out(path.parent)
         except OSError as error:
-            raise storage_error(self.path, error, "nothing was changed") from error
+            self.close()
+            raise storage_error(path, error, "nothing was changed") from error
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether a reader sees old bytes from a journal."""
+        return bool(self._pending)
+
+    def _unfinished(self) -> tuple[int, _Writes] | None:
+        """Return the size and the bytes that a journal has kept of this file, None where there is nothing to undo."""
         try:
-            _lock(self._fd, self.path)
-        except TrajectoryError:
-            os.close(self._fd)
-            raise
-        self._committed_size = self._size = os.fstat(self._fd).st_size
+            data = self._journal.read_bytes()
+            if data[: len(_MAGIC)].strip(b"\0") not in (b"", _MAGIC):
+                raise InputError(f"{self._journal} lies where a journal goes and is none; move it away.")
+            header, old, _ = unpacked(data[len(_MAGIC) :])
+            if os.pread(self._fd, header["key"][1], header["key"][0]).hex() != header["bytes"]:
+                return None
+            writes, at = [], 0
+            for offset, length in header["blocks"]:
+                writes.append((offset, old[at : at + length]))
+                at += length
+            return header["size"], writes
+        except (FileNotFoundError, ValueError, LookupError, TypeError, RecursionError):
+            return None  # void, or never finished itself: then the file has not been touched
+
+    def _put_back(self, size: int, writes: _Writes) -> None:
+        for offset, block in writes:
+            write_whole(self._fd, block, offset)
+        os.ftruncate(self._fd, size)
+        os.fsync(self._fd)
+        self._committed_size = self._size = size
 
     # ---- the file object that h5py calls ---------------------------------------------------------------------------
 
@@ -110,34 +140,46 @@ class AtomicFile:
 
     # ---- transactions ----------------------------------------------------------------------------------------------
 
-    def plan(self, *, shrinks: bool = False) -> list[tuple[int, bytes]]:
-        """Return the pending writes as `(offset, bytes)` in the order in which `commit` makes them."""
-        old_end = self._committed_size
-        beyond: list[tuple[int, bytes]] = []
-        inside: list[tuple[int, bytes]] = []
-        for offset, block in self._pending:
-            split = max(old_end - offset, 0)
-            if split:
-                inside.append((offset, block[:split]))
-            if split < len(block):
-                beyond.append((offset + split, block[split:]))
-        return beyond + sorted(_latest(inside), key=_rank, reverse=shrinks)
-
-    def commit(self, *, shrinks: bool = False) -> None:
-        """Put the collected writes on disk. On failure raise OSError with the file as it was before the transaction."""
+    def commit(self) -> None:
+        """Put the collected writes on the medium. On failure raise OSError with the file as it was before."""
         if self._dead:
             raise OSError(errno.EIO, "an earlier write failed")
+        end = self._committed_size
+        writes = _latest(self._pending)
+        beyond = [(max(offset, end), block[max(end - offset, 0) :]) for offset, block in writes]
+        inside = sorted(
+            [(offset, block[: max(end - offset, 0)]) for offset, block in writes if offset < end], key=_rank
+        )
+        old: _Writes = []
         try:
-            for offset, block in self.plan(shrinks=shrinks):
+            old = [(offset, os.pread(self._fd, len(block), offset)) for offset, block in inside]
+            self._keep(end, old)
+            for offset, block in beyond + inside:
                 write_whole(self._fd, block, offset)
-            if os.fstat(self._fd).st_size != self._size:
+            if self._size > end:
                 os.ftruncate(self._fd, self._size)
+            os.fsync(self._fd)
         except OSError:
             self.abandon()
-            os.ftruncate(self._fd, self._committed_size)
+            with suppress(OSError):  # if this fails, too, the journal stands, and whoever opens the file goes by it
+                self._put_back(end, old)
+                os.ftruncate(self._journal_fd, 0)
             raise
+        # Should the power fail before this is on the medium, one transaction more is taken back: checkpoints allow it.
+        os.ftruncate(self._journal_fd, 0)
+        if self._size < end:  # what is cut off stands in no journal
+            os.fsync(self._journal_fd)
+            os.ftruncate(self._fd, self._size)
         self._pending.clear()
         self._committed_size = self._size
+
+    def _keep(self, size: int, old: _Writes) -> None:
+        """Write the journal: the size of the file and the bytes that are about to be overwritten."""
+        offset, length = self.key
+        header = {"key": self.key, "bytes": os.pread(self._fd, length, offset).hex(), "size": size,
+                  "blocks": [(offset, len(block)) for offset, block in old]}  # fmt: skip
+        write_whole(self._journal_fd, _MAGIC + packed(header, b"".join(block for _, block in old)), 0)
+        os.fsync(self._journal_fd)
 
     def abandon(self) -> None:
         """Drop the collected writes and all later ones: HDF5's own state is now ahead of the disk."""
@@ -145,10 +187,16 @@ class AtomicFile:
         self._pending.clear()
 
     def close(self) -> None:
-        """Close the descriptor; what was not committed is dropped."""
+        """Close the file; what was not committed is dropped. Twice does no harm."""
+        if self._journal_fd >= 0:
+            with suppress(OSError):
+                if not os.fstat(self._journal_fd).st_size:
+                    os.fsync(self._journal_fd)  # what is complete must not be taken back later
+                    self._journal.unlink(missing_ok=True)
+            os.close(self._journal_fd)
         if self._fd >= 0:
             os.close(self._fd)
-            self._fd = -1
+        self._fd = self._journal_fd = -1
 
     def __enter__(self) -> AtomicFile:
         return self
@@ -158,9 +206,9 @@ class AtomicFile:
         self.close()
 
 
-def _latest(writes: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+def _latest(writes: _Writes) -> _Writes:
     """Return disjoint writes with the same effect: where two overlap, the later one stands."""
-    kept: list[tuple[int, bytes]] = []
+    kept: _Writes = []
     for offset, block in reversed(writes):
         pieces = [(offset, block)]
         for other, cover in kept:
@@ -189,15 +237,3 @@ def _rank(item: tuple[int, bytes]) -> tuple[int, int]:
     if block[:4] == _BTREE and len(block) > 5:
         return (1, -block[5])
     return (3 if block[:4] == _SYMBOLS else 2, -offset)
-
-
-def _lock(descriptor: int, path: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system: no advisory lock, two writers are the user's to avoid
-        return
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            raise TrajectoryError(f"{path} is being written by another process; wait, or take another name.") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import zlib
 from collections.abc import Mapping
@@ -39,6 +40,16 @@ def frame_checksums(columns: Mapping[str, npt.NDArray[Any]]) -> Checksums:
     return upper
 
 
+def frames_digest(checksums: Mapping[str, Checksums]) -> Any:
+    """Return the SHA-256 object of frames' checksums `(n,)` by name; frames that come later are added to it."""
+    return hashlib.sha256(checksum_rows(checksums))
+
+
+def checksum_rows(checksums: Mapping[str, Checksums]) -> bytes:
+    """Return the checksums of frames as bytes, frame by frame."""
+    return np.stack([checksums[name] for name in sorted(checksums)], axis=1).astype("<u4").tobytes()
+
+
 def check_frames_read(path: Any, stored: Checksums, found: Checksums, start: int, stride: int) -> None:
     """Raise TrajectoryError when frames `start`, `start + stride`, ... are not those that were written."""
     if not np.array_equal(stored, found):
@@ -61,6 +72,23 @@ def unsealed(text: str) -> str:
     if found is None or _digest(bare) != found.group(1):
         raise ValueError("its text is not what was written (checksum)")
     return bare
+
+
+def packed(header: dict[str, Any], blob: bytes) -> bytes:
+    """Return a line of JSON and the bytes that follow it, in a form that `unpacked` takes back whole or not at all."""
+    text = json.dumps(header)
+    digest = hashlib.sha256(text.encode() + blob).hexdigest()
+    return f"{digest} {len(blob)} {text}\n".encode() + blob
+
+
+def unpacked(data: bytes) -> tuple[dict[str, Any], bytes, bytes]:
+    """Return header and bytes of what `packed` made, and what follows them. Raises ValueError when it is damaged."""
+    line, _, rest = data.partition(b"\n")
+    digest, size, text = [*line.split(b" ", 2), b"", b"", b""][:3]
+    blob = rest[: int(size)] if size.isdigit() else b""
+    if hashlib.sha256(text + blob).hexdigest().encode() != digest:
+        raise ValueError("its checksum is wrong")
+    return json.loads(text), blob, rest[len(blob) :]
 
 
 def _digest(text: str) -> str:

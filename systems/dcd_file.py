@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from systems.atomic_file import storage_error, write_whole
-from systems.checksums import Checksums
 from systems.dcd_layout import DcdLayout, cell_blocks, cells_of_blocks, header_bytes, step_fields, title_bytes
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.frame_store import (
@@ -26,20 +25,19 @@ from systems.frame_store import (
     damage_reported,
     get_json,
     open_hdf5,
-    refuse_existing,
-    write_new,
+    read_run_id,
 )
 from systems.hdf5_file import check_read, read_checksums, read_columns
 from systems.pdb_text import pdb_text
 from systems.scene import Scene
 from systems.trajectory_types import (
     Float32Array,
-    Float64Array,
     FrameBlock,
     TrajectoryReader,
     TrajectoryWriter,
     check_same_topology,
 )
+from systems.whole_file import create_whole, refuse_existing, storage_error, write_whole
 
 _OUR_PDB = b"REMARK   1 surromd scene"
 
@@ -52,11 +50,13 @@ def companions(path: Path) -> tuple[Path, Path]:
 class DcdWriter(TrajectoryWriter):
     """Writes a DCD and its companions; see `systems.trajectory.open_writer` for the arguments and errors."""
 
-    def __init__(self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool) -> None:
+    def __init__(
+        self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool, run_id: str = ""
+    ) -> None:
         self.path, self.scene, self._fd = path, scene, -1
         self._pdb, self._meta = companions(path)
         if not append:
-            self._create(record, overwrite)
+            self._create(record, overwrite, run_id)
         if not self._meta.exists():
             raise TrajectoryError(f"{path} has no {self._meta.name} beside it and cannot be continued.")
         self._store = FrameStore(self._meta)
@@ -65,7 +65,7 @@ class DcdWriter(TrajectoryWriter):
             layout = DcdLayout.read(path)
             if layout != DcdLayout.ours(scene.n_atoms, layout.first_frame_at, has_cell=scene.cell_nm is not None):
                 raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
-            _check_against_meta(path, layout, self._store.n_frames, self._store.largest_append)
+            _check_against_meta(path, layout, self._store.n_frames, completed=False)
             self._layout, self.n_frames = layout, self._store.n_frames
             self.last_time_ps, self._first_times = self._store.last_time_ps, self._store.first_times_ps()
             new = {key: value for key, value in record.items() if key not in self._store.record}
@@ -80,7 +80,7 @@ class DcdWriter(TrajectoryWriter):
             self.close()
             raise
 
-    def _create(self, record: dict[str, Any], overwrite: bool) -> None:
+    def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
         for file in (self.path, self._meta, self._pdb):
             refuse_existing(file, overwrite)
         if self._pdb.exists() and not self._pdb.read_bytes().startswith(_OUR_PDB):
@@ -94,13 +94,14 @@ class DcdWriter(TrajectoryWriter):
                 record,
                 lambda file: add_column(file, "time", 0, "<f8"),
                 overwrite=overwrite,
+                run_id=run_id,
                 checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
             )
             made.append(self._meta)
-            write_new(self._pdb, topology)
+            create_whole(self._pdb, topology)
             made.append(self._pdb)
             header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
-            write_new(self.path, header + title_bytes(self.scene.n_atoms))
+            create_whole(self.path, header + title_bytes(self.scene.n_atoms))
         except SurromdError:
             for file in made:
                 file.unlink(missing_ok=True)
@@ -113,7 +114,6 @@ class DcdWriter(TrajectoryWriter):
             raise InputError(f"{self.path}: a DCD holds positions only; write an .h5 to keep velocities or forces.")
         if block.cell_nm is not None and not self._layout.has_cell:
             raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
-        self._store.announce(len(block))
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         angstrom = block.positions_nm * np.float32(10.0)
         stored: dict[str, npt.NDArray[Any]] = {FRAMES: angstrom}
@@ -128,11 +128,13 @@ class DcdWriter(TrajectoryWriter):
             write_whole(self._fd, frames.tobytes(), self._layout.offset(self.n_frames))
             self._first_times = np.concatenate([first_times, block.time_ps])[:2]
             self._set_length(self.n_frames + len(block))
+            os.fsync(self._fd)
             self._store.append(block, {}, stored)
         except BaseException as error:
-            # Taking space back needs none, so this also succeeds on a full disk.
+            # Taking space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
             self._first_times = first_times
-            self._set_length(self.n_frames)
+            with suppress(OSError):
+                self._set_length(self.n_frames)
             failed = self._store.failed(error) if isinstance(error, OSError) else error
             self.close()
             raise failed from error
@@ -155,23 +157,11 @@ class DcdWriter(TrajectoryWriter):
             raise self._store.failed(error) from error
         self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
 
-    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
-        self._refuse_closed()
-        return self._store.series()
-
-    def update_record(self, entries: dict[str, Any]) -> None:
-        self._refuse_closed()
-        self._store.update_record(entries)
-
-    def _refuse_closed(self) -> None:
-        if self._fd < 0:
-            raise InputError(f"{self.path} is closed; open it again with append=True.")
-
     def close(self) -> None:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-        self._store.close()
+        super().close()
 
 
 class DcdReader(TrajectoryReader):
@@ -184,7 +174,6 @@ class DcdReader(TrajectoryReader):
     def __init__(self, path: Path, top: Path | None) -> None:
         self.path = path
         self._layout = layout = DcdLayout.read(path)
-        self._checksums: dict[str, Checksums] = {}
         self.n_atoms = layout.n_atoms
         pdb, meta = companions(path)
         if meta.exists():
@@ -193,11 +182,10 @@ class DcdReader(TrajectoryReader):
                     raise TrajectoryError(f"{meta} is not the record of {path.name}; move it to read the DCD alone.")
                 self.n_frames = consistent_length(file, meta)
                 self.time_ps, self.flags, self.chunk_idx, self.scalars = read_columns(file, meta, self.n_frames)
-                self._checksums = read_checksums(file, self.n_frames)
+                self.checksums, self.run_id = read_checksums(file, self.n_frames), read_run_id(file)
                 self.record = get_json(file, "surromd/record")
                 self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
-                in_flight = int(file["surromd"].attrs["largest_append"])
-            _check_against_meta(path, layout, self.n_frames, in_flight)
+            _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
             if top is not None:
                 _scene_from_top(top, path, self.n_atoms)
         else:
@@ -226,7 +214,7 @@ class DcdReader(TrajectoryReader):
                 bad = start + stride * int(np.argmin(lengths))
                 raise TrajectoryError(f"{self.path} is damaged at frame {bad}; restore it from a whole copy.")
             out[:, :, axis] = frames[f"x{axis}"]
-        check_read(self, self._checksums, FRAMES, out, slice(start, stop, stride))
+        check_read(self, FRAMES, out, slice(start, stop, stride))
         out *= np.float32(0.1)
         return out
 
@@ -236,17 +224,17 @@ class DcdReader(TrajectoryReader):
         if not self._layout.has_cell:
             return None
         blocks = np.asarray(self._frames["cell"][start:stop:stride])
-        check_read(self, self._checksums, CELLS, blocks, slice(start, stop, stride))
+        check_read(self, CELLS, blocks, slice(start, stop, stride))
         return cells_of_blocks(blocks, self._layout.byte_order)
 
     def close(self) -> None:
         self._frames = None
 
 
-def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, in_flight: int) -> None:
-    """Raise TrajectoryError unless the DCD holds the recorded frames and at most one append in flight more."""
+def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, completed: bool) -> None:
+    """Raise TrajectoryError unless the DCD holds the recorded frames; behind them a run may have some in flight."""
     extra = layout.file_bytes - layout.offset(n_frames)
-    if extra < 0 or extra > in_flight * layout.frame_dtype.itemsize:
+    if extra < 0 or (extra and completed):
         whole = (layout.file_bytes - layout.first_frame_at) // layout.frame_dtype.itemsize
         raise TrajectoryError(
             f"{path} holds {whole} whole frames where {companions(path)[1].name} records {n_frames}: one of them is "

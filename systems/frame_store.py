@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-import os
+import uuid
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,11 +20,12 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.atomic_file import AtomicFile, storage_error, write_whole
-from systems.checksums import frame_checksums, sealed, unsealed
+from systems.atomic_file import AtomicFile, journal_path
+from systems.checksums import checksum_rows, frame_checksums, frames_digest, sealed, unsealed
 from systems.errors import InputError, StorageError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory_types import FrameBlock
+from systems.whole_file import create_whole, refuse_existing, storage_error
 
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048
@@ -102,10 +103,6 @@ def get_json(file: h5py.File, name: str) -> Any:
     return json.loads(unsealed(text) if CHECKSUMS in file else text)
 
 
-def _sealed_as_the_file_is(file: h5py.File, text: str) -> str:
-    return sealed(text) if CHECKSUMS in file else text  # files of earlier versions stay readable by those
-
-
 def create_store(
     path: Path,
     scene: Scene,
@@ -113,20 +110,22 @@ def create_store(
     lay_out: Callable[[h5py.File], None],
     *,
     overwrite: bool,
+    run_id: str = "",
     checksums: Sequence[str] = (FRAMES,),
 ) -> None:
     """Create the file with all headers and no frames; it appears under its name only when it is whole.
 
-    `lay_out` adds the format's own groups and columns, `checksums` names what each frame has one of. Raises
-    TrajectoryError when the file exists and `overwrite` is False, InputError for a record that is not JSON,
-    StorageError when the disk refuses.
+    `lay_out` adds the format's own groups and columns, `checksums` names what each frame has one of, `run_id` says
+    whose file it is (a number of its own by default). Raises TrajectoryError when the file exists and `overwrite` is
+    False, InputError for a record that is not JSON, StorageError when the disk refuses.
     """
     refuse_existing(path, overwrite)
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         group = file.create_group("surromd")
         group.attrs["format_version"] = np.int64(FORMAT_VERSION)
-        group.attrs["largest_append"] = np.int64(0)
+        # Kept as raw data, at a place that stays: by it a journal knows its file.
+        group["run_id"] = np.bytes_((run_id or uuid.uuid4().hex).encode("ascii"))
         group.create_group("scalars")
         set_text(group, "record", sealed(json_text(record, "record")), _RECORD_BYTES)
         set_text(group, "scene", sealed(json_text(scene.to_dict(), "scene")))
@@ -134,36 +133,22 @@ def create_store(
         for name in checksums:
             add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
         lay_out(file)
-    write_new(path, image.getvalue())
+    create_whole(path, image.getvalue())
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise TrajectoryError when `path` exists and must not be replaced."""
-    if path.exists() and not overwrite:
-        raise TrajectoryError(f"{path} exists already; overwrite it, resume it, or choose another name.")
+def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
+    """Open an HDF5 file: to read, as it was before a transaction that did not end, or through `source`, to write.
 
-
-def write_new(path: Path, data: bytes) -> None:
-    """Write a whole file under a temporary name and rename it. Raises StorageError; nothing half-written stays."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-        try:
-            write_whole(descriptor, data, 0)
-        finally:
-            os.close(descriptor)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise storage_error(path, error, "no file was made") from error
-
-
-def open_hdf5(path: Path, source: Any = None, mode: str = "r") -> h5py.File:
-    """Open an HDF5 file. Raises TrajectoryError, in one line, when it is absent, cut short or no HDF5 file."""
+    Raises TrajectoryError, in one line, when it is absent, cut short or no HDF5 file.
+    """
     if not path.exists():
         raise TrajectoryError(f"{path} does not exist.")
+    seen: Any = source or path
+    if source is None and journal_path(path).exists():
+        before = AtomicFile(path, writable=False)
+        seen = before if before.is_unfinished else path
     try:
-        return h5py.File(path if source is None else source, mode)
+        return h5py.File(seen, "r" if source is None else "r+")
     except (OSError, RuntimeError, ValueError) as error:
         text = str(error)
         if "truncated" in text:
@@ -189,12 +174,12 @@ def column_names(file: h5py.File) -> list[str]:
 def consistent_length(file: h5py.File, path: Path) -> int:
     """Return the number of frames that every column holds.
 
-    Columns may differ by one append in flight (a writer that was killed); the frames behind the shortest are not
-    counted. Raises TrajectoryError for any other difference and for blocks of data that are missing.
+    In files of earlier versions, which had no journal, they may differ by one append that was in flight when a writer
+    was killed. Raises TrajectoryError for any other difference and for blocks of data that are missing.
     """
     columns = {name: file[name] for name in column_names(file)}
     lengths = {name: int(column.shape[0]) for name, column in columns.items()}
-    in_flight = int(file["surromd"].attrs["largest_append"]) if "surromd" in file else 0
+    in_flight = int(file["surromd"].attrs.get("largest_append", 0)) if "surromd" in file else 0
     shortest, longest = min(lengths.values()), max(lengths.values())
     if longest - shortest > in_flight:
         listed = ", ".join(f"/{name} {n}" for name, n in lengths.items())
@@ -220,19 +205,24 @@ def columns_with_frames(
     return given if flags is None else given | {"flags": flags}
 
 
+def read_run_id(file: h5py.File) -> str:
+    """Return the number of the run that wrote a file; nothing of other programs and earlier versions."""
+    return file["surromd/run_id"][()].decode("ascii") if "surromd/run_id" in file else ""
+
+
 class FrameStore:
     """Appends to a file made by `create_store`, one transaction per append.
 
-    Raises TrajectoryError when the file is damaged, not ours, or written by another process.
+    Raises TrajectoryError when the file is damaged or not ours (this version's), StorageError.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         open_hdf5(path).close()
-        self._atomic = AtomicFile(path)
+        self._atomic = AtomicFile(path, writable=True)
         self._columns: dict[str, h5py.Dataset] = {}
         try:
-            self.file = open_hdf5(path, self._atomic, "r+")
+            self.file = open_hdf5(path, self._atomic)
         except BaseException:
             self._atomic.close()
             raise
@@ -241,8 +231,6 @@ class FrameStore:
         try:
             with damage_reported(path):
                 self._read_headers()
-            if any(len(column) != self.n_frames for column in self._columns.values()):
-                self.truncate(self.n_frames)  # what a crash left behind the last whole append
         except BaseException:
             self.close()
             raise
@@ -250,13 +238,25 @@ class FrameStore:
     def _read_headers(self) -> None:
         if "surromd" not in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
+        self.run_id = read_run_id(self.file)
+        if not self.run_id:
+            raise TrajectoryError(f"{self.path} was written by an earlier version of surromd, which may continue it.")
+        run_id = self.file["surromd/run_id"]
+        self._atomic.key = (run_id.id.get_offset(), run_id.dtype.itemsize)
         self.scene = Scene.from_dict(get_json(self.file, "surromd/scene"))
         self.record: dict[str, Any] = get_json(self.file, "surromd/record")
         self.n_frames = consistent_length(self.file, self.path)
-        self.largest_append = int(self.file["surromd"].attrs["largest_append"])
         self._columns.update({name: self.file[name] for name in column_names(self.file)})
         if not {"time", "surromd/chunk_idx"} <= set(self._columns):
             raise TrajectoryError(f"{self.path} is damaged: it lacks columns.")
+        self._digest_again()
+
+    def _digest_again(self) -> None:
+        self._digest = frames_digest({name: c[:] for name, c in self._columns.items() if name.startswith(CHECKSUMS)})
+
+    def digest(self) -> str:
+        """Return the hash of all frames written so far, as `frames_digest` makes it of their checksums."""
+        return self._digest.hexdigest()
 
     @property
     def last_time_ps(self) -> float | None:
@@ -281,7 +281,6 @@ class FrameStore:
         """
         n, start = len(block), self.n_frames
         self.check_flags(block)
-        self.announce(n)
         self._need_columns(block)
         values: dict[str, npt.NDArray[Any]] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}
         if block.flags is not None:
@@ -297,27 +296,17 @@ class FrameStore:
                 column[start:] = block.scalars.get(name.rpartition("/")[2], np.full(n, np.nan))
         self._commit()
         self.n_frames += n
-
-    def announce(self, n_frames: int) -> None:
-        """Note, before they are written, that up to `n_frames` frames may be in flight. Raises StorageError."""
-        if n_frames > self.largest_append:
-            self.file["surromd"].attrs["largest_append"] = np.int64(n_frames)
-            self._commit()
-            self.largest_append = n_frames
+        self._digest.update(checksum_rows({name: values[name] for name in values if name.startswith(CHECKSUMS)}))
 
     def _need_columns(self, block: FrameBlock) -> None:
-        """Make the columns that a block brings. In a transaction of their own: if its frames could be there before the
-        names of its columns, a reader would take them for frames without."""
+        """Make the columns that a block brings."""
         if not self.n_frames and block.flags is None and self._columns.pop("surromd/flags", None) is not None:
             del self.file["surromd/flags"]
         wanted = {f"surromd/scalars/{name}": "<f8" for name in block.scalars}
         if block.flags is not None:
             wanted["surromd/flags"] = "<u2"
-        missing = [name for name in wanted if name not in self._columns]
-        for name in missing:
+        for name in wanted.keys() - self._columns.keys():
             self._columns[name] = add_column(self.file, name, self.n_frames, wanted[name])
-        if missing:
-            self._commit()
 
     def check_flags(self, block: FrameBlock) -> None:
         """Raise InputError when this block has flags and the frames before have none, or the reverse."""
@@ -330,28 +319,27 @@ class FrameStore:
         """Cut all columns to `n_frames`. Raises InputError when there are fewer, StorageError."""
         if not 0 <= n_frames <= self.n_frames:
             raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
-        usual = self.largest_append
-        self.announce(self.n_frames - n_frames)
+        if n_frames == self.n_frames:
+            return
         for column in self._columns.values():
             column.resize(n_frames, axis=0)
-        self._commit(shrinks=True)
-        self.n_frames, self.largest_append = n_frames, usual
-        self.file["surromd"].attrs["largest_append"] = np.int64(usual)
         if n_frames == 0 and self._columns.pop("surromd/flags", None) is not None:
             del self.file["surromd/flags"]
         self._commit()
+        self.n_frames = n_frames
+        self._digest_again()
 
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
         merged = {**self.record, **entries}
-        set_text(self.file["surromd"], "record", _sealed_as_the_file_is(self.file, json_text(merged, "record")))
+        set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
         self._commit()
         self.record = merged
 
-    def _commit(self, *, shrinks: bool = False) -> None:
+    def _commit(self) -> None:
         self.file.flush()
         try:
-            self._atomic.commit(shrinks=shrinks)
+            self._atomic.commit()
         except OSError as error:
             raise self.failed(error) from error
 

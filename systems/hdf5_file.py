@@ -35,6 +35,7 @@ from systems.frame_store import (
     get_json,
     open_hdf5,
     program_version,
+    read_run_id,
 )
 from systems.scene import Scene
 from systems.trajectory_types import (
@@ -64,6 +65,7 @@ class Hdf5Writer(TrajectoryWriter):
         append: bool,
         overwrite: bool,
         columns: Sequence[str] = (),
+        run_id: str = "",
     ) -> None:
         self.path, self.scene = path, scene
         check_wanted(columns, path)
@@ -75,6 +77,7 @@ class Hdf5Writer(TrajectoryWriter):
                 record,
                 lambda file: _lay_out(file, scene, columns),
                 overwrite=overwrite,
+                run_id=run_id,
                 checksums=names,
             )
         self._store = FrameStore(path)
@@ -108,21 +111,6 @@ class Hdf5Writer(TrajectoryWriter):
         self._store.truncate(n_frames)
         self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
 
-    def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
-        self._refuse_closed()
-        return self._store.series()
-
-    def update_record(self, entries: dict[str, Any]) -> None:
-        self._refuse_closed()
-        self._store.update_record(entries)
-
-    def _refuse_closed(self) -> None:
-        if not self._store.file:
-            raise InputError(f"{self.path} is closed; open it again with append=True.")
-
-    def close(self) -> None:
-        self._store.close()
-
 
 class Hdf5Reader(TrajectoryReader):
     """Reads our own HDF5 trajectories and MDTraj's. Raises TrajectoryError when the file is damaged or incomplete."""
@@ -148,7 +136,7 @@ class Hdf5Reader(TrajectoryReader):
         self.n_atoms = int(self._coordinates.shape[1])
         columns = read_columns(self._file, self.path, self.n_frames)
         self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
-        self._checksums = read_checksums(self._file, self.n_frames)
+        self.checksums, self.run_id = read_checksums(self._file, self.n_frames), read_run_id(self._file)
         self.times_known = "surromd" in self._file or "time" in self._file
         self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
         self.scene = self._read_scene()
@@ -166,7 +154,7 @@ class Hdf5Reader(TrajectoryReader):
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._gather(self._coordinates, start, stop, stride)
-        check_read(self, self._checksums, FRAMES, frames, slice(start, stop, stride))
+        check_read(self, FRAMES, frames, slice(start, stop, stride))
         return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
 
     def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
@@ -175,7 +163,7 @@ class Hdf5Reader(TrajectoryReader):
         if name not in self._file:
             return None
         values = self._gather(self._file[name], start, stop, stride)
-        check_read(self, self._checksums, name, values, slice(start, stop, stride))
+        check_read(self, name, values, slice(start, stop, stride))
         return values
 
     def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
@@ -184,7 +172,7 @@ class Hdf5Reader(TrajectoryReader):
         with damage_reported(self.path):
             cells = read_cells(self._file, start, stop, stride)
         if cells is not None:
-            check_read(self, self._checksums, CELLS, cells, slice(start, stop, stride))
+            check_read(self, CELLS, cells, slice(start, stop, stride))
         return cells
 
     def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
@@ -236,14 +224,12 @@ def read_checksums(file: h5py.File, n_frames: int) -> dict[str, Checksums]:
     return {name: column[:n_frames] for name, column in file.get(CHECKSUMS, {}).items()}
 
 
-def check_read(
-    reader: TrajectoryReader, checksums: dict[str, Checksums], name: str, stored: npt.NDArray[Any], frames: slice
-) -> None:
+def check_read(reader: TrajectoryReader, name: str, stored: npt.NDArray[Any], frames: slice) -> None:
     """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written.
 
     With positions (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars.
     """
-    if name not in checksums or not len(stored):
+    if name not in reader.checksums or not len(stored):
         return
     columns = {name: stored}
     if name == FRAMES and reader.chunk_idx is not None:
@@ -251,7 +237,7 @@ def check_read(
         scalars = {key: values[frames] for key, values in reader.scalars.items()}
         columns |= columns_with_frames(reader.time_ps[frames], reader.chunk_idx[frames], flags, scalars)
     found = frame_checksums(columns)
-    check_frames_read(reader.path, checksums[name][frames], found, frames.start, frames.step)
+    check_frames_read(reader.path, reader.checksums[name][frames], found, frames.start, frames.step)
 
 
 def _nm_per_unit(dataset: h5py.Dataset, path: Path) -> float:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from systems.atomic_file import journal_path
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory_types import FrameBlock, TrajectoryReader, TrajectoryWriter
 
-__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "open_trajectory", "open_writer"]
+__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
 
 _HDF5 = (".h5", ".hdf5")
 
@@ -23,13 +25,16 @@ def open_writer(
     append: bool = False,
     overwrite: bool = False,
     columns: Sequence[str] = (),
+    run_id: str = "",
+    claimed: bool = False,
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5` or `.dcd`), or continue one with `append=True`.
 
     A DCD is accompanied by `NAME.pdb` (topology) and `NAME.meta.h5` (record, exact times, flags). With `append` the
     file must be ours and hold the same ordered topology; what it records stays, new keys of `record` are added, and an
     append that a crash interrupted is cut off. `record` must be JSON-able. `columns`: what each frame has beside
-    positions, 'velocities' and 'forces' (HDF5 only); the cell of a periodic scene is kept in any case.
+    positions, 'velocities' and 'forces' (HDF5 only); the cell of a periodic scene is kept in any case. `run_id`: whose
+    file it is. The writer holds the file's claim (systems.claim), unless its caller does (`claimed`).
     Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
     `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
     process; StorageError when the folder is missing, not writable or full.
@@ -41,17 +46,40 @@ def open_writer(
         raise TrajectoryError(f"{path} does not exist and cannot be continued.")
     if path.name.endswith(".meta.h5"):
         raise InputError(f"{path}: names ending in .meta.h5 are kept for the companions of DCD files; choose another.")
-    if path.suffix.lower() in _HDF5:
-        from systems.hdf5_file import Hdf5Writer
+    if path.suffix.lower() == ".dcd" and columns:
+        raise InputError(f"{path}: a DCD holds positions only; write an .h5 to keep {' and '.join(columns)}.")
+    if path.suffix.lower() not in (*_HDF5, ".dcd"):
+        raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
+    from systems.claim import Claim
+    from systems.dcd_file import DcdWriter
+    from systems.hdf5_file import Hdf5Writer
 
-        return Hdf5Writer(path, scene, record, append=append, overwrite=overwrite, columns=columns)
-    if path.suffix.lower() == ".dcd":
-        from systems.dcd_file import DcdWriter
+    claim = None if claimed else Claim(path)
+    how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
+    try:
+        writer: TrajectoryWriter
+        if path.suffix.lower() == ".dcd":
+            writer = DcdWriter(path, scene, record, **how)
+        else:
+            writer = Hdf5Writer(path, scene, record, columns=columns, **how)
+    except BaseException:
+        if claim is not None:
+            claim.close()
+        raise
+    if claim is not None:
+        writer.claim = claim
+        weakref.finalize(writer, claim.close)
+    return writer
 
-        if columns:
-            raise InputError(f"{path}: a DCD holds positions only; write an .h5 to keep {' and '.join(columns)}.")
-        return DcdWriter(path, scene, record, append=append, overwrite=overwrite)
-    raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
+
+def companions(path: Path) -> tuple[Path, ...]:
+    """Return the paths of what is written beside a trajectory."""
+    if path.suffix.lower() != ".dcd":
+        return (journal_path(path),)
+    from systems import dcd_file
+
+    pdb, meta = dcd_file.companions(path)
+    return pdb, meta, journal_path(meta)
 
 
 def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:

@@ -6,17 +6,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from systems.checksums import Checksums, frames_digest
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 
+if TYPE_CHECKING:
+    from systems.claim import Claim
+    from systems.frame_store import FrameStore
+
 Float32Array = npt.NDArray[np.float32]
 Float64Array = npt.NDArray[np.float64]
+_VERIFIED_AT_ONCE = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,22 @@ class TrajectoryWriter(ABC):
     scene: Scene
     n_frames: int
     last_time_ps: float | None
+    claim: Claim | None = None
+    _store: FrameStore
+
+    @property
+    def run_id(self) -> str:
+        """The number of the run whose file this is."""
+        return self._store.run_id
+
+    def digest(self) -> str:
+        """Return the hash of all frames written so far."""
+        return self._store.digest()
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What the file says of its frames."""
+        return self._store.record
 
     def append(
         self,
@@ -106,17 +128,25 @@ class TrajectoryWriter(ABC):
     def truncate(self, n_frames: int) -> None:
         """Cut the file to its first `n_frames` frames, to resume from there. Raises InputError, StorageError."""
 
-    @abstractmethod
     def series(self) -> tuple[Float64Array, dict[str, Float64Array]]:
         """Return the times `(n_frames,)` ps and the scalars by name of all frames written so far."""
+        self._refuse_closed()
+        return self._store.series()
 
-    @abstractmethod
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge JSON-able `entries` into the record (top-level keys are replaced). Raises InputError, StorageError."""
+        self._refuse_closed()
+        self._store.update_record(entries)
 
-    @abstractmethod
+    def _refuse_closed(self) -> None:
+        if not self._store.file:
+            raise InputError(f"{self.path} is closed; open it again with append=True.")
+
     def close(self) -> None:
         """Close the file; twice does no harm."""
+        self._store.close()
+        if self.claim is not None:
+            self.claim.close()
 
     def __enter__(self) -> TrajectoryWriter:
         return self
@@ -163,7 +193,8 @@ class TrajectoryWriter(ABC):
 class TrajectoryReader(ABC):
     """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say.
 
-    `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames.
+    `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames. `run_id` is
+    the number of the run that wrote the file, and `checksums` are those of its frames `(n_frames,)`, where it has them.
     """
 
     path: Path
@@ -176,6 +207,8 @@ class TrajectoryReader(ABC):
     chunk_idx: npt.NDArray[np.int32] | None
     scalars: dict[str, Float64Array]
     times_known: bool = True
+    run_id: str = ""
+    checksums: Mapping[str, Checksums] = MappingProxyType({})
 
     def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
         """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).
@@ -186,6 +219,17 @@ class TrajectoryReader(ABC):
         if first >= last:
             return np.empty((0, self.n_atoms, 3), dtype=np.float32)
         return self._read(first, last, step)
+
+    def verify(self, n_frames: int) -> None:
+        """Read all that is kept of the first frames. Raises TrajectoryError when it is not what was written."""
+        for start in range(0, n_frames, _VERIFIED_AT_ONCE):
+            stop = min(start + _VERIFIED_AT_ONCE, n_frames)
+            for read in (self.read, self.read_velocities, self.read_forces, self.read_cells):
+                read(start, stop)
+
+    def digest(self, n_frames: int) -> str:
+        """Return the hash that the writer of the first frames had of them (`TrajectoryWriter.digest`)."""
+        return frames_digest({name: values[:n_frames] for name, values in self.checksums.items()}).hexdigest()
 
     def read_velocities(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array | None:
         """Return velocities `(n, n_atoms, 3)` nm/ps, None when the file holds none. Frames and errors as in `read`."""

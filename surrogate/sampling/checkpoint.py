@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import zipfile
 import zlib
@@ -15,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.account import Tally
+from systems.checkpoint import Checkpoint, write_checkpoint
 from systems.errors import InputError
-from systems.whole_file import create_whole
 
 Float32Array = npt.NDArray[np.float32]
 
-_FORMAT = 2
 # What zipfile and NumPy raise on files that are damaged, or made to harm; nothing in them is ever run.
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
                OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
@@ -48,55 +46,30 @@ class Progress:
     tallies: list[Tally] = field(default_factory=list)
 
 
-def checkpoint_path(out: Path) -> Path:
-    """Return where the checkpoint of a rollout stands whose first file is `out`."""
-    return out.with_name(out.name + ".checkpoint")
-
-
-def write_checkpoint(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all. Raises StorageError."""
+def save_progress(path: Path, progress: Progress, header: dict[str, Any], *, before: bytes = b"") -> bytes:
+    """Write a checkpoint whole or not at all; the rest as `systems.checkpoint.write_checkpoint`."""
     arrays: dict[str, Any] = {k: v for k, v in vars(progress).items() if isinstance(v, np.ndarray)}
     plain = {k: v for k, v in asdict(progress).items() if k not in arrays}
     buffer = io.BytesIO()
-    header = {"format": _FORMAT, "settings": settings, "progress": plain}
-    np.savez(buffer, header=np.array(json.dumps(header)), **arrays)
-    create_whole(path, lambda temporary: _write_bytes(temporary, buffer.getvalue()))
+    np.savez(buffer, **arrays)
+    return write_checkpoint(path, {**header, "progress": plain}, buffer.getvalue(), before=before)
 
 
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
+def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) -> Progress:
+    """Return where a rollout of these settings stood, or of any (None), by one state in its checkpoint `path`.
 
-
-def precision_of(path: Path) -> str:
-    """Return the precision, 'fp32' or 'bf16', of the rollout that a checkpoint is of; 'auto' where it cannot be read.
-
-    A rollout that goes on keeps it, whatever another processor would choose.
+    Raises InputError when it cannot be read, or the rollout was started with other settings.
     """
+    header, blob = state
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return "bf16" if json.loads(str(stored["header"]))["settings"]["bf16"] else "fp32"
-    except UNREADABLE:
-        return "auto"
-
-
-def read_checkpoint(path: Path, settings: dict[str, Any] | None) -> Progress:
-    """Return where a rollout of these settings stood, or of any (None).
-
-    Raises InputError when the file cannot be read, or the rollout was started with other settings.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"]))
-            arrays = {key: stored[key] for key in stored.files if key != "header"}
-        known, plain = header["settings"], header.get("progress", {})
-        of_this_version = header.get("format") == _FORMAT
-        tallies = [Tally(**tally) for tally in plain.pop("tallies", [])]
-        progress = Progress(**arrays, **plain, tallies=tallies) if of_this_version else None
+        with np.load(io.BytesIO(blob), allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        known, plain = header["settings"], dict(header["progress"])
+        tallies = [Tally(**tally) for tally in plain.pop("tallies")]
+        progress = Progress(**arrays, **plain, tallies=tallies)
     except UNREADABLE as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"checkpoint {path} cannot be read ({reason}); start again with --overwrite.") from error
-    if progress is None:
-        raise InputError(f"checkpoint {path} is of another version of surromd; start again with --overwrite.")
     wanted = known if settings is None else settings
     for key in {**known, **wanted}:
         was, now = known.get(key), wanted.get(key)

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.account import Clock, Tally
-from surrogate.sampling.checkpoint import Progress, checkpoint_path, precision_of, read_checkpoint, write_checkpoint
+from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.domain import fit_weights
@@ -22,11 +22,14 @@ from surrogate.sampling.interventions import Chunk, Interventions
 from surrogate.sampling.plan import Plan, settle_plan
 from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
 from surrogate.sampling.settings import GUARDS, RolloutConfig
+from systems.checkpoint import FLUSH_SHARE, checkpoint_path, last_supported, new_header, read_checkpoints, writer_at
+from systems.checksums import packed
+from systems.claim import claimed_outputs
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 from systems.selection import part_of
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory import open_trajectory
 from systems.trajectory_types import TrajectoryWriter
 
 if TYPE_CHECKING:
@@ -69,51 +72,69 @@ def rollout(
         save_every_ps=config.save_every_ps,
     )
     state_path = checkpoint_path(outs[0])
-    begun = resume and config.precision == "auto" and state_path.exists()
+    precision = config.precision
+    if resume and precision == "auto" and state_path.exists():
+        # A rollout that goes on keeps it, whatever another processor would choose.
+        precision = "bf16" if read_checkpoints(state_path)[0][0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(
         weights,
         solver_steps=config.solver_steps,
         solver=config.solver,
-        precision=precision_of(state_path) if begun else config.precision,
+        precision=precision,
         compile=config.compile,
         stiff=config.stiff,
     )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
-    if resume and not state_path.exists() and _just_begun(outs):
-        resume, overwrite = False, True
-    resuming = resume and all(p.exists() for p in outs)
-    if resume and not resuming and not overwrite:
-        _refuse_missing(outs, state_path)
-    if resuming and not state_path.exists():
-        return _already_complete(outs, plan)
-    state = read_checkpoint(state_path, plan.settings) if resuming else _start(plan, sampler, len(outs))
-    sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
-    clock = Clock(state.seconds)
     checks = Guard(weights.domain)
 
     with ExitStack() as stack:
+        asked_to_stop = stack.enter_context(deferred_interrupt())
+        stack.enter_context(claimed_outputs(outs, may_exist=resume or overwrite))
+        if resume and not state_path.exists() and any(path.exists() for path in outs):
+            return _already_complete(outs, plan)
+        kept = last_supported(state_path, outs) if resume and state_path.exists() else None
+        state = _start(plan, sampler, len(outs)) if kept is None else progress_of(state_path, kept, plan.settings)
+        header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
+        last_state = packed(*kept) if kept else b""
+        if plan.n_frames < header.get("n_frames_wanted", 0):
+            raise InputError(
+                f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
+                "as much time or more, or write to another file."
+            )
+        header |= {"settings": plan.settings, "n_frames_wanted": plan.n_frames}
+        sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
+        clock = Clock(state.seconds)
         coupling = None
         if config.needs_openmm:
             coupling = Coupling(weights)
             stack.callback(coupling.close)
         engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
                                plan.n_between)  # fmt: skip
-        asked_to_stop = stack.enter_context(deferred_interrupt())
-        writers = _open_writers(stack, plan, sampler, checks, outs, append=resuming, overwrite=overwrite)
-        if resuming:
-            _cut_back(writers, outs, min(state.steps, plan.n_steps) // plan.stride)
-        else:
-            # Before any frame is written: killed at any later moment, the rollout can be gone on with.
-            write_checkpoint(state_path, state, plan.settings)
+
+        def save() -> None:
+            nonlocal last_state
+            last_state = save_progress(state_path, state, header, before=last_state)
+
+        if not state.steps:
+            # Before there are files, so that a rollout killed at any later moment can be gone on with.
+            save()
+        writers = _open_writers(stack, plan, sampler, checks, outs, header, resumed=kept is not None)
         buffers: list[list[_Block]] = [[] for _ in outs]
         started = time.monotonic() - state.wall_s
-        last_flush = time.monotonic()
+        flushed_at, flushed_s = time.monotonic(), 0.0
         speed = Speed(state.steps, time.monotonic())
 
         def flush() -> None:
+            nonlocal flushed_at, flushed_s
+            began = time.monotonic()
             for writer, buffer in zip(writers, buffers, strict=True):
                 _flush(writer, buffer)
-            write_checkpoint(state_path, state, plan.settings)
+            header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
+            # Of a last chunk frames may be left out: no longer rollout could go on from its end.
+            if state.steps < plan.n_steps:
+                save()
+            flushed_at = time.monotonic()
+            flushed_s = flushed_at - began
 
         while state.steps < plan.n_steps:
             chunk = engine.advance(
@@ -130,9 +151,9 @@ def rollout(
             _buffer(plan, state, chunk, buffers)
             _move_on(state, chunk, sampler)
             complete, stopping = state.steps >= plan.n_steps, asked_to_stop()
-            if complete or stopping or time.monotonic() - last_flush > flush_every_s:
+            pause_s = max(flush_every_s, FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
+            if complete or stopping or time.monotonic() - flushed_at > pause_s:
                 flush()
-                last_flush = time.monotonic()
             if progress is not None:
                 done = min(state.steps // plan.stride, plan.n_frames)
                 progress(done, plan.n_frames, speed.describe(plan, state, len(outs)))
@@ -140,7 +161,9 @@ def rollout(
                 raise KeyboardInterrupt
         state.wall_s = time.monotonic() - started
         close_account(plan, state, checks, sampler, writers, completed=True)
-    state_path.unlink(missing_ok=True)
+        for writer in writers:
+            writer.close()
+        state_path.unlink(missing_ok=True)
     return list(outs)
 
 
@@ -206,47 +229,14 @@ def _flush(writer: TrajectoryWriter, buffer: list[_Block]) -> None:
     buffer.clear()
 
 
-def _open_writers(stack: ExitStack, plan: Plan, sampler: ChunkSampler, checks: Guard, outs: Sequence[Path], *,
-                  append: bool, overwrite: bool) -> list[TrajectoryWriter]:  # fmt: skip
+def _open_writers(stack: ExitStack, plan: Plan, sampler: ChunkSampler, checks: Guard, outs: Sequence[Path],
+                  header: dict[str, Any], *, resumed: bool) -> list[TrajectoryWriter]:  # fmt: skip
     scene = plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
     writers = []
     for k, path in enumerate(outs):
         record = new_record(plan, sampler, checks, replica=k)
-        writer = open_writer(path, scene, record, append=append, overwrite=overwrite)
-        writers.append(stack.enter_context(writer))
+        writers.append(stack.enter_context(writer_at(path, scene, record, header, k, resumed=resumed)))
     return writers
-
-
-def _refuse_missing(outs: Sequence[Path], state_path: Path) -> None:
-    """Raise InputError where a rollout was begun and one of its files has gone."""
-    missing = [path for path in outs if not path.exists()]
-    if state_path.exists() or len(missing) < len(outs):
-        raise InputError(
-            f"{missing[0]} is not there to go on from, though other files of its rollout are; restore it, or start "
-            "again with --overwrite."
-        )
-
-
-def _just_begun(outs: Sequence[Path]) -> bool:
-    """Whether a rollout was stopped after it made files and before it wrote frames into any."""
-    there = [path for path in outs if path.exists()]
-    for path in there:
-        with open_trajectory(path) as reader:
-            if reader.n_frames or reader.record.get("kind") != "rollout":
-                return False
-    return bool(there)
-
-
-def _cut_back(writers: Sequence[TrajectoryWriter], outs: Sequence[Path], n_frames: int) -> None:
-    """Cut files to what the checkpoint knows of. Raises InputError, before any is changed, where one holds less."""
-    for path, writer in zip(outs, writers, strict=True):
-        if writer.n_frames < n_frames:
-            raise InputError(
-                f"{path} holds {writer.n_frames} frames where its checkpoint has seen {n_frames}: it was cut short or "
-                "replaced; restore it, or start again with --overwrite."
-            )
-    for writer in writers:
-        writer.truncate(n_frames)
 
 
 def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:

@@ -17,9 +17,10 @@ import torch
 
 from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling.checkpoint import Progress, checkpoint_path, read_checkpoint, write_checkpoint
+from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
 from surrogate.sampling.rollout import RolloutConfig, rollout
 from surrogate.sampling.simulation import Simulation
+from systems.checkpoint import checkpoint_path, read_checkpoints
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError, WeightsError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
@@ -84,7 +85,7 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
         child.stop(number)
         status, said = child.end()
         assert status in expected, said or status
-        known = read_checkpoint(state, None).steps if state.exists() else 0
+        known = progress_of(state, read_checkpoints(state)[0], None).steps if state.exists() else 0
         assert known >= promised, "what a checkpoint has seen stays"
         # A kill between the append and its checkpoint leaves one chunk more, which is cut and computed again.
         assert all(known <= len(frames_of(path)) <= known + chunk for path in outs if known or path.exists())
@@ -105,13 +106,13 @@ def test_stopped_between_its_first_frames_and_their_checkpoint_it_goes_on(
     class Killed(BaseException):
         pass
 
-    def killed_after_frames(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
+    def killed_after_frames(path: Path, progress: Progress, header: dict[str, Any], *, before: bytes) -> bytes:
         if progress.steps:
             raise Killed
-        write_checkpoint(path, progress, settings)
+        return save_progress(path, progress, header, before=before)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("surrogate.sampling.rollout.write_checkpoint", killed_after_frames)
+        patch.setattr("surrogate.sampling.rollout.save_progress", killed_after_frames)
         rollout(alanine_dipeptide, small_weights, outs, config, flush_every_s=0.0)
     assert len(frames_of(outs[0])) == small_weights.model.n_new
     rollout(alanine_dipeptide, small_weights, outs, config, resume=True)
@@ -209,7 +210,7 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_changed(
     before = [path.read_bytes() for path in half_done]
     for bad in (b"", good[:-40], good[:300] + bytes([good[300] ^ 4]) + good[301:], b"PK\x03\x04 nothing of ours"):
         state.write_bytes(bad)
-        with pytest.raises(InputError, match=r"checkpoint .* cannot be read .*--overwrite"):
+        with pytest.raises(InputError, match=r"checkpoint .* cannot be read .*--overwrite|is none of this version's"):
             rollout(alanine_dipeptide, small_weights, half_done, config, resume=True)
     assert [path.read_bytes() for path in half_done] == before
     state.unlink()
@@ -230,14 +231,14 @@ class _Harm:
 def test_no_code_runs_from_a_hostile_file(tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights) -> None:
     harm, file = tmp_path / "harm", tmp_path / "hostile"
     with open(file, "wb") as handle:
-        np.savez(handle, header=np.array([_Harm(harm)], dtype=object))
+        np.savez(handle, last_frames=np.array([_Harm(harm)], dtype=object))
     with pytest.raises(InputError, match="cannot be read"):
-        read_checkpoint(file, {})
+        progress_of(file, ({"settings": {}, "progress": {}}, file.read_bytes()), {})
     simulation = Simulation(alanine_dipeptide, small_weights, solver_steps=2, precision="fp32")
     for data in (file.read_bytes(), pickle.dumps(_Harm(harm))):
         file.write_bytes(data)
         with pytest.raises(SurromdError):
-            read_checkpoint(file, {})
+            read_checkpoints(file)
         with pytest.raises(SurromdError):
             simulation.loadCheckpoint(str(file))
     torch.save({"model": _Harm(harm)}, tmp_path / "w.safetensors")

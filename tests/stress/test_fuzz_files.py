@@ -14,8 +14,9 @@ import pytest
 
 from surrogate.data.weights import Weights, load_weights
 from surrogate.sampling.account import Tally
-from surrogate.sampling.checkpoint import Progress, read_checkpoint, write_checkpoint
+from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
 from surrogate.sampling.simulation import Simulation
+from systems.checkpoint import read_checkpoints, write_checkpoint
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
@@ -123,11 +124,11 @@ def make_checkpoint(path: Path) -> None:
     last, velocities = (rng.normal(size=shape).astype(np.float32) for shape in ((2, 1, 22, 3), (2, 22, 3)))
     progress = Progress(last, velocities,
                         chunks=9, steps=63, wall_s=1.5, seconds={"draw": 1.0}, tallies=[tally, Tally()])  # fmt: skip
-    write_checkpoint(path, progress, SETTINGS)
+    save_progress(path, progress, {"settings": SETTINGS})
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    found = vars(read_checkpoint(path, SETTINGS))
+    found = vars(progress_of(path, read_checkpoints(path)[0], SETTINGS))
     return {key: value.tobytes() if isinstance(value, np.ndarray) else repr(value) for key, value in found.items()}
 
 
@@ -137,12 +138,6 @@ def read_weights(path: Path) -> dict[str, Any]:
     domain = {**vars(weights.domain), "scene": weights.domain.scene.to_dict()}
     return {"tensors": tensors, "config": weights.model.config.to_dict(), "domain": json.dumps(domain),
             "provenance": weights.provenance}  # fmt: skip
-
-
-def read_reference_checkpoint(path: Path) -> tuple[Any, ...]:
-    from md_reference.checkpoint import read_checkpoint as read
-
-    return read(path)
 
 
 def simulation_reader(scene: Scene, small_weights: Weights) -> Callable[[Path], Any]:
@@ -168,10 +163,8 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
         make_checkpoint(folder / "a.h5.checkpoint")
         return folder / "a.h5.checkpoint", read_progress
     if kind == "reference checkpoint":
-        from md_reference.checkpoint import write_checkpoint as write
-
-        write(folder / "b.h5.checkpoint", {"config": {"seed": 1}, "n_frames": 5}, b"state" * 300, sync=False)
-        return folder / "b.h5.checkpoint", read_reference_checkpoint
+        write_checkpoint(folder / "b.h5.checkpoint", {"config": {"seed": 1}, "n_frames": 5}, b"state" * 300)
+        return folder / "b.h5.checkpoint", read_checkpoints
     if kind == "simulation checkpoint":
         simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
         simulation.step(9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -12,15 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
-from md_reference import checkpoint as module
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.simulate import MDConfig, checkpoint_path, simulate
+from systems.checkpoint import read_checkpoints
 from systems.errors import InputError, SimulationError, StorageError, TrajectoryError, UnitError, UnknownNameError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory import open_trajectory, open_writer
 
 SUFFIXES = [".h5", ".dcd"]
 SHORT = MDConfig(time_ps=4.0, save_every_ps=0.2, equilibrate_ps=0.4, seed=7, platform="Reference")
@@ -117,7 +117,7 @@ def test_resume_after_kill_9_equals_an_uninterrupted_run(
         killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
         assert checkpoint_path(out).exists()
-        header = json.loads(checkpoint_path(out).read_bytes().partition(b"\n")[0])
+        header = {"n_frames": read_checkpoints(checkpoint_path(out))[0][0]["files"][0]["n_frames"]}
         with open_trajectory(out) as reader:
             assert header["n_frames"] <= reader.n_frames < 600
             assert reader.record["completed"] is False
@@ -197,22 +197,82 @@ def test_a_stopped_run_may_become_longer(alanine_dipeptide: Scene, tmp_path: Pat
 
 def test_a_damaged_checkpoint_is_one_clear_line(alanine_dipeptide: Scene, tmp_path: Path) -> None:
     out = interrupted(alanine_dipeptide, tmp_path / "a.h5")
-    header, _, blob = checkpoint_path(out).read_bytes().partition(b"\n")
-    flipped = bytes([blob[300] ^ 1])
-    for damaged in (
-        b"",
-        b"\x00\x01",
-        b"[1]\n" + blob,
-        header,
-        header + b"\n" + blob[: len(blob) // 2],  # OpenMM itself would load this
-        header + b"\n" + blob[:300] + flipped + blob[301:],
-    ):
+    whole = checkpoint_path(out).read_bytes()
+    for damaged in (b"", b"\x00\x01", b"[1]\n" + whole, whole[:60], whole[: len(whole) // 2], flipped(whole, 700)):
         checkpoint_path(out).write_bytes(damaged)
-        with pytest.raises(InputError, match="is damaged") as caught:
+        with pytest.raises(InputError, match=r"cannot be read .*--overwrite|is none of this version's") as caught:
             simulate(alanine_dipeptide, SHORT, out, resume=True)
         assert "\n" not in str(caught.value)
-    checkpoint_path(out).write_bytes(header + b"\n" + blob)
+    checkpoint_path(out).write_bytes(whole)
     simulate(alanine_dipeptide, SHORT, out, resume=True)
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+def test_a_replaced_trajectory_is_refused(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    """Another run's file in its place, or its own, cut short or with another frame: none is gone on with."""
+    out = interrupted(alanine_dipeptide, tmp_path / "a.h5")
+    other = interrupted(alanine_dipeptide, tmp_path / "b.h5", replace(SHORT, seed=8), at_frame=8)
+    mine, theirs = out.read_bytes(), other.read_bytes()
+    before = checkpoint_path(out).read_bytes()
+    with h5py.File(tmp_path / "a.h5") as file:
+        frame = file["coordinates"].id.get_chunk_info(0).byte_offset
+    for bad, said in ((theirs, "is not the file that this run wrote"), (flipped(mine, frame), "damaged at frame 0")):
+        out.write_bytes(bad)
+        with pytest.raises(InputError, match=said) as caught:
+            simulate(alanine_dipeptide, SHORT, out, resume=True)
+        assert "\n" not in str(caught.value)
+        assert out.read_bytes() == bad and checkpoint_path(out).read_bytes() == before
+    out.write_bytes(mine)
+    with open_writer(out, alanine_dipeptide, {}, append=True) as writer:
+        writer.truncate(1)
+    with pytest.raises(InputError, match="holds 1 frames where its checkpoint has seen"):
+        simulate(alanine_dipeptide, SHORT, out, resume=True)
+    out.unlink()
+    with pytest.raises(InputError, match="is not there to go on from"):
+        simulate(alanine_dipeptide, SHORT, out, resume=True)
+    out.write_bytes(mine)
+    simulate(alanine_dipeptide, SHORT, out, resume=True)
+    whole = simulate(alanine_dipeptide, SHORT, tmp_path / "whole.h5")
+    np.testing.assert_array_equal(contents(out)[0], contents(whole)[0])
+
+
+@pytest.mark.parametrize("state", ["stopped", "complete"])
+def test_a_run_does_not_become_shorter(alanine_dipeptide: Scene, tmp_path: Path, state: str) -> None:
+    out = tmp_path / "a.h5"
+    if state == "stopped":
+        interrupted(alanine_dipeptide, out)
+    else:
+        simulate(alanine_dipeptide, SHORT, out)
+    before = out.read_bytes()
+    with pytest.raises(InputError, match="was started for 4 ps and cannot become shorter"):
+        simulate(alanine_dipeptide, replace(SHORT, time_ps=0.4), out, resume=True)
+    assert out.read_bytes() == before
+
+
+def test_a_users_own_file_is_not_taken_for_a_checkpoint(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    out = tmp_path / "a.h5"
+    checkpoint_path(out).write_text("mine")
+    for how in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(InputError, match="is none of this version's"):
+            simulate(alanine_dipeptide, SHORT, out, **how)
+    assert checkpoint_path(out).read_text() == "mine" and not out.exists()
+
+
+def test_frames_behind_the_last_checkpoint_are_not_missed(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    """The last state is of frames that did not reach the medium: the one before is gone on from."""
+    out = interrupted(alanine_dipeptide, tmp_path / "a.h5")
+    states = read_checkpoints(checkpoint_path(out))
+    assert len(states) == 2
+    n_before = states[1][0]["files"][0]["n_frames"]
+    assert 0 < n_before < states[0][0]["files"][0]["n_frames"]
+    with open_writer(out, alanine_dipeptide, {}, append=True) as writer:
+        writer.truncate(n_before)
+    simulate(alanine_dipeptide, SHORT, out, resume=True)
+    whole = simulate(alanine_dipeptide, SHORT, tmp_path / "whole.h5")
+    np.testing.assert_array_equal(contents(out)[0], contents(whole)[0])
 
 
 def test_a_run_without_its_checkpoint_is_not_resumed_blindly(alanine_dipeptide: Scene, tmp_path: Path) -> None:
@@ -305,8 +365,8 @@ def test_no_room_for_the_checkpoint_is_one_clear_line(
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(module.os, "fsync", full)
-    with pytest.raises(StorageError, match="No space left") as caught:
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match=r"disk .* is full") as caught:
         simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("*.new"))

@@ -19,6 +19,7 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import CAUGHT, Guard
 from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.claim import frames_in
 from systems.errors import InputError, SimulationError, UnknownNameError
 from systems.geometry import superpose
 from systems.limits import limits_from_frames
@@ -246,14 +247,13 @@ def test_a_wrong_model_is_stopped_within_one_chunk(
     out = tmp_path / "a.h5"
     with pytest.raises(SimulationError, match=r"replica 0, in its first chunk: .*(valid|passes)"):
         roll(out, scene, weights_of(domain, scatter), guard, n_chunks=50)
-    with open_trajectory(out) as reader:
-        assert reader.record["completed"] is False
-        assert reader.record["interventions"]["chunks_caught"] == 1
-        if guard == "flag":
+    if guard == "flag":
+        with open_trajectory(out) as reader:
+            assert reader.record["completed"] is False
+            assert reader.record["interventions"]["chunks_caught"] == 1
             assert reader.n_frames == N_NEW and (reader.flags & np.uint16(INVALID)).all()
-        else:
-            assert reader.n_frames == 0, "no invalid frame is written"
-    assert list(tmp_path.glob("*.checkpoint")) == []
+        out.unlink()
+    assert list(tmp_path.iterdir()) == [], "no invalid frame is written, and no file without frames is left"
 
 
 @pytest.mark.parametrize(("guard", "mark"), [("resample", DRAWN_AGAIN), ("fallback", MD_AFTER_FAILURE)])
@@ -294,8 +294,7 @@ def test_random_weights_of_a_real_architecture_are_stopped(
     for guard in ("flag", "repair", "fallback"):
         with pytest.raises(SimulationError, match="replica 0, in its first chunk"):
             roll(tmp_path / f"{guard}.h5", scene, weights, guard, n_chunks=50, solver_steps=2)
-        with open_trajectory(tmp_path / f"{guard}.h5") as reader:
-            assert reader.n_frames <= weights.model.n_new
+        assert frames_in(tmp_path / f"{guard}.h5") <= weights.model.n_new
 
 
 def test_off_goes_on_whatever_comes(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:

@@ -16,9 +16,9 @@ from surrogate.data.weights import Weights, load_weights
 from surrogate.describe import describe_file
 from surrogate.models import precision
 from surrogate.models.precision import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
-from surrogate.sampling.checkpoint import checkpoint_path, precision_of
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.checkpoint import checkpoint_path, read_checkpoints
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory
@@ -93,7 +93,7 @@ def test_the_record_says_which_and_why_and_resume_keeps_it(
 
     with pytest.raises(Stop):
         rollout(alanine_dipeptide, small_weights, [begun], config, progress=stop, flush_every_s=0.0)
-    assert precision_of(checkpoint_path(begun)) == "fp32"
+    assert read_checkpoints(checkpoint_path(begun))[0][0]["settings"]["bf16"] is False
     processor(monkeypatch, FAST)
     rollout(alanine_dipeptide, small_weights, [begun], config, resume=True)
     with open_trajectory(begun) as ours, open_trajectory(whole) as undisturbed:
@@ -105,11 +105,6 @@ def test_the_record_says_which_and_why_and_resume_keeps_it(
         assert reader.record["precision"] == "bf16"
         assert "4 times as fast" in reader.record["precision_reason"]
     assert "network in bf16: products in bf16 through avx512_bf16" in describe_file(fresh)["account"][0]
-
-
-def test_a_damaged_checkpoint_leaves_the_choice_open(tmp_path: Path) -> None:
-    (tmp_path / "x.checkpoint").write_bytes(b"nothing of ours")
-    assert precision_of(tmp_path / "x.checkpoint") == "auto"
 
 
 def test_measuring_leaves_random_numbers_alone() -> None:
