@@ -116,6 +116,7 @@ class Preparation(TypedDict, total=False):
     drop_ligand: Annotated[bool, Flag("--drop-ligand", "Leave ligands and ions beside a peptide out.", default=False)]
     drop_water: Annotated[bool, Flag("--drop-water", "Leave the file's waters out, as is usual.", default=False)]
     keep_water: Annotated[bool, Flag("--keep-water", "Keep the file's waters, in explicit solvent.", default=False)]
+    cap_breaks: Annotated[bool, Flag("--cap-breaks", "Close a chain that breaks with ACE and NME.", default=False)]
 
 
 class MDOptions(MDSettings, Preparation, total=False):

@@ -80,6 +80,7 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
         drop_ligand=options["drop_ligand"],
         drop_water=options["drop_water"],
         keep_water=options["keep_water"],
+        cap_breaks=options["cap_breaks"],
     )
     if not quiet:
         for line in prepared.provenance.get("repairs", []):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from systems.bonding import Bonding, Residue, find_bonds
 from systems.clashes import check_contacts
 from systems.errors import InputError, PreparationError
+from systems.gaps import caps_of, find_gaps, refuse_gaps
 from systems.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
 from systems.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
 from systems.mmcif_file import is_component
@@ -36,6 +36,7 @@ def prepare(
     drop_ligand: bool = False,
     drop_water: bool = False,
     keep_water: bool = False,
+    cap_breaks: bool = False,
 ) -> Scene:
     """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
     `sequence:ACE-ALA-NME`.
@@ -44,7 +45,8 @@ def prepare(
     line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
     missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
     them free ions, which no N, O or S of the rest holds, unless `keep_ligand`. Other ions and ligands beside a peptide
-    are refused until one says what becomes of them.
+    are refused until one says what becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
+    with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
     from systems import library
@@ -76,12 +78,25 @@ def prepare(
     if suffix in _OTHER_SUFFIXES:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
-        return prepare_file(path, ph=ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, keep_water=keep_water)
+        return prepare_file(
+            path,
+            ph=ph,
+            keep_ligand=keep_ligand,
+            drop_ligand=drop_ligand,
+            keep_water=keep_water,
+            cap_breaks=cap_breaks,
+        )
     return library.load(text)
 
 
 def prepare_file(
-    path: Path, *, ph: float = 7.0, keep_ligand: bool = False, drop_ligand: bool = False, keep_water: bool = False
+    path: Path,
+    *,
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    keep_water: bool = False,
+    cap_breaks: bool = False,
 ) -> Scene:
     """Return the scene of a PDB or mmCIF file; see `prepare`."""
     if is_mmcif(path) and is_component(text := read_text(path)):
@@ -89,14 +104,16 @@ def prepare_file(
 
         return scene_from_component(text, path)
     try:
-        return _prepare_file(path, ph, keep_ligand=keep_ligand, drop_ligand=drop_ligand, keep_water=keep_water)
+        return _prepare_file(path, ph, keep_ligand, drop_ligand, keep_water, cap_breaks)
     except PreparationError as error:
         if str(path) in str(error):
             raise
         raise PreparationError(f"{path}: {error}") from error
 
 
-def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool, keep_water: bool) -> Scene:
+def _prepare_file(
+    path: Path, ph: float, keep_ligand: bool, drop_ligand: bool, keep_water: bool, cap_breaks: bool
+) -> Scene:
     found = read_structure(path)
     repairs = list(found.notes)
     kept = _choose_alternates(found.atoms, repairs)
@@ -113,8 +130,13 @@ def _prepare_file(path: Path, ph: float, *, keep_ligand: bool, drop_ligand: bool
             others = structure.only(ligands)
             others_bonding = find_bonds(others.atoms, others.conect)
         structure, bonding = rest, find_bonds(rest.atoms, rest.conect, rest.chain_ends)
+    gaps = find_gaps(bonding, structure.chain_ends)
+    if gaps and cap_breaks:
+        caps = caps_of(gaps, structure.atoms, repairs)
+        structure = _Structure([*structure.atoms, *caps], structure.conect, structure.chain_ends)
+        bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
+    refuse_gaps([] if cap_breaks else gaps, structure.atoms)
     repairs += bonding.notes
-    _refuse_gaps(bonding, structure.atoms, structure.chain_ends)
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
     before = _handedness(bonding, atoms)
@@ -214,22 +236,6 @@ def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[
             f"{len(atoms) - len(kept)} atoms left out"
         )
     return kept
-
-
-def _refuse_gaps(bonding: Bonding, atoms: Sequence[AtomRecord], chain_ends: set[int]) -> None:
-    """Neighbours in one chain, neither an end by its atoms, a cap or TER, whose C and N no bond joins."""
-    bonded_n = {i for pair in bonding.peptide_bonds for i in pair}
-    for before, residue in pairwise(bonding.residues):
-        c, n = before.heavy.get("C", -1), residue.heavy.get("N", -1)
-        if min(c, n) < 0 or {c, n} & bonded_n or before.key[0] != residue.key[0] or chain_ends & set(before.atoms):
-            continue
-        names = (before.template.name if before.template else "", residue.template.name if residue.template else "")
-        if all(names) and names[0] not in ("NME", "NH2") and names[1] != "ACE" and "OXT" not in before.heavy:
-            gap = np.linalg.norm(np.subtract(atoms[c].position_angstrom, atoms[n].position_angstrom))
-            raise PreparationError(
-                f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart); "
-                "fill the gap, or end the chain there with caps or a TER record."
-            )
 
 
 def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:

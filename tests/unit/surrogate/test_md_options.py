@@ -38,6 +38,7 @@ TYPED = {
     "keep_ligand": (None, True),
     "drop_ligand": (None, True),
     "drop_water": (None, True),
+    "cap_breaks": (None, True),
     "keep_water": (None, True),
 }
 
