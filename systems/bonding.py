@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from systems.components import PH_OF_FEWEST, Component, component, hydrogens_of, known_template
 from systems.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.errors import PreparationError
 from systems.modified_residues import listed
@@ -56,8 +57,17 @@ class Bonding:
     peptide_bonds: set[tuple[int, int]]
 
     @property
+    def neighbours(self) -> list[list[int]]:
+        """Of each atom the atoms that it is bonded to."""
+        near: list[list[int]] = [[] for _ in range(sum(len(r.atoms) for r in self.residues))]
+        for i, j in self.bonds.tolist():
+            near[i].append(j)
+            near[j].append(i)
+        return near
+
+    @property
     def is_complete(self) -> bool:
-        """Whether no standard residue lacks an atom."""
+        """Whether no residue that is known by its name lacks an atom."""
         return not any(r.missing or r.lacks_hydrogens for r in self.residues)
 
 
@@ -102,6 +112,7 @@ def find_bonds(
     bonds |= _bonds_by_distance(atoms, near, length, free, ions, bonds, notes)
     bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
     bonds |= _disulfides(atoms, near, length, bonds, of_atom)
+    bonds |= _links_of_components(atoms, near, length, of_atom, ions)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
     _note_missing(residues, atoms, bonded)
     return Bonding(bonded, residues, notes, peptide)
@@ -117,17 +128,22 @@ def _residues(atoms: Sequence[AtomRecord]) -> list[Residue]:
         groups.setdefault(atom.residue_key, []).append(i)
     residues = []
     for key, members in groups.items():
-        residue = Residue(key, members, template_for(key[2]))
+        residue = Residue(key, members, known_template(key[2]))
         if residue.template is not None:
             heavy: dict[str, int] = {}
             fits = True
+            found = component(key[2]) if template_for(key[2]) is None else None
+            element = {} if found is None else dict(zip(found.heavy, found.elements, strict=True))
             for i in members:
                 if atoms[i].element != "H":
                     name = canonical_heavy_name(residue.template, atoms[i].name)
-                    fits = fits and name is not None and name not in heavy and name[0] == atoms[i].element
+                    fits = fits and name is not None and name not in heavy
+                    fits = fits and element.get(name or "", (name or " ")[0]) == atoms[i].element
                     heavy[name or ""] = i
             if fits:
                 residue.heavy = heavy
+            elif template_for(key[2]) is None:
+                residue.template = None  # another molecule under the name of a component
         residues.append(residue)
     return residues
 
@@ -279,6 +295,25 @@ def _hydrogen_bonds_to_parents(
     return found
 
 
+def _links_of_components(
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    of_atom: dict[int, Residue],
+    ions: set[int],
+) -> set[tuple[int, int]]:
+    """Bonds that link polymers, between two residues of which one is a component of the dictionary."""
+    found = set()
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if of_atom[i] is of_atom[j] or {i, j} & ions or "H" in (atoms[i].element, atoms[j].element):
+            continue
+        if not any(of_atom[k].heavy and template_for(of_atom[k].key[2]) is None for k in (i, j)):
+            continue
+        if _links_residues(atoms[i], atoms[j], d):
+            found.add((i, j))
+    return found
+
+
 def _disulfides(
     atoms: Sequence[AtomRecord],
     near: npt.NDArray[np.int64],
@@ -311,17 +346,37 @@ def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: n
         template, heavy = residue.template, residue.heavy
         if template is None or not heavy:
             continue
-        residue.missing = [a for a in template.heavy if a not in heavy]
+        residue.missing = [a for a in template.heavy if a not in heavy and a not in template.optional]
         needed = dict(template.hydrogens)
+        found = component(residue.key[2]) if template_for(residue.key[2]) is None else None
+        if found is not None:
+            needed = _least_hydrogens(residue, found, neighbours)
         if template.is_amino_acid and {"N", "C"} <= set(heavy):
             joined_c = any(atoms[j].element == "N" and j not in residue.atoms for j in neighbours[heavy["C"]])
             joined_n = any(atoms[j].element == "C" and j not in residue.atoms for j in neighbours[heavy["N"]])
             if not joined_c and "OXT" not in heavy and not hydrogens(heavy["C"]):
                 residue.missing.append("OXT")
-            needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
+            if found is None:
+                needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
             if template.name == "CYS" and residue.key[2].upper() not in ("CYM", "CYX", "CYS2"):
                 partners = [j for j in neighbours[heavy["SG"]] if atoms[j].element == "S"] if "SG" in heavy else [0]
                 needed["SG"] = 0 if partners else 1
         residue.lacks_hydrogens = any(hydrogens(heavy[a]) < n for a, n in needed.items() if a in heavy)
         if template.name == "HIS" and {"ND1", "NE2"} <= set(heavy):
             residue.lacks_hydrogens |= not (hydrogens(heavy["ND1"]) or hydrogens(heavy["NE2"]))
+
+
+def links_of(residue: Residue, neighbours: Sequence[Sequence[int]]) -> dict[str, int]:
+    """Return how many bonds each heavy atom of a residue, by its name in the template, has to other residues."""
+    own = set(residue.atoms)
+    counts = {name: sum(j not in own for j in neighbours[i]) for name, i in residue.heavy.items()}
+    return {name: n for name, n in counts.items() if n}
+
+
+def _least_hydrogens(residue: Residue, found: Component, neighbours: list[list[int]]) -> dict[str, int]:
+    """Return the least number of hydrogens on each heavy atom of a component, at any pH."""
+    present = {*residue.heavy, *residue.missing}
+    least: dict[str, int] = {}
+    for _, parent in hydrogens_of(found, present, links_of(residue, neighbours), ph=PH_OF_FEWEST):
+        least[parent] = least.get(parent, 0) + 1
+    return least

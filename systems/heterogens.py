@@ -77,7 +77,8 @@ def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int
 
 def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
     """Indices of atoms in molecules without any standard residue, beside at least one; none where all are such."""
-    standard = {i for r in bonding.residues if r.template is not None for i in r.atoms}
+    chains = [r for r in bonding.residues if r.template is not None and not r.template.is_saccharide]
+    standard = {i for r in chains for i in r.atoms}
     if not standard:
         return []
     graph = nx.Graph(bonding.bonds.tolist())

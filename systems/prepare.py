@@ -19,6 +19,7 @@ from systems.mmcif_file import is_component
 from systems.modified_residues import describe_residue, standardise
 from systems.mol_file import SUFFIXES, suffix_of
 from systems.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
+from systems.residues import template_for
 from systems.scene import Scene
 from systems.structure import scene_from_records
 from systems.waters import complete_waters
@@ -254,6 +255,12 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
             raise PreparationError(
                 f"{residue.label} has only {' '.join(residue.heavy)} of its heavy atoms; "
                 "give a structure with at least the whole backbone."
+            )
+        built = [a for a in residue.missing if a != "OXT"]
+        if built and template_for(residue.key[2]) is None:
+            raise PreparationError(
+                f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}, which only standard "
+                "residues are given; add all its heavy atoms."
             )
 
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from systems.bonding import Bonding, Residue
 from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError
+from systems.hydrogens import Asked, asked_hydrogens
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
 from systems.residues import template_for
@@ -32,13 +33,14 @@ _STATES = {
     ("HIS", (True, True)): "HIS charged (HIP)", ("HIS", (True, False)): "HIS neutral (HID)",
     ("HIS", (False, True)): "HIS neutral (HIE)", ("CYS", (True,)): "CYS neutral",
 }  # fmt: skip
+_UNKNOWN = "XCC"
 _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 
 
 def complete(
     atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float
 ) -> tuple[list[AtomRecord], npt.NDArray[np.int64], list[str]]:
-    """Return atoms, bonds and an account of what was added to structures of standard residues.
+    """Return atoms, bonds and an account of what was added to structures of residues that are all known by name.
 
     Heavy atoms of the file keep their positions; hydrogens of residues that had all of theirs keep them too, the others
     get new ones, in the protonation that the file shows or, where it shows none, the usual one at `ph`. Names become
@@ -51,14 +53,20 @@ def complete(
     chains = _chains(bonding)
     residues = [r for chain in chains for r in chain]
     text = _heavy_atom_text(atoms, chains)
-    variants = [variant_of(residue, atoms, bonding.bonds) for residue in residues]
+    neighbours = bonding.neighbours
+    closed = {r.key for chain in chains if _is_cycle(chain, bonding) for r in (chain[0], chain[-1])}
+    variants = [
+        asked_hydrogens(residue, atoms, neighbours, ph=ph, in_cycle=residue.key in closed) for residue in residues
+    ]
     reference = Platform.getPlatformByName("Reference")
     try:
         with fixed_random_numbers():
             fixer = PDBFixer(pdbfile=io.StringIO(text), platform=reference)
             fixer.missingResidues = {}
             fixer.findMissingAtoms()
+            _forget_ends(fixer, residues)
             fixer.addMissingAtoms(seed=1)
+            _add_bonds(fixer.topology, residues, bonding.bonds)
             modeller = app.Modeller(fixer.topology, fixer.positions)
             modeller.addHydrogens(pH=ph, variants=variants, platform=reference)
     except Exception as error:  # PDBFixer and OpenMM raise bare Exceptions, KeyErrors and ValueErrors alike
@@ -70,7 +78,7 @@ def complete(
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
-    account = _account(residues, records)
+    account = _account(residues, records, ph)
     replaced = _with_replaced_hydrogens(residues, records, atoms)
     if replaced:
         account.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
@@ -80,10 +88,29 @@ def complete(
     return records, bonds, account
 
 
+def _forget_ends(fixer: Any, residues: Sequence[Residue]) -> None:
+    """Take from PDBFixer's list the OXT of residues whose C is bonded onwards, in a cycle or to something unusual."""
+    for residue, built in zip(residues, fixer.topology.residues(), strict=True):
+        if "OXT" not in residue.missing:
+            fixer.missingTerminals.pop(built, None)
+            if built in fixer.missingAtoms:
+                fixer.missingAtoms[built] = [a for a in fixer.missingAtoms[built] if a.name != "OXT"]
+
+
+def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: npt.NDArray[np.int64]) -> None:
+    """Add the bonds of heavy atoms that OpenMM does not know by the names of residues."""
+    built = [{a.name: a for a in residue.atoms()} for residue in topology.residues()]
+    place = {i: at[name] for r, at in zip(residues, built, strict=True) for name, i in r.heavy.items() if name in at}
+    known = {frozenset((a, b)) for a, b in topology.bonds()}
+    for i, j in bonds.tolist():
+        if i in place and j in place and frozenset((place[i], place[j])) not in known:
+            topology.addBond(place[i], place[j])
+
+
 def protonation_account(
     labels: Sequence[str],
     keys: Sequence[tuple[str, str, str]],
-    given: Sequence[str | None],
+    given: Sequence[Asked],
     records: Sequence[AtomRecord],
     ph: float,
 ) -> list[str]:
@@ -140,49 +167,35 @@ def fixed_random_numbers() -> Iterator[None]:
         random.setstate(state)
 
 
-def variant_of(residue: Residue, atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> str | None:
-    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
-    name = residue.key[2].upper()
-    named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
-    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN", "CYX"):
-        return named
-    if named == "CYM":
-        return "CYX"
-    template = residue.template
-    if template is None or template.name not in ("HIS", "ASP", "GLU", "LYS"):
-        return None
-    near: dict[int, int] = dict.fromkeys(residue.heavy.values(), 0)
-    for i, j in bonds.tolist():
-        for a, b in ((i, j), (j, i)):
-            if a in near and atoms[b].element == "H":
-                near[a] += 1
-    count = {a: near[i] for a, i in residue.heavy.items()}
-    if template.name == "HIS":
-        return {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}.get((count.get("ND1", 0), count.get("NE2", 0)))
-    if template.name == "LYS":
-        return {2: "LYN", 3: "LYS"}.get(count.get("NZ", 0))
-    ends = sum(count.get(a, 0) for a in ("OD1", "OD2", "OE1", "OE2"))
-    if ends:
-        return "ASH" if template.name == "ASP" else "GLH"
-    return template.name if not residue.lacks_hydrogens else None
-
-
 def _chains(bonding: Bonding) -> list[list[Residue]]:
-    """Residues as peptide bonds join them, from first to last, whatever their order in the file."""
+    """Residues as peptide bonds join them, from first to last, whatever their order in the file.
+
+    A cycle is opened between residues that have no protonation to be settled, where it can be.
+    """
     of_atom = {i: k for k, r in enumerate(bonding.residues) for i in r.atoms}
     following = {of_atom[c]: of_atom[n] for c, n in bonding.peptide_bonds}
+    before = {n: c for c, n in following.items()}
+
+    def burden(k: int) -> int:
+        ends = (bonding.residues[k].template, bonding.residues[before.get(k, k)].template)
+        return sum(t is not None and t.name in _TITRATED for t in ends)
+
+    starts = [k for k in range(len(bonding.residues)) if k not in before]
     chains: list[list[Residue]] = []
-    for start in range(len(bonding.residues)):
-        if start in following.values():
-            continue
+    seen: set[int] = set()
+    for start in [*starts, *sorted(before, key=burden)]:
         chain, k = [], start
-        while k >= 0:
+        while k >= 0 and k not in seen:
+            seen.add(k)
             chain.append(bonding.residues[k])
             k = following.get(k, -1)
-        chains.append(chain)
-    if sum(map(len, chains)) != len(bonding.residues):
-        raise PreparationError("a cyclic peptide lacks atoms, which is not repaired; give it with all hydrogens.")
+        if chain:
+            chains.append(chain)
     return chains
+
+
+def _is_cycle(chain: Sequence[Residue], bonding: Bonding) -> bool:
+    return (chain[-1].heavy.get("C", -1), chain[0].heavy.get("N", -1)) in bonding.peptide_bonds
 
 
 def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Residue]]) -> str:
@@ -193,7 +206,7 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
         for residue in chain:
             number += 1
             name_of = {i: a for a, i in residue.heavy.items()}
-            residue_name = residue.template.name if residue.template is not None else residue.key[2]
+            residue_name = _name_for_openmm(residue)
             for i in residue.atoms:
                 atom = atoms[i]
                 if atom.element == "H":
@@ -208,6 +221,12 @@ def _heavy_atom_text(atoms: Sequence[AtomRecord], chains: Sequence[Sequence[Resi
                 lines.append(f"{head}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {name[0]}")
         lines.append("TER")
     return "\n".join([*lines, "END", ""])
+
+
+def _name_for_openmm(residue: Residue) -> str:
+    """The standard name; for a component one that OpenMM knows nothing about, and therefore leaves alone."""
+    standard = template_for(residue.key[2])
+    return _UNKNOWN if standard is None else standard.name
 
 
 def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[float]]:
@@ -320,13 +339,19 @@ def _distance(old: Sequence[int], new: Sequence[int], atoms: Sequence[AtomRecord
     return float(np.square(gaps).sum())
 
 
-def _account(residues: Sequence[Residue], records: Sequence[AtomRecord]) -> list[str]:
+def _account(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
     notes = []
     for residue in residues:
         if residue.missing:
             end = " (the chain ends here, as a carboxylate)" if "OXT" in residue.missing else ""
             notes.append(f"{residue.label}: added {' '.join(residue.missing)}{end}")
     short = [r.label for r in residues if r.lacks_hydrogens]
+    by_dictionary = [r.label for r in residues if r.lacks_hydrogens and template_for(r.key[2]) is None]
+    if by_dictionary:
+        notes.append(
+            f"their hydrogens by the chemical component dictionary, groups charged as at pH {ph:g}: "
+            f"{listed(by_dictionary)}"
+        )
     if short:
         of_short = {r.key for r in residues if r.lacks_hydrogens}
         n = sum(a.element == "H" and a.residue_key in of_short for a in records)

@@ -63,16 +63,17 @@ ONE_LETTER = {
 
 @dataclass(frozen=True)
 class ResidueTemplate:
-    """A standard residue: `bonds` between heavy atoms, `hydrogens` the least number on each heavy atom that has any."""
+    """A residue that is known by its name: `bonds` between heavy atoms, `hydrogens` the least number on each heavy atom
+    that has any, `optional` heavy atoms that need not be there. `is_amino_acid`: N, CA, C and O link it into a chain.
+    """
 
     name: str
     heavy: tuple[str, ...]
     bonds: tuple[tuple[str, str], ...]
     hydrogens: dict[str, int]
-
-    @property
-    def is_amino_acid(self) -> bool:
-        return self.name in _SIDE_CHAINS
+    optional: frozenset[str] = frozenset()
+    is_amino_acid: bool = False
+    is_saccharide: bool = False
 
 
 def template_for(residue_name: str) -> ResidueTemplate | None:
@@ -117,4 +118,6 @@ def _template(name: str, bonds: str, hydrogens: str, counts: dict[str, int]) -> 
     pairs = [tuple(b.split("-")) for b in bonds.split()]
     heavy = list(dict.fromkeys(a for pair in pairs for a in pair)) or ["N"]
     counts = counts | {h[:-1]: int(h[-1]) for h in hydrogens.split()}
-    return ResidueTemplate(name, tuple(heavy), tuple((a, b) for a, b in pairs), counts)
+    return ResidueTemplate(
+        name, tuple(heavy), tuple((a, b) for a, b in pairs), counts, is_amino_acid=name in _SIDE_CHAINS
+    )

@@ -1,0 +1,63 @@
+"""Which hydrogens OpenMM's Modeller is asked to put on each residue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from systems.bonding import Residue, links_of
+from systems.components import component, hydrogens_of
+from systems.errors import PreparationError
+from systems.pdb_records import AtomRecord
+from systems.residues import template_for
+
+# A variant of Modeller's by name, the hydrogens one by one with their heavy atoms, or None: what pH decides.
+Asked = str | list[tuple[str, str]] | None
+# Hydrogens that Modeller's own rules count rightly: peptide bonds, and sulfurs in disulfides.
+_USUAL_LINKS = {"N": 1, "C": 1, "SG": 1}
+
+
+def asked_hydrogens(
+    residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]], *, ph: float, in_cycle: bool
+) -> Asked:
+    """Return what to ask of Modeller for a residue.
+
+    Standard residues are left to its rules, in the protonation that the file shows. Components of the dictionary, and
+    standard residues where those rules fail (an end of the chain that a bond closes, a side chain bonded to another
+    residue), are asked for hydrogen by hydrogen: those of the file where it has all, else the dictionary's at this pH.
+    Raises PreparationError for a residue of which nothing is known.
+    """
+    assert residue.template is not None
+    links = links_of(residue, neighbours)
+    is_standard = template_for(residue.key[2]) is not None
+    if is_standard and not in_cycle and all(n <= _USUAL_LINKS.get(atom, 0) for atom, n in links.items()):
+        return variant_of(residue, atoms, neighbours)
+    if not residue.lacks_hydrogens:
+        return [
+            (atoms[h].name, name) for name, i in residue.heavy.items() for h in neighbours[i] if atoms[h].element == "H"
+        ]
+    found = component(residue.template.name)
+    if found is None:
+        raise PreparationError(f"{residue.label} lacks hydrogens, and the dictionary does not hold it; give them.")
+    return hydrogens_of(found, {*residue.heavy, *residue.missing}, links, ph=ph)
+
+
+def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequence[Sequence[int]]) -> str | None:
+    """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
+    name = residue.key[2].upper()
+    named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
+    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN", "CYX"):
+        return named
+    if named == "CYM":
+        return "CYX"
+    template = residue.template
+    if template is None or template.name not in ("HIS", "ASP", "GLU", "LYS"):
+        return None
+    count = {a: sum(atoms[j].element == "H" for j in neighbours[i]) for a, i in residue.heavy.items()}
+    if template.name == "HIS":
+        return {(1, 1): "HIP", (1, 0): "HID", (0, 1): "HIE"}.get((count.get("ND1", 0), count.get("NE2", 0)))
+    if template.name == "LYS":
+        return {2: "LYN", 3: "LYS"}.get(count.get("NZ", 0))
+    ends = sum(count.get(a, 0) for a in ("OD1", "OD2", "OE1", "OE2"))
+    if ends:
+        return "ASH" if template.name == "ASP" else "GLH"
+    return template.name if not residue.lacks_hydrogens else None
