@@ -13,8 +13,9 @@ from surrogate.bench.rolling import Frames
 from surrogate.bench.stress_measures import HALF_ANGSTROM_RULE, measure_bonds
 from surrogate.judge.distributions import block_occupancy
 from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.relaxation import longest_correlation, relaxation_of
+from surrogate.judge.relaxation import relaxation_of
 from surrogate.judge.rows import Options, Sample, make_sample
+from surrogate.judge.slow_motion import longest_correlation
 from surrogate.judge.statistics import block_length, estimate, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry
 from surrogate.judge.worth import Worth, distance_to_truth, errors_by_length, worth_by

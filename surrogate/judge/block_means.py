@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from surrogate.judge.equal_atoms import over_groups
 from surrogate.judge.probes import Family
-from surrogate.judge.rows import Group, Row, Sample, Trio
-from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate, pooled
+from surrogate.judge.rows import Group, Row, Sample, Trio, truth_of
+from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
@@ -120,7 +120,7 @@ def shift_row(
     least = [1.0, 1.0]
     for k in range(len(shift)):
         r, c, other = (mean_estimate(float(m.values[k]), m.draws[:, k], m.n_blocks) for m in means)
-        both = pooled(r, other) if math.isfinite(other.value) else r
+        both = truth_of(r, other)
         for side, (x, y) in enumerate(((c, both), (other, r))):
             if abs(x.value - y.value) > resolution:
                 least[side] = min(least[side], difference_p(x, y) * len(shift))

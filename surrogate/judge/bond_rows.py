@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions
 from surrogate.judge.curves import BondLength
-from surrogate.judge.equal_atoms import equal_rows, group_labels, over_groups
-from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
-from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate, pooled
+from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, equal_rows, evenly, group_labels, over_groups
+from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row, truth_of
+from surrogate.judge.statistics import Estimate, difference_p, estimate, mean_estimate
 from surrogate.judge.structure import CONSTRAINED_BELOW_NM, bond_label
 from systems.validity import Geometry
 
@@ -65,7 +65,7 @@ def bond_rows(trio: Trio) -> tuple[list[Row], list[BondLength]]:
                 resolution=BOND_RESOLUTION_ANGSTROM,
             )
         )
-    flexible = [g for g in groups if not rigid[g].any()]
+    flexible = evenly([g for g in groups if not rigid[g].any()], MOST_HISTOGRAMS)
     if flexible:
         rows.append(_bond_distance_row(trio, flexible))
     return rows, table
@@ -156,7 +156,7 @@ def _least_p(ref: _Moments, cand: _Moments, rep: _Moments) -> tuple[float, float
     least = [1.0, 1.0]
     for b in range(n_bonds):
         r, c, other = (mean_estimate(float(m.mean[b]), m.draws_mean[:, b], m.n_blocks) for m in (ref, cand, rep))
-        both = pooled(r, other) if math.isfinite(other.value) else r
+        both = truth_of(r, other)
         for k, (x, y) in enumerate(((c, both), (other, r))):
             if abs(x.value - y.value) > BOND_RESOLUTION_ANGSTROM:
                 least[k] = min(least[k], difference_p(x, y) * n_bonds)

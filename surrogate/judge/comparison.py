@@ -27,11 +27,14 @@ from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.peptide_protocol import peptide_charts
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.shape_rows import shape_rows
+from surrogate.judge.slow_motion import longest_correlation
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
 from surrogate.judge.survival import survival_charts
+from surrogate.judge.temperature_row import temperature_rows
 from surrogate.judge.torsion_rows import other_torsion_rows
 from surrogate.judge.wasserstein_rows import wasserstein_rows
+from surrogate.judge.within_rows import within_rows
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
 from systems.errors import InputError
@@ -43,8 +46,10 @@ from systems.validity import Geometry
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
 ROOMS: tuple[Room, ...] = (
     wasserstein_rows,
+    temperature_rows,
     shape_rows,
     other_torsion_rows,
+    within_rows,
     contact_rows,
     hydrogen_bond_rows,
     lifetime_rows,
@@ -59,15 +64,17 @@ ROOMS: tuple[Room, ...] = (
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
 _ROWS_FORESEEN = 60
+_MOST_TIMES_AS_LONG = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
     """One candidate against the reference: rows with a word each, what is wrong (worst first), and the verdict.
 
-    `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` stand behind the error
-    bars; `correlation_ps` is the slowest torsion's integrated autocorrelation time in the reference, which makes it
-    `effective_samples` independent samples; `speed_ratio` is simulated time per wall second over the reference's.
+    `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` (of the reference) stand
+    behind the error bars; `correlation_ps` is the integrated autocorrelation time of the slowest motion in reference
+    and replicate, which makes of the equal length `effective_samples` independent samples; `speed_ratio` is simulated time per wall
+    second over the reference's.
     `worth` says by each measure how much MD the whole candidate is worth, and `worth_words` says it in a sentence
     (empty where it cannot be told, or frames are broken).
     """
@@ -243,23 +250,29 @@ def _judge(
     more = [row for found, _, _ in rooms for row in found]
     judged = verdict.judge_rows(by_group([*rows, *kinetic, *slowest, *seams, *more]), options, account.imposed)
     found = verdict.findings(judged)
-    compared = trio.reference.features.total_ps
     truth = trio.reference
-    kind = verdict.status(judged)
+    samples = effective_samples(round(trio.compared_ps / truth.features.lag_ps), correlation)
+    doubts = remarks.doubts(trio, samples, correlation)
+    kind = verdict.status(judged, doubts)
     worth = worths(reference, candidate, replicate, torsions, options)
-    words = "" if kind == "broken" else headline(worth, lambda ps: cost_ratio(ps, account, reference_account))
+    words = ""
+    known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
+    if kind != "broken" and not doubts.apart and known >= remarks.LEAST_FOR_WORTH:
+        words = headline(worth, lambda ps: cost_ratio(ps, account, reference_account))
     return Judgement(
         account=account,
         status=kind,
-        verdict=" ".join([verdict.sentence(judged, found, format_time_ps(compared)), *([words] if words else [])]),
+        verdict=" ".join(
+            [verdict.sentence(judged, found, format_time_ps(trio.compared_ps), doubts), *([words] if words else [])]
+        ),
         findings=found,
         rows=judged,
-        compared_ps=compared,
-        n_frames=truth.features.n_frames,
+        compared_ps=trio.compared_ps,
+        n_frames=min(s.features.n_frames for s in trio.samples),
         block_ps=truth.blocks.n_frames_each * truth.features.lag_ps,
         n_blocks=truth.blocks.n_blocks,
         correlation_ps=correlation * truth.features.lag_ps,
-        effective_samples=effective_samples(truth.features.n_frames, correlation),
+        effective_samples=samples,
         speed_ratio=speed_ratio(account, reference_account),
         faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
         skipped=(
@@ -270,7 +283,7 @@ def _judge(
             *(x for _, _, why in rooms for x in why),
         ),
         notes=tuple(
-            remarks.trimming(trio, reference, candidate, replicate, correlation)
+            remarks.trimming(trio, reference, candidate, replicate)
             + remarks.unlike(judged, options)
             + imposed_notes(account.label, judged, account.imposed)
         ),
@@ -296,22 +309,27 @@ def _equal_terms(
     replicate: Features,
     options: Options,
 ) -> tuple[Trio, float]:
-    """Cut all three to one number of frames and divide them into blocks of one length; the slowest time in frames."""
+    """Divide all three into blocks of one length, of which the first of each are as long as the shortest of the three;
+    return them and the slowest time of the truth in frames.
+
+    All of a longer reference takes part in the tests, up to `_MOST_TIMES_AS_LONG` times the candidate's length.
+    """
     n = min(reference.n_frames, candidate.n_frames, replicate.n_frames)
     if n < _MIN_FRAMES:
         raise InputError(
             f"{candidate.label}: only {n} frames can be compared at equal length; at least {_MIN_FRAMES} are needed "
             "(without a replicate the reference counts half)."
         )
-    cut = [f.frames(0, n) for f in (reference, candidate, replicate)]
-    times = [relaxation.longest_correlation(f) for f in cut]
-    each = block_length(n, max(times))
-    n_rows = _ROWS_FORESEEN + 8 * (len(torsions.phi) + len(torsions.psi))
+    cut = [f.frames(0, min(f.n_frames, _MOST_TIMES_AS_LONG * n)) for f in (reference, candidate, replicate)]
+    # A candidate that never leaves a state must not make the truth's own motion look slow, hence two times.
+    slowest = longest_correlation(cut[0], cut[2])
+    each = block_length(n, max(slowest, longest_correlation(cut[1])))
+    n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * metrics.FEW_RESIDUES)
     options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
     truth, rolled, other = (
-        make_sample(f, make_blocks(f.segment_lengths, each), options, stream) for stream, f in enumerate(cut)
+        make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
     )
-    return Trio(scene, torsions, geometry, truth, rolled, other, options), times[0]
+    return Trio(scene, torsions, geometry, truth, rolled, other, options), slowest
 
 
 def _with_forecast(judgement: Judgement, charts: Sequence[Chart], skipped: Sequence[tuple[str, str]]) -> Judgement:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.block_means import Means, block_means
+from surrogate.judge.block_means import Means, block_means, shift_row
 from surrogate.judge.charts import BarChart, Chart
+from surrogate.judge.metrics import are_many
 from surrogate.judge.rows import Row, Trio, observable_row
 from surrogate.judge.structure import Backbone
 from systems.scene import Scene
@@ -90,6 +91,8 @@ def coupling_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
             for phi in sample.features.phi
         ]
         means.append(block_means(sample, hertz))
+    if are_many(trio):
+        return [_largest_shift(trio, sites, means)], [], []
     rows = [
         observable_row(
             trio,
@@ -106,6 +109,21 @@ def coupling_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
         for k, site in enumerate(sites)
     ]
     return rows, [_chart(sites, means)], []
+
+
+def _largest_shift(trio: Trio, sites: list[Site], means: list[Means]) -> Row:
+    return shift_row(
+        trio,
+        means,
+        [site.label for site in sites],
+        key="coupling_shift",
+        group="populations",
+        metric="Largest shift of a ³J(HN,HA)",
+        unit="Hz",
+        tolerance=TOLERANCE_HZ,
+        resolution=0.02,
+        statement=lambda label, c, r: f"³J(HN,HA) of {label} is {c:.2f} Hz instead of {r:.2f} Hz",
+    )
 
 
 def _chart(sites: list[Site], means: list[Means]) -> Chart:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+T = TypeVar("T")
+
+# Of more bonds or angles than this, evenly chosen ones have histograms: those of a protein say the same many times.
+MOST_HISTOGRAMS = 128
 
 
 def equal_rows(rows: npt.NDArray[np.int64], classes: npt.NDArray[np.int64]) -> list[npt.NDArray[np.intp]]:
@@ -25,6 +30,11 @@ def equal_rows(rows: npt.NDArray[np.int64], classes: npt.NDArray[np.int64]) -> l
 def group_labels(labels: Sequence[str], groups: Sequence[npt.NDArray[np.intp]]) -> list[str]:
     """Return the name of the first of each group, and how many more are equal to it."""
     return [labels[g[0]] + (f" and {len(g) - 1} equal" if len(g) > 1 else "") for g in groups]
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """Return all items, or at most `most` of them, evenly chosen."""
+    return list(items[:: -(-len(items) // most)]) if items else []
 
 
 def over_groups(values: FloatArray, groups: Sequence[npt.NDArray[np.intp]]) -> FloatArray:

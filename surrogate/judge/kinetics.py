@@ -198,7 +198,7 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     """
     from deeptime.decomposition import TICA
 
-    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames]
+    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
     if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
         return None
     covariance = TICA.covariance_estimator(lagtime=lag_frames)

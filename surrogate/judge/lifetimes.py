@@ -10,6 +10,7 @@ import numpy.typing as npt
 from surrogate.judge.block_means import column, family_of
 from surrogate.judge.charts import Chart
 from surrogate.judge.equal_atoms import equal_rows, group_labels
+from surrogate.judge.own_blocks import with_own_blocks
 from surrogate.judge.relaxation import speed_words
 from surrogate.judge.rows import Row, Trio, observable_row
 from surrogate.judge.statistics import Blocks
@@ -39,15 +40,21 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
     chosen = [k for k in order[:_MOST] if first[k][1].sum() >= _LEAST_BREAKS]
     if not chosen:
         return [], [], [(_NAME, f"the reference breaks none of them {_LEAST_BREAKS} times")]
-    rows = []
+    rows: list[Row] = []
+    skipped: list[tuple[str, str]] = []
     for k in chosen:
-        sums = [_group_sums(f, groups[k], s.blocks) for f, s in zip(formed, trio.samples, strict=True)]
+        fine = with_own_blocks(trio, [_breaks_beyond_rate(f, groups[k]) for f in formed])
+        sums = [_group_sums(f, groups[k], s.blocks) for f, s in zip(formed, fine.samples, strict=True)]
+        if not sums[1][1].sum():
+            never = "never breaks it" if sums[1][0].sum() else "never forms it"
+            skipped.append((f"Lifetime of the hydrogen bond {labels[k]}", f"the candidate {never}"))
+            continue
         with np.errstate(invalid="ignore", divide="ignore"):
             values = [float(lag_ps * f.sum() / b.sum()) if b.sum() else np.nan for f, b in sums]
-            draws = [lag_ps * (s.weights @ f) / (s.weights @ b) for (f, b), s in zip(sums, trio.samples, strict=True)]
+            draws = [lag_ps * (s.weights @ f) / (s.weights @ b) for (f, b), s in zip(sums, fine.samples, strict=True)]
         rows.append(
             observable_row(
-                trio,
+                fine,
                 values,
                 draws,
                 key=f"hydrogen_bond_lifetime:{labels[k]}",
@@ -60,7 +67,15 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
                 log=True,
             )
         )
-    return rows, [], []
+    return rows, [], skipped
+
+
+def _breaks_beyond_rate(formed: Sequence[BoolArray], columns: npt.NDArray[np.intp]) -> list[FloatArray]:
+    """Return per segment how many bonds break at each frame beyond what the mean rate has for those formed, `(n,)`."""
+    held = [x[:, columns].sum(axis=1).astype(np.float64) for x in formed]
+    broken = [np.append((x[:-1, columns] & ~x[1:, columns]).sum(axis=1), 0).astype(np.float64) for x in formed]
+    rate = sum(b.sum() for b in broken) / max(sum(h.sum() for h in held), 1.0)
+    return [b - rate * h for b, h in zip(broken, held, strict=True)]
 
 
 def _group_sums(

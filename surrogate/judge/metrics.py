@@ -11,9 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import distributions
+from surrogate.judge.block_means import block_means, shift_row
 from surrogate.judge.distributions import RAMACHANDRAN_BINS, TORSION_BINS
-from surrogate.judge.rows import Group, Row, Trio, distance_row, observable_row
+from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, evenly
+from surrogate.judge.rows import Group, Row, Sample, Trio, distance_row, observable_row
 from surrogate.judge.statistics import Estimate, estimate, excess_p
+from surrogate.judge.structure import Residue
 from systems import validity
 from systems.validity import Geometry
 
@@ -24,6 +27,10 @@ Membership = Callable[[npt.NDArray[np.floating]], npt.NDArray[np.bool_]]
 ONE_KJ_FACTOR = math.exp(1.0 / (8.31446261815324e-3 * 300.0))
 TORN_NM = 0.25
 WHOLE_KEY = "valid:whole"
+# More residues than this, and they share rows: means over all, and the one that is furthest off.
+FEW_RESIDUES = 12
+MOST_MAPS = 16
+_POPULATION_TOLERANCE = 5.0
 
 
 class Check(NamedTuple):
@@ -87,6 +94,7 @@ def _share_row(trio: Trio, check: Check, key: str, *, torn: bool = False) -> Row
     mask = check.mask | validity.NOT_FINITE
     made: list[Estimate] = []
     failing_frames: list[int] = []
+    n_frames: list[int] = []
     for sample in trio.samples:
         good = [(f & mask) == 0 for f in sample.features.flags]
         if torn:
@@ -97,6 +105,7 @@ def _share_row(trio: Trio, check: Check, key: str, *, torn: bool = False) -> Row
         draws = 100.0 * (sample.weights @ inside) / (sample.weights @ total)
         found = estimate(float(value), draws, sample.blocks.n_blocks)
         failing_frames.append(round(float(total.sum() - inside.sum())))
+        n_frames.append(sample.features.n_frames)
         made.append(replace(found, low=max(found.low, 0.0), high=min(found.high, 100.0)))
     # Frames that are not finite fail every check; the sentence counts what this one finds beyond the reference.
     if torn:
@@ -115,7 +124,7 @@ def _share_row(trio: Trio, check: Check, key: str, *, torn: bool = False) -> Row
         candidate=made[1],
         replicate=made[2],
         ratio=None,
-        p_value=excess_p(failing_frames[1], failing_frames[0] + failing_frames[2], 1.0 / 3.0)
+        p_value=excess_p(failing_frames[1], failing_frames[0] + failing_frames[2], n_frames[1] / sum(n_frames))
         if check.by_chance
         else math.nan,
         p_replicate=math.nan,
@@ -125,8 +134,16 @@ def _share_row(trio: Trio, check: Check, key: str, *, torn: bool = False) -> Row
     )
 
 
+def are_many(trio: Trio) -> bool:
+    """Whether residues are too many for rows of their own."""
+    return max(len(trio.torsions.phi), len(trio.torsions.psi)) > FEW_RESIDUES
+
+
 def population_rows(trio: Trio) -> list[Row]:
-    """Return the populations of the psi basins and of phi > 0, in percent of all frames."""
+    """Return the populations of the psi basins and of phi > 0, in percent of all frames; of many residues only the one
+    that is furthest off."""
+    if are_many(trio):
+        return [_largest_population_shift(trio)]
     rows = []
     for k, label in enumerate(trio.torsions.psi_labels):
         for name, member in (("β", distributions.is_beta), ("α", distributions.is_alpha)):
@@ -134,6 +151,33 @@ def population_rows(trio: Trio) -> list[Row]:
     for k, label in enumerate(trio.torsions.phi_labels):
         rows.append(_population_row(trio, "phi", k, distributions.is_positive, "φ > 0", label))
     return rows
+
+
+def _largest_population_shift(trio: Trio) -> Row:
+    labels = [f"ψ in the β basin, {x}" for x in trio.torsions.psi_labels]
+    labels += [f"φ > 0, {x}" for x in trio.torsions.phi_labels]
+    means = [
+        block_means(
+            sample,
+            [
+                100.0 * np.concatenate([distributions.is_beta(psi), distributions.is_positive(phi)], axis=1)
+                for phi, psi in zip(sample.features.phi, sample.features.psi, strict=True)
+            ],
+        )
+        for sample in trio.samples
+    ]
+    return shift_row(
+        trio,
+        means,
+        labels,
+        key="population_shift",
+        group="populations",
+        metric="Largest shift of a basin's population",
+        unit="%",
+        tolerance=_POPULATION_TOLERANCE,
+        resolution=0.1,
+        statement=lambda label, c, r: f"{label}: {c:.3g} % of frames instead of {r:.3g} %",
+    )
 
 
 def _population_row(
@@ -172,18 +216,13 @@ def _population_row(
 
 
 def torsion_rows(trio: Trio) -> list[Row]:
-    """Return Jensen-Shannon distances: jointly per residue (50 x 50 bins), then phi and psi alone (100 bins)."""
+    """Return Jensen-Shannon distances: jointly per residue (50 x 50 bins), then phi and psi alone (100 bins); of many
+    residues their means."""
+    if are_many(trio):
+        return _mean_torsion_rows(trio)
     rows = []
     for residue in trio.torsions.residues:
-        counts = [
-            distributions.block_counts_joint(
-                [x[:, residue.phi] for x in s.features.phi],
-                [x[:, residue.psi] for x in s.features.psi],
-                RAMACHANDRAN_BINS,
-                s.blocks,
-            )
-            for s in trio.samples
-        ]
+        counts = [_joint_counts(s, residue) for s in trio.samples]
         rows.append(_jsd_row(trio, counts, "joint_jsd", "Joint φ/ψ", residue.label, "distributions"))
     for symbol, labels, pick in (
         ("φ", trio.torsions.phi_labels, lambda s: s.features.phi),
@@ -195,6 +234,35 @@ def torsion_rows(trio: Trio) -> list[Row]:
             ]
             key = "phi_jsd" if symbol == "φ" else "psi_jsd"
             rows.append(_jsd_row(trio, counts, key, symbol, label, "distributions"))
+    return rows
+
+
+def _joint_counts(sample: Sample, residue: Residue) -> FloatArray:
+    phi, psi = (
+        [x[:, k] for x in series]
+        for series, k in ((sample.features.phi, residue.phi), (sample.features.psi, residue.psi))
+    )
+    return distributions.block_counts_joint(phi, psi, RAMACHANDRAN_BINS, sample.blocks)
+
+
+def _mean_torsion_rows(trio: Trio) -> list[Row]:
+    rows = []
+    residues = evenly(trio.torsions.residues, MOST_MAPS)
+    if residues:
+        counts = [np.stack([_joint_counts(s, r) for r in residues], axis=1) for s in trio.samples]
+        rows.append(
+            _jsd_row(trio, counts, "joint_jsd", "Joint φ/ψ", f"mean of {len(residues)} residues", "distributions")
+        )
+    for symbol, key, pick in (("φ", "phi_jsd", lambda s: s.features.phi), ("ψ", "psi_jsd", lambda s: s.features.psi)):
+        columns = evenly(range(pick(trio.reference)[0].shape[1]), MOST_HISTOGRAMS)
+        if columns:
+            counts = [
+                np.stack(
+                    [distributions.block_counts([x[:, k] for x in pick(s)], TORSION_BINS, s.blocks) for k in columns], 1
+                )
+                for s in trio.samples
+            ]
+            rows.append(_jsd_row(trio, counts, key, symbol, f"mean of {len(columns)} residues", "distributions"))
     return rows
 
 

@@ -139,12 +139,18 @@ def fit_model(
     connected = counts.submodel_largest(connectivity_threshold=0)
     if connected.n_states < 3:
         return None
-    markov = MaximumLikelihoodMSM(reversible=True).fit(connected).fetch_model()
+    try:
+        markov = MaximumLikelihoodMSM(reversible=True).fit(connected).fetch_model()
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # counts too few for a reversible estimate
+        return None
     times = np.asarray(markov.timescales())
     n_slow = int((times > _SLOW_IN_LAGS * lag_frames).sum())
     wanted = min(max(n_slow + 1, 2), MAX_STATES) if n_states is None else n_states
     wanted = min(wanted, markov.n_states - 1)
-    lumped = markov.pcca(wanted)
+    try:
+        lumped = markov.pcca(wanted)
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # no so many sets that hold together
+        return None
     populations = np.bincount(lumped.assignments, weights=markov.stationary_distribution, minlength=wanted)
     rank = np.empty(wanted, dtype=np.int64)
     rank[np.argsort(-populations)] = np.arange(wanted)

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from surrogate.judge import distributions, msm
 from surrogate.judge.charts import BarChart, Chart, Landscape, Line, LineChart, Role
 from surrogate.judge.kinetics import lagged_eigenvalue, timescale
-from surrogate.judge.relaxation import speed_words, tica_features
+from surrogate.judge.relaxation import speed_words
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.slow_motion import tica_features
 from surrogate.judge.statistics import estimate
 from systems.units import format_time_ps
 

@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions, kinetics, msm
 from surrogate.judge.charts import BarChart, Chart, Line, LineChart
-from surrogate.judge.relaxation import tica_features
 from surrogate.judge.rows import Row, Trio
+from surrogate.judge.slow_motion import tica_features
 from surrogate.judge.statistics import Blocks
 from surrogate.judge.structure import Features
 from systems.units import format_time_ps
@@ -152,7 +152,8 @@ def decorrelation(segments: Segments, n_lags: int) -> FloatArray:
 def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str]]]:
     """Return the recipe's table as a bar chart and the decorrelation of each torsion, or why they were skipped."""
     name = f"The peptide papers' recipe (lag {format_time_ps(LAG_PS)}, {N_CLUSTERS} clusters, {N_STATES} states)"
-    reference, candidate, replicate = (s.features for s in trio.samples)
+    n = min(s.features.n_frames for s in trio.samples)
+    reference, candidate, replicate = (s.features.frames(0, n) for s in trio.samples)
     if not trio.options.peptide_recipe:
         return [], [], [(name, "not asked for")]
     if not (len(trio.torsions.phi) or len(trio.torsions.psi)):

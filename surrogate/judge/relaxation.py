@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from surrogate.judge import curves, distributions, kinetics
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.slow_motion import SLOW_KINDS, tica_features
 from surrogate.judge.statistics import Estimate, difference_p, estimate
 from surrogate.judge.structure import Features
 from systems.units import format_time_ps
@@ -19,23 +20,8 @@ FloatArray = npt.NDArray[np.float64]
 Skipped = tuple[str, str]
 
 MAX_DRAWN_LAGS = 240
-SLOW_KINDS = ("χ", "rotatable")
 _MIN_BOUNDARIES = 20
-
-
-def longest_correlation(features: Features) -> float:
-    """Return the longest integrated autocorrelation time (frames) among cos and sin of all torsions and phi > 0."""
-    series: list[list[FloatArray]] = []
-    for torsions in (features.phi, features.psi):
-        for k in range(torsions[0].shape[1]):
-            angles = [np.asarray(x[:, k], dtype=np.float64) for x in torsions]
-            series += [[np.cos(x) for x in angles], [np.sin(x) for x in angles]]
-            if torsions is features.phi:
-                series.append([np.where(np.isfinite(x), x > 0, np.nan) for x in angles])
-    if not series and features.bonds_nm[0].shape[1]:
-        series = [[np.asarray(x.mean(1), dtype=np.float64) for x in features.bonds_nm]]
-    times = [kinetics.zero_crossing(s)[1] for s in series]
-    return max((t for t in times if math.isfinite(t)), default=1.0)
+_MOST_RELAXING = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +44,41 @@ class _Correlated:
         return self.curve[self.kept] + low, self.curve[self.kept] + high
 
 
+def turning(features: Features) -> list[tuple[str, str, list[FloatArray]]]:
+    """Return what relaxation is told by: symbol, label and cosine `(n,)` per segment of every psi, or, where there is
+    none, of every rotatable torsion, folded as it is."""
+    if features.psi[0].shape[1] or features.probes is None:
+        n = features.psi[0].shape[1]
+        names = [("ψ", "") for _ in range(n)]
+        columns = [[x[:, k] for x in features.psi] for k in range(n)]
+    else:
+        slow = [k for k, t in enumerate(features.probes.torsions) if t.kind in SLOW_KINDS]
+        names = [("", features.probes.torsions[k].label) for k in slow]
+        columns = [[x[:, k] for x in features.series["torsions"]] for k in slow]
+    return [(s, label, [np.cos(x.astype(np.float64)) for x in c]) for (s, label), c in zip(names, columns, strict=True)]
+
+
 def correlation_rows(trio: Trio) -> tuple[list[Row], list[curves.CorrelationCurve], list[Skipped]]:
-    """Return, for each psi, rows of C(lag) at the chosen lags and of its integral; the curves; what was skipped."""
+    """Return, for each psi or rotatable torsion, rows of C(lag) at the chosen lags and of its integral; the curves;
+    what was skipped. Of more than `_MOST_RELAXING` torsions the slowest in the reference."""
     rows: list[Row] = []
     drawn: list[curves.CorrelationCurve] = []
     skipped: list[Skipped] = []
+    moving = [turning(s.features) for s in trio.samples]
+    labels = [
+        (f"cos {symbol}", trio.torsions.psi_labels[k]) if symbol else ("cos", label)
+        for k, (symbol, label, _) in enumerate(moving[0])
+    ]
+    chosen = list(range(len(labels)))
+    if len(chosen) > _MOST_RELAXING:
+        times = np.nan_to_num([kinetics.zero_crossing(series)[1] for _, _, series in moving[0]])
+        chosen = sorted(np.argsort(-times)[:_MOST_RELAXING].tolist())
+        skipped.append((f"Relaxation of {len(labels)} torsions", f"the {len(chosen)} slowest have rows"))
     lag_ps = trio.reference.features.lag_ps
     wanted = sorted({max(1, round(x / lag_ps)) for x in trio.options.lags_ps if x >= 0.5 * lag_ps} or {1})
-    for k, label in enumerate(trio.torsions.psi_labels):
-        series = [[np.cos(x[:, k].astype(np.float64)) for x in s.features.psi] for s in trio.samples]
+    for k in chosen:
+        what, label = labels[k]
+        series = [m[k][2] for m in moving]
         crossings = [kinetics.zero_crossing(s)[0] for s in series]
         longest = min(max(s.features.segment_lengths) for s in trio.samples)
         n_lags = min(max(3 * max(crossings), wanted[-1]) + 1, longest, kinetics.MAX_LAG_FRAMES)
@@ -77,16 +89,24 @@ def correlation_rows(trio: Trio) -> tuple[list[Row], list[curves.CorrelationCurv
         results = [_correlate(s, sample, n_lags, kept) for s, sample in zip(series, trio.samples, strict=True)]
         for lag in wanted:
             if lag < n_lags:
-                rows.append(_value_row(trio, results, lag, label))
+                rows.append(_value_row(trio, results, lag, what, label))
             else:
-                what = f"C({format_time_ps(lag * lag_ps)}) of cos ψ, {label}"
-                skipped.append((what, "the segments are shorter than that"))
-        rows.append(_time_row(trio, results, label))
+                name = f"C({format_time_ps(lag * lag_ps)}) of {what}, {label}"
+                skipped.append((name, "the segments are shorter than that"))
+        rows.append(_time_row(trio, results, what, label))
         (ref_low, ref_high), (cand_low, cand_high) = results[0].band(), results[1].band()
         reference, candidate, replicate = (r.curve[kept] for r in results)
         drawn.append(
             curves.CorrelationCurve(
-                f"cos ψ {label}", kept * lag_ps, reference, ref_low, ref_high, candidate, cand_low, cand_high, replicate
+                f"{what} {label}",
+                kept * lag_ps,
+                reference,
+                ref_low,
+                ref_high,
+                candidate,
+                cand_low,
+                cand_high,
+                replicate,
             )
         )
     return rows, drawn, skipped
@@ -107,8 +127,8 @@ def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: 
 
 
 def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
-    """Return the autocorrelation of cos psi (torsion `k`) after one frame, and its relaxation time in ps."""
-    series = [np.cos(x[:, k].astype(np.float64)) for x in sample.features.psi]
+    """Return the autocorrelation of torsion `k` of `turning` after one frame, and its relaxation time in ps."""
+    series = turning(sample.features)[k][2]
     longest = min(max(sample.features.segment_lengths), kinetics.MAX_LAG_FRAMES)
     n_lags = min(3 * kinetics.zero_crossing(series)[0] + 2, longest)
     found = _correlate(series, sample, n_lags, np.array([min(1, n_lags - 1)]))
@@ -119,7 +139,7 @@ def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
     )
 
 
-def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, label: str) -> Row:
+def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, what: str, label: str) -> Row:
     at = int(np.searchsorted(results[0].kept, lag))
     time = format_time_ps(lag * trio.reference.features.lag_ps)
     return observable_row(
@@ -128,15 +148,15 @@ def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, label: str)
         [r.draws[:, at] for r in results],
         key=f"correlation:{lag}:{label}",
         group="kinetics",
-        metric=f"Autocorrelation of cos ψ at {time}, {label}",
+        metric=f"Autocorrelation of {what} at {time}, {label}",
         unit="",
         tolerance=0.05,
         tolerance_text="± 0.05",
-        statement=lambda c, r: f"cos ψ of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
+        statement=lambda c, r: f"{what} of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
     )
 
 
-def _time_row(trio: Trio, results: Sequence[_Correlated], label: str) -> Row:
+def _time_row(trio: Trio, results: Sequence[_Correlated], what: str, label: str) -> Row:
     lag_ps = trio.reference.features.lag_ps
     return observable_row(
         trio,
@@ -144,11 +164,11 @@ def _time_row(trio: Trio, results: Sequence[_Correlated], label: str) -> Row:
         [r.draws_time * lag_ps for r in results],
         key=f"correlation_time:{label}",
         group="kinetics",
-        metric=f"Relaxation time of cos ψ, {label}",
+        metric=f"Relaxation time of {what}, {label}",
         unit="ps",
         tolerance=0.2,
         tolerance_text="± 20 %",
-        statement=lambda c, r: speed_words(f"cos ψ of {label} relaxes", c, r),
+        statement=lambda c, r: speed_words(f"{what} of {label} relaxes", c, r),
         log=True,
     )
 
@@ -158,6 +178,8 @@ def speed_words(what: str, candidate: float, reference: float) -> str:
         return f"{what} not at all: it does not move"
     if candidate <= 0:
         return f"{what} within one frame (reference {reference:.3g} ps)"
+    if reference <= 0:
+        return f"{what} in {candidate:.3g} ps, the reference within one frame"
     ratio = reference / candidate
     words = f"{ratio:.2g} times too fast" if ratio >= 1 else f"{1 / ratio:.2g} times too slowly"
     return f"{what} {words} ({candidate:.3g} ps instead of {reference:.3g} ps)"
@@ -211,20 +233,6 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
         ),
     ]
     return rows, [curves.histogram(trio, projected, bins, "TIC 0", "")], []
-
-
-def tica_features(features: Features) -> list[FloatArray]:
-    """Return cos and sin of phi, psi, chi and every other rotatable torsion, `(n_frames, k)` per segment.
-
-    Amide bonds and rotors (methyl and the like) are left out: what turns them is not the slow motion looked for.
-    """
-    slow = [k for k, t in enumerate(features.probes.torsions) if t.kind in SLOW_KINDS] if features.probes else []
-    further = features.series.get("torsions") if slow else None
-    out = []
-    for i, (phi, psi) in enumerate(zip(features.phi, features.psi, strict=True)):
-        others = [] if further is None else [further[i][:, slow]]
-        out.append(kinetics.circular_features(phi, psi, *others))
-    return out
 
 
 def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:

@@ -6,31 +6,41 @@ from collections.abc import Sequence
 
 from surrogate.judge import metrics, verdict
 from surrogate.judge.rows import Options, Row, Trio
+from surrogate.judge.slow_motion import rarely_crossed
 from surrogate.judge.structure import Features
 from systems import validity
 from systems.units import format_time_ps
 
-_SHORT_IN_CORRELATION_TIMES = 30
+LEAST_SAMPLES = 20
+_MENTIONED = 3
 
 
-def trimming(
-    trio: Trio, reference: Features, candidate: Features, replicate: Features, correlation: float
-) -> list[str]:
-    """Return what was left out of each trajectory for equal length, and whether the rest is too short to judge by."""
-    notes = []
-    compared = trio.reference.features
-    for features in (reference, candidate, replicate):
-        if features.n_frames > compared.n_frames:
-            notes.append(
-                f"{features.label}: the first {format_time_ps(compared.total_ps)} of "
-                f"{format_time_ps(features.total_ps)} are used, for equal length."
-            )
-    if compared.n_frames < _SHORT_IN_CORRELATION_TIMES * 2 * correlation:
-        notes.append(
-            f"The compared length is only {compared.n_frames / (2 * correlation):.0f} correlation times of the slowest "
-            "torsion: too short to judge by; error bars are themselves uncertain."
+def trimming(trio: Trio, reference: Features, candidate: Features, replicate: Features) -> list[str]:
+    """Return which trajectories are longer than the equal length at which distances are taken."""
+    longer = [f for f in (reference, candidate, replicate) if f.total_ps > trio.compared_ps]
+    return [
+        f"{f.label}: the first {format_time_ps(trio.compared_ps)} of {format_time_ps(f.total_ps)} are used for the "
+        "distances, at equal length; all of it for the tests."
+        for f in longer
+    ]
+
+
+def doubts(trio: Trio, samples: float, correlation: float) -> verdict.Doubts:
+    """Return which slow motions are not sampled, in words."""
+    short = lost = ""
+    lag_ps = trio.reference.features.lag_ps
+    if samples < LEAST_SAMPLES:
+        short = (
+            f"the slowest motion is remembered for {format_time_ps(float(f'{correlation * lag_ps:.2g}'))}, which "
+            f"makes {samples:.2g} independent samples, too few to judge by ({LEAST_SAMPLES} are needed)"
         )
-    return notes
+    apart = rarely_crossed((trio.reference.features, trio.replicate.features), trio.candidate.features)
+    if apart:
+        named = ", ".join(apart[:_MENTIONED]) + (f" and {len(apart) - _MENTIONED} more" if apart[_MENTIONED:] else "")
+        lost = (
+            f"it lies in another state of {named} than the reference, and hardly any run passes from one to the other"
+        )
+    return verdict.Doubts(short, lost)
 
 
 def unlike(rows: Sequence[Row], options: Options) -> list[str]:

@@ -29,6 +29,11 @@ Group = Literal["validity", "structure", "populations", "distributions", "kineti
 Kind = Literal["share", "distance", "observable"]
 Word = Literal["agrees", "close", "differs", "fails", "undecided", "imposed"]
 
+# A replicate this unlikely to be of one simulation with the reference does not speak for it.
+UNLIKE_BELOW = 1e-3
+# Histograms drawn at a time, as numbers: a hundred MB or so.
+_DRAWN_VALUES = 4e6
+
 GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributions", "kinetics")
 
 
@@ -94,11 +99,17 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`."""
+    """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`.
+
+    Tests use all blocks. What depends on the length itself (a histogram's distance, the floor) uses the first `n_equal`
+    blocks alone, which are as long as those of the other trajectories.
+    """
 
     features: Features
     blocks: Blocks
     weights: FloatArray
+    n_equal: int
+    equal_weights: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +126,30 @@ class Trio:
     temperature_k: float = 300.0
 
     @property
+    def compared_ps(self) -> float:
+        """The equal length, ps."""
+        return min(s.features.total_ps for s in self.samples)
+
+    @property
     def samples(self) -> tuple[Sample, Sample, Sample]:
         """Reference, candidate, replicate."""
         return self.reference, self.candidate, self.replicate
 
 
-def make_sample(features: Features, blocks: Blocks, options: Options, stream: int) -> Sample:
-    """Return a sample with its own stream of bootstrap draws, so that adding a candidate changes no other number."""
+def make_sample(
+    features: Features, blocks: Blocks, options: Options, stream: int, n_equal_frames: int | None = None
+) -> Sample:
+    """Return a sample with its own stream of bootstrap draws, so that adding a candidate changes no other number.
+
+    `n_equal_frames`: the length that all trajectories of the comparison have; None for the whole.
+    """
     rng = np.random.default_rng([options.seed, stream])
-    return Sample(features, blocks, bootstrap_weights(blocks.n_blocks, options.n_bootstrap, rng))
+    n = blocks.n_blocks
+    if n_equal_frames is not None and n_equal_frames < features.n_frames:
+        n = max(min(round(n * n_equal_frames / features.n_frames), n), 1)
+    weights = bootstrap_weights(blocks.n_blocks, options.n_bootstrap, rng)
+    equal = weights if n == blocks.n_blocks else bootstrap_weights(n, options.n_bootstrap, rng)
+    return Sample(features, blocks, weights, n, equal)
 
 
 def by_group(rows: Sequence[Row]) -> list[Row]:
@@ -139,11 +165,15 @@ def distance_row(
     group: Group,
     metric: str,
     statement: Callable[[float], str],
+    strata: Sequence[npt.NDArray[np.int64]] | None = None,
 ) -> Row:
     """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate).
 
     `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged.
-    `statement(ratio)` words the deviation. The p-values are block permutation tests.
+    `statement(ratio)` words the deviation. Distances are those of equal lengths; the p-values are block permutation
+    tests of everything there is. A replicate that differs from the reference does not speak for it: the candidate is
+    then tested against the reference alone. `strata`: the kind of each block of the three; only blocks of one kind are
+    exchanged.
     """
     ref, cand, rep = (c.reshape(len(c), -1, c.shape[-1]) for c in counts)
     # Bins that nobody visits add nothing to any distance.
@@ -156,18 +186,16 @@ def distance_row(
         return np.asarray(distributions.distance(p.reshape(shape), q.reshape(shape)).mean(-1))
 
     flat = [c.reshape(len(c), -1) for c in (ref, cand, rep)]
-    sums = [c.sum(0)[None] for c in flat]
-    drawn = [s.weights @ c for s, c in zip(trio.samples, flat, strict=True)]
+    equal = [c[: s.n_equal] for s, c in zip(trio.samples, flat, strict=True)]
+    sums = [c.sum(0)[None] for c in equal]
     to_candidate, to_replicate = float(mean_distance(sums[0], sums[1])[0]), float(mean_distance(sums[0], sums[2])[0])
-    draws_candidate, draws_replicate = mean_distance(drawn[0], drawn[1]), mean_distance(drawn[0], drawn[2])
-    n_blocks = min(len(c) for c in flat)
+    draws_candidate, draws_replicate = drawn_distances(trio, equal, mean_distance)
+    n_blocks = min(len(c) for c in equal)
     ratio = Estimate(math.nan)
     if to_replicate > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
-    rng = np.random.default_rng([trio.options.seed, 99])
-    n_permutations = trio.options.n_permutations
-    p = permutation_p(np.concatenate([flat[0], flat[2]]), flat[1], mean_distance, rng, n_permutations)
+    p, p_replicate = permutation_pair(trio, flat, mean_distance, 99, strata)
     return Row(
         key=key,
         group=group,
@@ -179,12 +207,66 @@ def distance_row(
         replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
         ratio=ratio,
         p_value=p if math.isfinite(to_candidate) else math.nan,
-        p_replicate=permutation_p(flat[0], flat[2], mean_distance, rng, n_permutations),
+        p_replicate=p_replicate,
         tolerance=2.0,
         tolerance_text="≤ 2 × replicate",
         statement=statement(ratio.value),
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
+
+
+Distance = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def drawn_distances(trio: Trio, equal: Sequence[FloatArray], distance: Distance) -> tuple[FloatArray, FloatArray]:
+    """Return bootstrap draws `(n_draws,)` of the distances of candidate and replicate to the reference.
+
+    `equal`: sums over the equally long parts of (reference, candidate, replicate), `(n_blocks, n_sums)`.
+    """
+    found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    n_draws = trio.options.n_bootstrap
+    batch = max(1, int(_DRAWN_VALUES // max(equal[0].shape[1], 1)))
+    for start in range(0, n_draws, batch):
+        ref, cand, rep = (s.equal_weights[start : start + batch] @ c for s, c in zip(trio.samples, equal, strict=True))
+        found[0].append(distance(ref, cand))
+        found[1].append(distance(ref, rep))
+    return np.concatenate(found[0]), np.concatenate(found[1])
+
+
+def permutation_pair(
+    trio: Trio,
+    flat: Sequence[FloatArray],
+    distance: Distance,
+    stream: int,
+    strata: Sequence[npt.NDArray[np.int64]] | None = None,
+) -> tuple[float, float]:
+    """Return the p-values of the candidate and of the replicate by block permutation; see `distance_row`.
+
+    `flat`: sums over all blocks of (reference, candidate, replicate), `(n_blocks, n_sums)`.
+    """
+    ref, cand, rep = flat
+    n = trio.options.n_permutations
+    rng = np.random.default_rng([trio.options.seed, stream])
+    kinds = [np.zeros(len(c), dtype=np.int64) for c in flat] if strata is None else strata
+    of_replicate = permutation_p(ref, rep, distance, rng, n, np.concatenate([kinds[0], kinds[2]]))
+    truth = [0] if of_replicate < UNLIKE_BELOW else [0, 2]
+    p = permutation_p(
+        np.concatenate([flat[k] for k in truth]),
+        cand,
+        distance,
+        rng,
+        n,
+        np.concatenate([*(kinds[k] for k in truth), kinds[1]]),
+    )
+    return p, of_replicate
+
+
+def truth_of(reference: Estimate, replicate: Estimate, *, log: bool = False) -> Estimate:
+    """Return what a candidate is tested against: reference and replicate together, or the reference alone where the
+    replicate is not known or differs from it."""
+    if not math.isfinite(replicate.value) or difference_p(replicate, reference, log=log) < UNLIKE_BELOW:
+        return reference
+    return pooled(reference, replicate, log=log)
 
 
 def _distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
@@ -219,7 +301,7 @@ def observable_row(
     """
     made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, trio.samples, strict=True)]
     ref, cand, rep = made
-    both = pooled(ref, rep, log=log) if math.isfinite(rep.value) else ref
+    both = truth_of(ref, rep, log=log)
     ratio = Estimate(math.nan)
     if ref.value > 2.0 * ref.error:
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -21,7 +21,7 @@ from surrogate.judge.block_means import (
 from surrogate.judge.charts import BarChart, Chart
 from surrogate.judge.curves import histogram
 from surrogate.judge.distributions import Bins
-from surrogate.judge.equal_atoms import equal_rows, group_labels
+from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, equal_rows, evenly, group_labels
 from surrogate.judge.rows import Group, Row, Trio, distance_row, observable_row
 
 FloatArray = npt.NDArray[np.float64]
@@ -196,6 +196,7 @@ def _angle_rows(trio: Trio) -> list[Row]:
     limits = bounds(angles[0])
     means = [block_means(s, v, limits) for s, v in zip(trio.samples, angles, strict=True)]
     groups = equal_rows(probes.angles, probes.classes)
+    drawn = evenly(groups, MOST_HISTOGRAMS)
     pooled = [over_equal(m, groups) for m in means]
     in_degrees = [Means(np.degrees(m.values), np.degrees(m.draws), m.n_blocks) for m in pooled]
     shift = shift_row(
@@ -210,8 +211,8 @@ def _angle_rows(trio: Trio) -> list[Row]:
         resolution=_ANGLE_RESOLUTION_DEG,
         statement=lambda label, c, r: f"the angle {label} is {abs(c - r):.1f}° too {'wide' if c > r else 'narrow'}",
     )
-    bins = [distributions.normal_bins([x[:, g] for x in angles[0]], _ANGLE_BINS) for g in groups]
-    return [shift, mean_distance(trio, angles, bins, "angle_jsd", "Bond angles", "structure", groups)]
+    bins = [distributions.normal_bins([x[:, g] for x in angles[0]], _ANGLE_BINS) for g in drawn]
+    return [shift, mean_distance(trio, angles, bins, "angle_jsd", "Bond angles", "structure", drawn)]
 
 
 def _pucker_rows(trio: Trio, charts: list[Chart]) -> list[Row]:

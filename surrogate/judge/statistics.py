@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
-MIN_BLOCKS = 10
+MIN_BLOCKS = 4
 MAX_BLOCKS = 100
 BLOCK_IN_CORRELATION_TIMES = 10
 ENOUGH_AS_FAR = 100
@@ -68,7 +69,11 @@ class Estimate:
 
 
 def block_length(n_frames: int, correlation_frames: float) -> int:
-    """Return the block length in frames: ten correlation times, but at least 10 and at most 100 blocks in all."""
+    """Return the block length in frames: ten correlation times, but at least 4 and at most 100 blocks in all.
+
+    Fewer than ten blocks are few degrees of freedom, and fewer than five no permutation test over many rows can find
+    significant: what has not been sampled is then undecided, never an alarm.
+    """
     wanted = BLOCK_IN_CORRELATION_TIMES * correlation_frames if math.isfinite(correlation_frames) else n_frames
     shortest, longest = n_frames / MAX_BLOCKS, n_frames / MIN_BLOCKS
     return max(1, int(min(max(wanted, shortest), longest)))
@@ -174,20 +179,22 @@ def difference_p(a: Estimate, b: Estimate, *, log: bool = False) -> float:
 
 
 def pooled(a: Estimate, b: Estimate, *, log: bool = False) -> Estimate:
-    """Return the mean of two equally long measurements of one thing (geometric with `log`).
+    """Return the mean of two measurements of one thing, weighted by their blocks (geometric with `log`).
 
     Its error is the combined standard error, or half their difference where that is larger: two pieces of one reference
     that disagree by more than their error bars show that the bars are too short.
     """
     n_blocks = a.n_blocks + b.n_blocks
+    share = a.n_blocks / n_blocks if n_blocks else 0.5
+    apart = math.sqrt(share * (1.0 - share))
     if log and a.value > 0 and b.value > 0:
-        value = math.sqrt(a.value * b.value)
-        combined = 0.5 * math.hypot(a.log_error, b.log_error)
-        log_error = max(combined, 0.5 * abs(math.log(a.value / b.value))) if math.isfinite(combined) else math.nan
+        value = math.exp(share * math.log(a.value) + (1.0 - share) * math.log(b.value))
+        combined = math.hypot(share * a.log_error, (1.0 - share) * b.log_error)
+        log_error = max(combined, apart * abs(math.log(a.value / b.value))) if math.isfinite(combined) else math.nan
         return Estimate(value, error=value * log_error, log_error=log_error, n_blocks=n_blocks)
-    combined = 0.5 * math.hypot(a.error, b.error)
-    error = max(combined, 0.5 * abs(a.value - b.value)) if math.isfinite(combined) else math.nan
-    return Estimate(0.5 * (a.value + b.value), error=error, n_blocks=n_blocks)
+    combined = math.hypot(share * a.error, (1.0 - share) * b.error)
+    error = max(combined, apart * abs(a.value - b.value)) if math.isfinite(combined) else math.nan
+    return Estimate(share * a.value + (1.0 - share) * b.value, error=error, n_blocks=n_blocks)
 
 
 def excess_p(n_candidate: int, n_others: int, share: float) -> float:
@@ -207,16 +214,19 @@ def permutation_p(
     distance: Callable[[FloatArray, FloatArray], FloatArray],
     rng: np.random.Generator,
     n_permutations: int = 1000,
+    strata: IntArray | None = None,
 ) -> float:
     """Return the p-value of "both sets of blocks come from one distribution" under the statistic `distance`.
 
     `counts_a` and `counts_b` are histograms per block, `(n_blocks_a | n_blocks_b, n_bins)`. Blocks are dealt at random
     to two sides; the p-value is the share of deals at least as far apart as the data. Dealing stops early once
     `ENOUGH_AS_FAR` deals were as far (Besag and Clifford, Biometrika 78, 301, 1991), as p is then known well enough.
-    Blocks must be longer than the correlation time for the blocks to be exchangeable.
+    Blocks must be longer than the correlation time for the blocks to be exchangeable. With `strata` `(n_blocks_a +
+    n_blocks_b,)` only blocks of one stratum are exchanged: each side keeps as many of each kind as it has.
     """
     pooled = np.concatenate([counts_a, counts_b])
     n_a, n = len(counts_a), len(pooled)
+    groups = [np.arange(n)] if strata is None else [np.flatnonzero(strata == k) for k in np.unique(strata)]
     observed = float(distance(counts_a.sum(0)[None], counts_b.sum(0)[None])[0])
     total = pooled.sum(0)
     n_as_far, done = 0, 0
@@ -224,9 +234,10 @@ def permutation_p(
     batch = min(largest, 2 * ENOUGH_AS_FAR)
     while done < n_permutations:
         size = min(batch, n_permutations - done)
-        order = rng.random((size, n)).argsort(axis=1)
         side = np.zeros((size, n))
-        np.put_along_axis(side, order[:, :n_a], 1.0, axis=1)
+        for members in groups:
+            order = members[rng.random((size, len(members))).argsort(axis=1)]
+            np.put_along_axis(side, order[:, : int((members < n_a).sum())], 1.0, axis=1)
         left = side @ pooled
         as_far = n_as_far + (distance(left, total - left) >= observed * (1 - 1e-12)).cumsum()
         if as_far[-1] >= ENOUGH_AS_FAR:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from surrogate.judge.imposed_rows import is_imposed
 from surrogate.judge.rows import Options, Row, Word
@@ -20,6 +20,17 @@ _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0,
 _MENTIONED = 3
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
+
+
+class Doubts(NamedTuple):
+    """Why a verdict must wait, in words, empty where it need not: `short` for slow motion sampled too little for
+    anything to agree, `apart` for states between which hardly any run passes, so that a difference says nothing."""
+
+    short: str = ""
+    apart: str = ""
+
+
+SURE = Doubts()
 
 
 def judge_rows(rows: Sequence[Row], options: Options, imposed: Collection[str] = ()) -> tuple[Row, ...]:
@@ -94,14 +105,20 @@ def _share_word(row: Row) -> Word:
     return "differs" if excess <= _FAILS_AT * row.tolerance else "fails"
 
 
-def status(rows: Sequence[Row]) -> Status:
-    """Return the word for the whole: that of the worst row; undecided when most statistical rows are."""
+def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
+    """Return the word for the whole: that of the worst row; undecided when most statistical rows are, or by `doubts`.
+
+    Frames that are no molecule are so whatever the doubts are."""
     words = [r.verdict for r in rows]
     if "fails" in words:
         return "broken"
+    if doubts.apart and not any(r.verdict == "differs" and r.group == "validity" for r in rows):
+        return "undecided"
     if "differs" in words:
         return "different"
     statistical = [r.verdict for r in rows if r.kind != "share" and r.verdict != "imposed"]
+    if doubts.short:
+        return "undecided"
     if statistical and statistical.count("undecided") > 0.5 * len(statistical):
         return "undecided"
     return "close" if "close" in words else "indistinguishable"
@@ -132,9 +149,9 @@ def _excess(row: Row) -> float:
     return off / row.tolerance if row.tolerance > 0 else off
 
 
-def sentence(rows: Sequence[Row], found: Sequence[str], compared: str) -> str:
+def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, doubts: Doubts = SURE) -> str:
     """Return the verdict in one or two sentences; `compared` is the compared length in words."""
-    kind = status(rows)
+    kind = status(rows, doubts)
     imposed = sum(r.verdict == "imposed" for r in rows)
     n = len(rows) - imposed
     undecided = sum(r.verdict == "undecided" for r in rows)
@@ -142,7 +159,7 @@ def sentence(rows: Sequence[Row], found: Sequence[str], compared: str) -> str:
     more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
     tail = ""
     if undecided:
-        tail = f" {undecided} of {n} metrics cannot be decided with this much reference."
+        tail = f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
     if imposed:
         tail += f" {imposed} more are imposed and left out."
     if kind == "broken":
@@ -157,7 +174,9 @@ def sentence(rows: Sequence[Row], found: Sequence[str], compared: str) -> str:
             f"tolerance: {worst}{more}.{tail}"
         )
     if kind == "undecided":
-        return f"Undecided over {compared}: the error bars are wider than the tolerances.{tail}"
+        why = "; ".join(filter(None, doubts)) or "the error bars are wider than the tolerances"
+        all_the_same = f" Significant as it stands: {worst}{more}." if found else ""
+        return f"Undecided over {compared}: {why}.{all_the_same}{tail}"
     return (
         f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics differs significantly "
         f"from it.{tail}"

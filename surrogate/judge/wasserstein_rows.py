@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from surrogate.judge.block_means import family_of
 from surrogate.judge.charts import Chart
-from surrogate.judge.equal_atoms import equal_rows
-from surrogate.judge.rows import Row, Trio
-from surrogate.judge.statistics import Blocks, Estimate, estimate, permutation_p
+from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, equal_rows, evenly
+from surrogate.judge.rows import Row, Trio, drawn_distances, permutation_pair
+from surrogate.judge.statistics import Blocks, Estimate, estimate
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
@@ -31,11 +31,11 @@ def wasserstein_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str
     pairs = np.asarray(trio.geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
     if len(pairs):
         lengths = [s.features.bonds_nm for s in trio.samples]
-        groups = equal_rows(pairs, probes.classes)
+        groups = evenly(equal_rows(pairs, probes.classes), MOST_HISTOGRAMS)
         rows.append(_row(trio, lengths, groups, "bond_wasserstein", "Bond lengths", "Å", 10.0, 0.5, 0.01, 0.001))
     if len(probes.angles):
         angles = [family_of(s, "angles") for s in trio.samples]
-        groups = equal_rows(probes.angles, probes.classes)
+        groups = evenly(equal_rows(probes.angles, probes.classes), MOST_HISTOGRAMS)
         rows.append(
             _row(trio, angles, groups, "angle_wasserstein", "Bond angles", "°", 180.0 / math.pi, 30.0, 1.0, 0.05)
         )
@@ -65,24 +65,17 @@ def _row(
         shape = (len(p), len(groups), _BINS)
         return wasserstein(p.reshape(shape), q.reshape(shape), widths).mean(axis=-1)
 
-    total = [c.sum(0)[None] for c in flat]
-    drawn = [s.weights @ c for s, c in zip(trio.samples, flat, strict=True)]
-    n_blocks = min(map(len, flat))
+    equal = [c[: s.n_equal] for s, c in zip(trio.samples, flat, strict=True)]
+    total = [c.sum(0)[None] for c in equal]
+    drawn = drawn_distances(trio, equal, distance)
+    n_blocks = min(map(len, equal))
     made: list[Estimate] = []
     for k in (1, 2):
-        value, draws = float(distance(total[0], total[k])[0]), distance(drawn[0], drawn[k])
-        found = estimate(value, draws, n_blocks)
+        found = estimate(float(distance(total[0], total[k])[0]), drawn[k - 1], n_blocks)
         made.append(replace(found, low=max(found.low, 0.0)))
-    rng = np.random.default_rng([trio.options.seed, 98])
-    n = trio.options.n_permutations
     candidate, replicate = made
-    p_values = [
-        permutation_p(a, b, distance, rng, n) if of.value > resolution else 1.0
-        for a, b, of in (
-            (np.concatenate([flat[0], flat[2]]), flat[1], candidate),
-            (flat[0], flat[2], replicate),
-        )
-    ]
+    tested = permutation_pair(trio, flat, distance, 98)
+    p_values = [p if of.value > resolution else 1.0 for p, of in zip(tested, made, strict=True)]
     low = name[0].lower() + name[1:]
     return Row(
         key=key,

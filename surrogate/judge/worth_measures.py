@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,11 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions, kinetics
 from surrogate.judge.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
-from surrogate.judge.relaxation import longest_correlation, tica_features
+from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, evenly
+from surrogate.judge.metrics import MOST_MAPS
+from surrogate.judge.relaxation import turning
 from surrogate.judge.rows import Options
+from surrogate.judge.slow_motion import SLOW_KINDS, longest_correlation, tica_features
 from surrogate.judge.statistics import Blocks, Piece, block_length, make_blocks
 from surrogate.judge.structure import Backbone, Features
 from surrogate.judge.worth import Measure, Worth, worth_by
@@ -63,7 +66,7 @@ def _equal_parts(reference: Features, candidate: Features, replicate: Features) 
     if n_blocks < 8:
         return None
     truth, other = reference.frames(0, n), replicate.frames(0, n)
-    slowest = longest_correlation(truth)
+    slowest = longest_correlation(truth, other)
     blocks = (
         even_blocks(truth.segment_lengths, n_blocks),
         make_blocks(candidate.segment_lengths, block_length(candidate.n_frames, slowest)),
@@ -89,19 +92,32 @@ def _measures(three: Three, blocks: ThreeBlocks, torsions: Backbone, options: Op
     out = []
     if torsions.residues:
         out.append(_joint_measure(three, blocks, torsions))
-    singles = [
-        [_counts(pick(f), k, b) for f, b in zip(three, blocks, strict=True)]
-        for pick, n in ((_phi, len(torsions.phi)), (_psi, len(torsions.psi)))
-        for k in range(n)
-    ]
-    if singles:
-        out.append(_histogram_measure("torsion_jsd", "each φ and ψ alone", singles))
+    name, columns = _torsion_columns(three, torsions)
+    if columns:
+        singles = [[_counts(pick(f), k, b) for f, b in zip(three, blocks, strict=True)] for pick, k in columns]
+        out.append(_histogram_measure("torsion_jsd", name, singles))
         out += _tica_measures(three, blocks, options)
         moving = _correlation_measure(three, blocks)
         out += [moving] if moving is not None else []
     elif three[0].bonds_nm[0].shape[1]:
         out.append(_bond_measure(three, blocks))
     return out
+
+
+def _torsion_columns(three: Three, torsions: Backbone) -> tuple[str, list[tuple[Callable[[Features], Segments], int]]]:
+    """Return what the torsions are called together, and each as the series it is in and its column: phi and psi, or,
+    where there are none, rotatable torsions; rotors of what has nothing else that turns."""
+    backbone = [(_phi, k) for k in range(len(torsions.phi))] + [(_psi, k) for k in range(len(torsions.psi))]
+    if backbone:
+        return "each φ and ψ alone", evenly(backbone, MOST_HISTOGRAMS)
+    probes = three[0].probes
+    if probes is None or "torsions" not in three[0].series:
+        return "", []
+    for kinds, name in ((SLOW_KINDS, "each rotatable torsion alone"), (("rotor",), "each rotor alone")):
+        chosen = [(_further, k) for k, t in enumerate(probes.torsions) if t.kind in kinds]
+        if chosen:
+            return name, evenly(chosen, MOST_HISTOGRAMS)
+    return "", []
 
 
 def _joint_measure(three: Three, blocks: ThreeBlocks, torsions: Backbone) -> Measure:
@@ -112,7 +128,7 @@ def _joint_measure(three: Three, blocks: ThreeBlocks, torsions: Backbone) -> Mea
             )
             for f, b in zip(three, blocks, strict=True)
         ]
-        for r in torsions.residues
+        for r in evenly(torsions.residues, MOST_MAPS)
     ]
     return _histogram_measure("joint_jsd", "φ/ψ map", per_residue)
 
@@ -123,6 +139,10 @@ def _phi(features: Features) -> Segments:
 
 def _psi(features: Features) -> Segments:
     return features.psi
+
+
+def _further(features: Features) -> Segments:
+    return features.series["torsions"]
 
 
 def _counts(series: Segments, column: int, blocks: Blocks, bins: Bins = TORSION_BINS) -> FloatArray:
@@ -167,12 +187,15 @@ def _tica_measures(three: Three, blocks: ThreeBlocks, options: Options) -> list[
 
 
 def _correlation_measure(three: Three, blocks: ThreeBlocks) -> Measure | None:
-    """Return the root mean square difference of the autocorrelations of cos psi, at lags even on a log scale.
+    """Return the root mean square difference of the autocorrelations of cos psi (of rotatable torsions where there is
+    no psi), at lags even on a log scale.
 
-    Lags run to the first zero crossing of the reference's slowest psi. None where no psi moves.
+    Lags run to the first zero crossing of the reference's slowest torsion. None where none moves.
     """
-    n_psi = three[0].psi[0].shape[1]
-    series = [[[np.cos(x[:, k].astype(np.float64)) for x in f.psi] for f in three] for k in range(n_psi)]
+    moving = [turning(f) for f in three]
+    chosen = evenly(range(len(moving[0])), MOST_MAPS)
+    series = [[m[k][2] for m in moving] for k in chosen]
+    n_psi = len(series)
     longest = max((kinetics.zero_crossing(per_sample[0])[0] for per_sample in series), default=0)
     longest = min(longest, *(max(f.segment_lengths) - 1 for f in three))
     if longest < 2:
@@ -195,4 +218,5 @@ def _correlation_measure(three: Three, blocks: ThreeBlocks) -> Measure | None:
     def squared(p: FloatArray, q: FloatArray) -> FloatArray:
         return np.asarray(((curves(p) - curves(q[None])) ** 2).mean(-1))
 
-    return Measure("psi_correlation", "kinetics", "autocorrelation of cos ψ", (sums[0], sums[1], sums[2]), squared)
+    name = "autocorrelation of cos ψ" if moving[0][0][0] else "autocorrelation of rotatable torsions"
+    return Measure("psi_correlation", "kinetics", name, (sums[0], sums[1], sums[2]), squared)

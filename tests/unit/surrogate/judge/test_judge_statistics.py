@@ -33,8 +33,8 @@ def test_blocks_cover_every_frame_once_and_cross_no_segment(lengths: list[int], 
 def test_block_length_follows_the_correlation_time_between_its_limits() -> None:
     assert statistics.block_length(10_000, 20.0) == 200
     assert statistics.block_length(10_000, 0.5) == 100
-    assert statistics.block_length(10_000, 5_000.0) == 1_000
-    assert statistics.block_length(10_000, math.inf) == 1_000
+    assert statistics.block_length(10_000, 5_000.0) == 2_500
+    assert statistics.block_length(10_000, math.inf) == 2_500
 
 
 def coverage(a: float, n_each: int, seed: int, n_experiments: int = 300) -> float:

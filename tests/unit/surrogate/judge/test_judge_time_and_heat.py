@@ -1,0 +1,152 @@
+"""A wrong time between frames, another temperature, torsions that have lost each other: each in its row, with a fair
+trajectory beside it that the row must leave alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogate.judge.comparison import Judgement, compare
+from surrogate.judge.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows import Options
+from surrogate.judge.slow_motion import longest_correlation, rarely_crossed
+from surrogate.judge.statistics import permutation_p
+from surrogate.judge.structure import Features
+
+OPTIONS = Options(peptide_recipe=False)
+
+
+@pytest.fixture(scope="module")
+def runs(shared_data: Path) -> list[Ensemble]:
+    folder = shared_data / "alanine-dipeptide"
+    return [load_ensemble([folder / f"trajectory-{k}.dcd"], top=folder / "ala2.pdb", lag_ps=1.0) for k in (1, 2, 3)]
+
+
+def like(run: Ensemble, frames: np.ndarray, label: str) -> Ensemble:
+    return replace(run, segments=[np.ascontiguousarray(frames)], label=label)
+
+
+@pytest.fixture(scope="module")
+def judged(runs: list[Ensemble]) -> dict[str, Judgement]:
+    frames = np.array(runs[1].segments[0])
+    n = len(frames)
+    candidates = [
+        runs[1],
+        like(runs[1], frames[::2], "every second"),
+        like(runs[1], frames[::5], "every fifth"),
+        like(runs[1], frames[np.arange(n) % 5 != 4], "fifth dropped"),
+        like(runs[1], np.repeat(frames, 2, axis=0)[:n], "doubled"),
+    ]
+    found = compare(runs[0], candidates, runs[2], options=OPTIONS).judgements
+    return {j.account.label: j for j in found}
+
+
+def test_a_fair_replicate_steps_as_the_reference_does(judged: dict[str, Judgement], runs: list[Ensemble]) -> None:
+    fair = judged[runs[1].label]
+    assert fair.status in ("indistinguishable", "undecided") and not fair.findings, fair.verdict
+    for key in ("torsion_step", "temperature", "phi_given_psi"):
+        assert fair.row(key).verdict == "agrees", key
+
+
+@pytest.mark.parametrize(
+    ("label", "degrees"),
+    [("every second", 23.2), ("every fifth", 29.5), ("fifth dropped", 19.9), ("doubled", 13.0)],
+)
+def test_a_wrong_time_between_frames_is_seen(judged: dict[str, Judgement], label: str, degrees: float) -> None:
+    row = judged[label].row("torsion_step")
+    assert row.verdict == "differs" and judged[label].status == "different"
+    assert row.candidate.value == pytest.approx(degrees, rel=0.05)
+    assert "from frame to frame" in judged[label].verdict
+
+
+def test_phi_shifted_against_psi_is_seen_within_the_basins(simulate: Callable[..., Ensemble]) -> None:
+    """The toy's phi and psi of different times: each alone is right, their maps together are not."""
+    from surrogate.judge import structure
+
+    three = [simulate(k, 6_000) for k in (31, 32, 33)]
+    torsions = structure.backbone(three[0].scene)
+    geometry = structure.reference_geometry(three[0])
+    probes = structure.reference_probes(three[0])
+    measured = [structure.measure(e, torsions, geometry, probes) for e in three]
+    shifted = replace(measured[1], phi=[np.roll(measured[1].phi[0], 3_000, axis=0)])
+    for features, expected in ((measured[1], ("agrees",)), (shifted, ("differs",))):
+        assert _within(three[0], measured, features)["phi_given_psi:ALA 2"] in expected
+
+
+def _within(reference: Ensemble, measured: list[Features], candidate: Features) -> dict[str, str]:
+    from surrogate.judge import comparison, structure, verdict
+    from surrogate.judge.within_rows import within_rows
+
+    torsions, geometry = structure.backbone(reference.scene), structure.reference_geometry(reference)
+    trio, _ = comparison._equal_terms(reference.scene, torsions, geometry, measured[0], candidate, measured[2], OPTIONS)
+    return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
+
+
+def test_blocks_of_one_kind_are_exchanged_with_their_like() -> None:
+    """Two kinds of blocks, unequally many on each side: without the kinds the sides look different."""
+    rng = np.random.default_rng(0)
+    kinds = np.array([0] * 18 + [1] * 2 + [0] * 6 + [1] * 14)
+    counts = np.where(kinds[:, None] == 0, [90.0, 10.0], [10.0, 90.0]) + rng.integers(0, 9, (40, 2))
+
+    def apart(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.abs(p[:, 0] / p.sum(1) - q[:, 0] / q.sum(1))
+
+    assert permutation_p(counts[:20], counts[20:], apart, rng, 500) < 0.01
+    assert permutation_p(counts[:20], counts[20:], apart, rng, 500, kinds) > 0.05
+
+
+def test_heat_shows_in_the_temperature_and_not_in_a_fair_run(simulate: Callable[..., Ensemble]) -> None:
+    three = [simulate(k, 6_000) for k in (41, 42, 43)]
+    frames = three[1].segments[0]
+    warm = frames + np.random.default_rng(5).normal(0, 0.002 * np.sqrt(50 / 300), frames.shape)
+    fair, hot = compare(
+        three[0], [three[1], like(three[1], warm.astype(np.float32), "350 K")], three[2], options=OPTIONS
+    ).judgements
+    assert fair.row("temperature").verdict == "agrees" and fair.row("temperature").candidate.value == pytest.approx(
+        300, abs=4
+    )
+    assert hot.row("temperature").verdict == "differs" and hot.row("temperature").candidate.value == pytest.approx(
+        350, abs=6
+    )
+    assert "vibrate as at 35" in " ".join(hot.findings) or "vibrate as at 34" in " ".join(hot.findings)
+
+
+def torsion_features(*angles: np.ndarray) -> Features:
+    """One further torsion and nothing else, a segment each."""
+    none = [np.empty((len(a), 0), dtype=np.float32) for a in angles]
+    flags = [np.zeros(len(a), dtype=np.uint16) for a in angles]
+    return Features("x", 1.0, [a[:, None].astype(np.float32) for a in angles], none, none, flags, None)
+
+
+def two_states(seed: int, n: int, dwell: float, start: int | None = None) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    state = (np.cumsum(rng.random(n) < 1 / dwell) + (rng.integers(2) if start is None else start)) % 2
+    return np.where(state == 1, 1.0, -1.2) + 0.2 * rng.standard_normal(n)
+
+
+def test_the_slowest_motion_is_found_whatever_the_molecule() -> None:
+    fast = longest_correlation(torsion_features(two_states(0, 20_000, 2.0)))
+    slow = longest_correlation(torsion_features(two_states(0, 20_000, 200.0)))
+    assert fast < 5 and slow == pytest.approx(100, rel=0.5), "two states of a mean stay of 200 frames: 100 frames"
+    stuck = longest_correlation(
+        torsion_features(two_states(1, 2_000, 1e9, 0)), torsion_features(two_states(2, 2_000, 1e9, 1))
+    )
+    assert stuck > 500, "two runs that stay apart have not sampled what lies between"
+
+
+def test_states_that_no_run_passes_between_are_told_from_a_wrong_population() -> None:
+    def run(start: int, dwell: float = 1e9, seed: int = 0) -> Features:
+        return torsion_features(two_states(seed, 4_000, dwell, start))
+
+    assert rarely_crossed((run(0), run(0, seed=1)), run(1, seed=2))
+    assert not rarely_crossed((run(0), run(0, seed=1)), run(0, seed=2)), "the same state"
+    assert not rarely_crossed((run(0, 50.0), run(0, 50.0, 1)), run(1, seed=2)), (
+        "the truth passes often: a state is missing"
+    )
+    assert not rarely_crossed((run(0), run(0, seed=1)), run(1, 50.0, 2)), (
+        "the candidate passes often: populations are wrong"
+    )
