@@ -73,8 +73,8 @@ class Judgement:
 
     `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` (of the reference) stand
     behind the error bars; `correlation_ps` is the integrated autocorrelation time of the slowest motion in reference
-    and replicate, which makes of the equal length `effective_samples` independent samples; `speed_ratio` is simulated time per wall
-    second over the reference's.
+    and replicate, which makes of the equal length `effective_samples` independent samples; `speed_ratio` is simulated
+    time per wall second over the reference's.
     `worth` says by each measure how much MD the whole candidate is worth, and `worth_words` says it in a sentence
     (empty where it cannot be told, or frames are broken).
     """

@@ -12,6 +12,8 @@ from systems import validity
 from systems.units import format_time_ps
 
 LEAST_SAMPLES = 20
+# What is known of the truth, however short the candidate is.
+LEAST_FOR_WORTH = 10
 _MENTIONED = 3
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge import kinetics
+from surrogate.judge.probes import Family
 from surrogate.judge.structure import Features
 
 FloatArray = npt.NDArray[np.float64]
@@ -71,7 +72,8 @@ def _angles(features: Features) -> list[tuple[str, list[npt.NDArray[Any]]]]:
     for symbol, series in (("φ", features.phi), ("ψ", features.psi)):
         out += [(f"{symbol} {k + 1}", [x[:, k] for x in series]) for k in range(series[0].shape[1])]
     if features.probes is not None:
-        for family, first, step in (("torsions", 0, 1), ("puckers", 1, 2)):
+        families: tuple[tuple[Family, int, int], ...] = (("torsions", 0, 1), ("puckers", 1, 2))
+        for family, first, step in families:
             if family in features.series:
                 names = features.probes.labels(family)[first::step]
                 out += [(n, [x[:, first + step * k] for x in features.series[family]]) for k, n in enumerate(names)]
@@ -106,8 +108,7 @@ def _all_series(features: Sequence[Features]) -> Iterator[Series]:
     n_phi, n_psi = features[0].phi[0].shape[1], features[0].psi[0].shape[1]
     further = features[0].series
     n_torsions, n_puckers, n_shape = (
-        further[family][0].shape[1] if family in further else 0  # type: ignore[index]
-        for family in ("torsions", "puckers", "shape")
+        further[family][0].shape[1] if family in further else 0 for family in ("torsions", "puckers", "shape")
     )
     for k in range(n_phi):
         yield [np.where(np.isfinite(x[:, k]), x[:, k] > 0, np.nan) for f in features for x in f.phi]

@@ -57,9 +57,7 @@ def _phi_row(trio: Trio, phi: int, psi: int, label: str) -> Row:
     angles = [[x[:, phi] for x in s.features.phi] for s in trio.samples]
     states = [
         [
-            np.where(distributions.is_positive(f), -1, np.where(distributions.is_alpha(p[:, psi]), 1, 0)).astype(
-                np.int64
-            )
+            np.where(distributions.is_positive(f), -1, distributions.is_alpha(p[:, psi]).astype(np.int64))
             for f, p in zip(own, s.features.psi, strict=True)
         ]
         for own, s in zip(angles, trio.samples, strict=True)
@@ -139,7 +137,7 @@ def _majority(sample: Sample, states: Sequence[IntArray]) -> IntArray:
 
 
 def _squared_steps(trio: Trio, sample: Sample) -> list[FloatArray]:
-    """Return per segment the mean square step in rad² of all torsions from each frame to the next, NaN after the last."""
+    """Return per segment the mean square step in rad² of all torsions from frame to frame, NaN after the last."""
     features = sample.features
     further = features.series.get("torsions")
     columns = _rotatable(trio)
