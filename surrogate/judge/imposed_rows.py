@@ -9,8 +9,8 @@ from systems.imposed import ANGLES, BONDS, RIGID_BONDS
 
 _ROWS = {
     RIGID_BONDS: ("bond_width:constrained bonds",),
-    BONDS: ("bond_shift", "bond_width:flexible bonds", "bond_jsd", "bond_wasserstein"),
-    ANGLES: ("angle_shift", "angle_jsd", "angle_wasserstein"),
+    BONDS: ("bond_shift", "bond_width:flexible bonds", "bond_jsd", "bond_wasserstein", "temperature"),
+    ANGLES: ("angle_shift", "angle_jsd", "angle_wasserstein", "temperature"),
 }
 
 
