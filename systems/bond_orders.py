@@ -79,15 +79,15 @@ def perceive(
     return orders, charges
 
 
-def _refuse_bent(
+def bent_carbons(
     elements: Sequence[str],
     neighbours: Sequence[Sequence[int]],
     atoms: Collection[int],
     positions_nm: npt.NDArray[np.float64],
-) -> None:
-    """Raise ValenceError naming carbons with three neighbours that are not flat, or with two not in a line."""
+) -> list[int]:
+    """Those of the atoms that are carbons with three neighbours and not flat, or with two and not straight."""
     bent = []
-    for i in atoms:
+    for i in sorted(atoms):
         if elements[i] != "C" or len(neighbours[i]) not in (2, 3):
             continue
         arms = positions_nm[neighbours[i]] - positions_nm[i]
@@ -96,8 +96,18 @@ def _refuse_bent(
             len(arms) == 2 and float(arms[0] @ arms[1]) > _STRAIGHT
         ):
             bent.append(i)
+    return bent
+
+
+def _refuse_bent(
+    elements: Sequence[str],
+    neighbours: Sequence[Sequence[int]],
+    atoms: Collection[int],
+    positions_nm: npt.NDArray[np.float64],
+) -> None:
+    bent = bent_carbons(elements, neighbours, atoms, positions_nm)
     if bent:
-        raise ValenceError(sorted(bent))
+        raise ValenceError(bent)
 
 
 def _match(

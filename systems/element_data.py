@@ -33,6 +33,11 @@ def atomic_weight_da(symbol: str) -> float:
     return _TABLE[symbol][0]
 
 
+def is_element(symbol: str) -> bool:
+    """Whether the table has this symbol."""
+    return symbol in _TABLE
+
+
 def is_metal(symbol: str) -> bool:
     """Whether this is a metal of the table."""
     return symbol in _TABLE and symbol not in _NOT_METALS

@@ -36,11 +36,10 @@ _CARBANION: _State = (3, -1, 25.0)
 _CYANIDE: _State = (3, -1, 20.0)
 _AZIDE_END: _State = (2, -1, 13.0)
 _OXONIUM: _State = (3, 1, 22.0)
-# Of a net charge on a group of conjugated atoms, an elementary charge; of one off the total that is said to be right.
+# Of a net charge on a group of conjugated atoms, an elementary charge.
 _NET_CHARGE = 4.0
-_OFF_TOTAL = 2.0
 # Ties: an order other than the file's, bonds that rarely are double, hydrogens on a nitrogen that takes a charge.
-_OTHER_ORDER = 0.3
+_OTHER_ORDER = 0.1
 _UNUSUAL = {frozenset("NO"): 0.0, frozenset("CO"): 0.02, frozenset("CN"): 0.03, frozenset("C"): 0.04,
             frozenset("CS"): 0.05}  # fmt: skip
 _HYDROGEN_ON_CATION = -0.02
@@ -63,7 +62,7 @@ def lewis_structure(
     """Return bond orders `(n_bonds,)` and formal charges `(n_atoms,)` of the structure of least penalty, or None.
 
     Every hydrogen must be present; no atom keeps an unpaired electron. `stated` holds orders that a file gives pairs
-    i < j, and `total_charge` a total it implies: both decide between structures that are otherwise alike.
+    i < j, which decide between structures that are otherwise alike; `total_charge` is the only one allowed.
     `carbon_ions` admits carbocations and carbanions.
     """
     pairs = [(min(i, j), max(i, j)) for i, j in bonds.tolist()]
@@ -77,16 +76,14 @@ def lewis_structure(
     orders = np.ones(len(pairs))
     charges = np.array([s[0][1] for s in states], dtype=np.int64)
     unsettled = [i for i, s in enumerate(states) if len(s) > 1 or s[0][0] != len(neighbours[i])]
+    rest = None if total_charge is None else total_charge - int(charges.sum() - charges[unsettled].sum())
     if not unsettled:
-        return orders, charges
+        return None if rest else (orders, charges)
     room = {i for i in unsettled if max(s[0] for s in states[i]) > len(neighbours[i])}
     open_bonds = [
         k for k, (i, j) in enumerate(pairs) if i in room and j in room and not _is_ylide(elements, neighbours, i, j)
     ]
-    solved = _solve(
-        elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {},
-        None if total_charge is None else total_charge - int(charges.sum() - charges[unsettled].sum()),
-    )  # fmt: skip
+    solved = _solve(elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {}, rest)
     if solved is None:
         return None
     extra, chosen = solved
@@ -167,50 +164,45 @@ def _solve(
     choices = [(k, s) for k, i in enumerate(atoms) for s in states[i]]
     conjugated = nx.Graph(bonds)
     conjugated.add_nodes_from(atoms)
-    groups = [sorted(group) for group in nx.connected_components(conjugated)]
-    n_bonds, n_choices = len(bonds), len(choices)
-    n_sums = len(groups) + (total is not None)
-    n = 2 * n_bonds + n_choices + n_sums
+    groups = [set(group) for group in nx.connected_components(conjugated)]
+    n_atoms, n_bonds = len(atoms), len(bonds)
+    first_sum = 2 * n_bonds + len(choices)
+    n = first_sum + len(groups)
     row_of = {i: k for k, i in enumerate(atoms)}
+    # Columns: a second and a third bond of each pair, the states, |charge| of each group.
     cost = np.zeros(n)
-    # Rows: one state an atom; valence; a third bond needs a second; |charge| of each group and of all.
-    matrix = lil_matrix((2 * len(atoms) + n_bonds + 2 * n_sums, n))
+    # Rows: one state an atom; valence; a third bond needs a second; |charge| of each group, twice; the total.
+    third, net = 2 * n_atoms, 2 * n_atoms + n_bonds
+    matrix = lil_matrix((net + 2 * len(groups) + (total is not None), n))
     low, high = np.zeros(matrix.shape[0]), np.zeros(matrix.shape[0])
-    low[: len(atoms)] = high[: len(atoms)] = 1.0
+    low[:n_atoms] = high[:n_atoms] = 1.0
     for k, (i, j) in enumerate(bonds):
-        pair = frozenset((elements[i], elements[j]))
-        wanted = stated.get((i, j))
-        cost[[k, n_bonds + k]] = _UNUSUAL.get(pair, 0.06)
-        if wanted is not None:
+        cost[[k, n_bonds + k]] = _UNUSUAL.get(frozenset((elements[i], elements[j])), 0.06)
+        if (wanted := stated.get((i, j))) is not None:
             cost[k] += _OTHER_ORDER if wanted < 2 else -_OTHER_ORDER
             cost[n_bonds + k] += _OTHER_ORDER if wanted < 3 else -_OTHER_ORDER
-        for i_end in (i, j):
-            matrix[len(atoms) + row_of[i_end], k] = matrix[len(atoms) + row_of[i_end], n_bonds + k] = 1.0
-        matrix[2 * len(atoms) + k, [k, n_bonds + k]] = (1.0, -1.0)
-        high[2 * len(atoms) + k] = 1.0
-    first_sum = 2 * n_bonds + n_choices
-    sums = [*((set(group), 0, _NET_CHARGE) for group in groups)]
-    if total is not None:
-        sums.append((set(atoms), total, _OFF_TOTAL))
+        for end in (i, j):
+            matrix[n_atoms + row_of[end], [k, n_bonds + k]] = 1.0
+        matrix[third + k, k], matrix[third + k, n_bonds + k] = 1.0, -1.0
+        high[third + k] = 1.0
     for c, (k, (valence, charge, penalty)) in enumerate(choices):
         i, column = atoms[k], 2 * n_bonds + c
-        on_cation = sum(elements[j] == "H" for j in neighbours[i]) if elements[i] == "N" and charge > 0 else 0
-        cost[column] = penalty + _HYDROGEN_ON_CATION * on_cation
+        hydrogens = sum(elements[j] == "H" for j in neighbours[i]) if elements[i] == "N" and charge > 0 else 0
+        cost[column] = penalty + _HYDROGEN_ON_CATION * hydrogens
         matrix[k, column] = 1.0
-        matrix[len(atoms) + k, column] = len(neighbours[i]) - valence
-        for g, (group, _, _) in enumerate(sums):
-            if i in group:
-                matrix[2 * len(atoms) + n_bonds + 2 * g, column] = charge
-                matrix[2 * len(atoms) + n_bonds + 2 * g + 1, column] = -charge
-    for g, (_, target, weight) in enumerate(sums):
-        cost[first_sum + g] = weight
-        rows = 2 * len(atoms) + n_bonds + 2 * g + np.arange(2)
-        matrix[rows, first_sum + g] = -1.0
-        low[rows], high[rows] = -np.inf, (target, -target)
-    upper = np.ones(n)
-    upper[first_sum:] = np.inf
-    whole = np.ones(n)
-    whole[first_sum:] = 0
+        matrix[n_atoms + k, column] = len(neighbours[i]) - valence
+        group = next(g for g, members in enumerate(groups) if i in members)
+        matrix[net + 2 * group, column], matrix[net + 2 * group + 1, column] = charge, -charge
+        if total is not None:
+            matrix[net + 2 * len(groups), column] = charge
+    for g in range(len(groups)):
+        cost[first_sum + g] = _NET_CHARGE
+        matrix[[net + 2 * g, net + 2 * g + 1], first_sum + g] = -1.0
+        low[[net + 2 * g, net + 2 * g + 1]] = -np.inf
+    if total is not None:
+        low[-1] = high[-1] = total
+    whole, upper = np.ones(n), np.ones(n)
+    whole[first_sum:], upper[first_sum:] = 0, np.inf
     found = milp(
         cost,
         integrality=whole,
@@ -220,7 +212,7 @@ def _solve(
     if found.x is None:
         return None
     x = np.round(found.x)
-    charges = np.zeros(len(atoms), dtype=np.int64)
+    charges = np.zeros(n_atoms, dtype=np.int64)
     for c, (k, (_, charge, _)) in enumerate(choices):
         charges[k] += int(x[2 * n_bonds + c]) * charge
     return x[:n_bonds] + x[n_bonds : 2 * n_bonds], charges

@@ -9,32 +9,40 @@ from typing import Any
 
 from systems.embedding import drop_isotopes, embed, require, sanitise
 from systems.errors import InputError, PreparationError
+from systems.mol2_file import missing_hydrogens, molecule_of, read_mol2
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
-_CHARGE_TOLERANCE = 0.2
 
 
 def read_molecule(path: Path, notes: list[str]) -> Any:
     """Return the first molecule of the file. Raises InputError or PreparationError; `notes` says what was changed."""
     from rdkit import Chem, rdBase
 
-    molecule: Any
     text = _text(path)
-    suffix = suffix_of(path)
     with rdBase.BlockLogs():
-        if suffix == ".mol2":
-            block = _first_mol2(text, path, notes)
-            molecule = Chem.MolFromMol2Block(block, sanitize=False, removeHs=False, cleanupSubstructures=True)
-        else:
-            block = _first_mol_block(text, notes)
-            molecule = Chem.MolFromMolBlock(block, sanitize=False, removeHs=False)
+        if suffix_of(path) == ".mol2":
+            return _read_mol2(text, path, notes)
+        molecule = Chem.MolFromMolBlock(_first_mol_block(text, notes), sanitize=False, removeHs=False)
     if molecule is None:
-        hint = " with SYBYL atom types" if suffix == ".mol2" else ""
-        raise InputError(f"{path} holds no molecule that can be read as {suffix[1:].upper()}; write it again{hint}.")
-    settled = settle_molecule(molecule, notes)
-    if suffix == ".mol2":
-        _check_charge(block, molecule)
-    return settled
+        raise InputError(f"{path} holds no molecule that can be read as {suffix_of(path)[1:].upper()}; write it again.")
+    return settle_molecule(molecule, notes)
+
+
+def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
+    """MOL2 with all hydrogens by its elements and bonds; without them by its types, if they are SYBYL's."""
+    from rdkit import Chem
+
+    found = read_mol2(text, path, notes)
+    has_hydrogens = "H" in found.elements
+    molecule = molecule_of(found, notes) if has_hydrogens else None
+    if molecule is None:
+        molecule = Chem.MolFromMol2Block(found.block, sanitize=False, removeHs=False, cleanupSubstructures=True)
+        # RDKit takes the names of other programs' types for elements.
+        if molecule is None or tuple(a.GetSymbol() for a in molecule.GetAtoms()) != found.elements:
+            molecule = None if has_hydrogens else molecule_of(found, notes)
+    if molecule is None:
+        raise missing_hydrogens(found)
+    return settle_molecule(molecule, notes)
 
 
 def settle_molecule(molecule: Any, notes: list[str]) -> Any:
@@ -77,36 +85,6 @@ def _first_mol_block(text: str, notes: list[str]) -> str:
     if len(records) > 1:
         notes.append(f"{len(records)} molecules in the file: the first is taken")
     return records[0] if records else ""
-
-
-def _first_mol2(text: str, path: Path, notes: list[str]) -> str:
-    records = text.split("@<TRIPOS>MOLECULE")[1:]
-    if not records:
-        raise InputError(f"{path} has no @<TRIPOS>MOLECULE record; write it again as MOL2.")
-    if len(records) > 1:
-        notes.append(f"{len(records)} molecules in the file: the first is taken")
-    return "@<TRIPOS>MOLECULE" + records[0]
-
-
-def _check_charge(block: str, molecule: Any) -> None:
-    """MOL2 has no formal charges: those that RDKit infers must add up to the partial charges of the file, if any."""
-    lines = block.splitlines()
-    if any(line.strip().upper() == "NO_CHARGES" for line in lines[:6]):
-        return
-    partial: list[float] = []
-    inside = False
-    for line in lines:
-        if line.startswith("@<TRIPOS>"):
-            inside = line.startswith("@<TRIPOS>ATOM")
-        elif inside and len(fields := line.split()) >= 9:
-            partial.append(float(fields[8]))
-    formal = sum(a.GetFormalCharge() for a in molecule.GetAtoms())
-    total = sum(partial)
-    if any(partial) and abs(total - formal) > _CHARGE_TOLERANCE:
-        raise PreparationError(
-            f"its partial charges add up to {total:+.2f}, the charges its atom types imply to {formal:+d}; "
-            "give the molecule as SDF, which states formal charges."
-        )
 
 
 def _with_geometry(molecule: Any, notes: list[str]) -> Any:
