@@ -81,7 +81,9 @@ def lewis_structure(
         return None if rest else (orders, charges)
     room = {i for i in unsettled if max(s[0] for s in states[i]) > len(neighbours[i])}
     open_bonds = [
-        k for k, (i, j) in enumerate(pairs) if i in room and j in room and not _is_ylide(elements, neighbours, i, j)
+        k
+        for k, (i, j) in enumerate(pairs)
+        if {i, j} <= room and ((stated or {}).get((i, j), 1) > 1 or not _is_ylide(elements, neighbours, i, j))
     ]
     solved = _solve(elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {}, rest)
     if solved is None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from systems.embedding import drop_isotopes, embed, require, sanitise
 from systems.errors import InputError, PreparationError
-from systems.mol2_file import missing_hydrogens, molecule_of, read_mol2
+from systems.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
 
@@ -30,19 +30,32 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
 
 def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
     """MOL2 with all hydrogens by its elements and bonds; without them by its types, if they are SYBYL's."""
-    from rdkit import Chem
-
     found = read_mol2(text, path, notes)
-    has_hydrogens = "H" in found.elements
-    molecule = molecule_of(found, notes) if has_hydrogens else None
-    if molecule is None:
-        molecule = Chem.MolFromMol2Block(found.block, sanitize=False, removeHs=False, cleanupSubstructures=True)
-        # RDKit takes the names of other programs' types for elements.
-        if molecule is None or tuple(a.GetSymbol() for a in molecule.GetAtoms()) != found.elements:
-            molecule = None if has_hydrogens else molecule_of(found, notes)
+    if "H" in found.elements or "C" not in found.elements:
+        molecule = molecule_of(found, notes) or _by_types(found)
+    else:  # most often a file that leaves its hydrogens out
+        molecule = _by_types(found) or molecule_of(found, notes)
     if molecule is None:
         raise missing_hydrogens(found)
     return settle_molecule(molecule, notes)
+
+
+def _by_types(found: Mol2) -> Any | None:
+    """RDKit's reading, where it finds the same elements (other programs' types are none) and hydrogens to add."""
+    from rdkit import Chem
+
+    molecule = Chem.MolFromMol2Block(found.block, sanitize=False, removeHs=False, cleanupSubstructures=True)
+    if molecule is None or tuple(a.GetSymbol() for a in molecule.GetAtoms()) != found.elements:
+        return None
+    for atom in molecule.GetAtoms():
+        atom.SetNoImplicit(False)  # its reader expects all hydrogens, and takes hydroxyls without for anions
+        if atom.GetFormalCharge() < 0 and atom.GetProp("_TriposAtomType") != "O.co2":
+            atom.SetFormalCharge(0)
+    try:
+        sanitise(molecule)
+    except PreparationError:
+        return None
+    return molecule if any(a.GetNumImplicitHs() for a in molecule.GetAtoms()) else None
 
 
 def settle_molecule(molecule: Any, notes: list[str]) -> Any:
