@@ -18,7 +18,7 @@ from surrogate.outputs import PathLike, Trajectories, check_outputs, find_trajec
 from surrogate.progress import progress_bar
 from surrogate.references import plan, reference
 from surrogate.rollouts import rollout
-from surrogate.scenes import systems
+from surrogate.scenes import systems, tell
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.units import Quantity, quantity
 
@@ -185,7 +185,9 @@ def train(
     `config`, an autoencoder codes them as it does for one molecule. `longest_lag_ps`: lam-slide learns every spacing of
     frames from that of the references to this one, and takes it as an input. Beside `out`, a
     CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
-    drawn (.svg). `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
+    drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are usable and, where they
+    are not, what would help (NAME.verdict.json, surrogate.training_verdicts). `device`: 'auto', 'cpu' or 'cuda';
+    several devices by torchrun (surrogate.training.devices).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
     from surrogate.trainings import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
@@ -247,4 +249,12 @@ def train(
         from surrogate.training.curves import plot_curves
 
         plot_curves(curves)
+    if arch not in FITTED and is_first_process():
+        from surrogate.training_verdicts import judge_training, write_verdict
+
+        verdict = judge_training(written)
+        write_verdict(written, verdict)
+        if not quiet:
+            for line in verdict.lines():
+                tell(written.name, line)
     return written
