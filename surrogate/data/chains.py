@@ -4,16 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import networkx as nx
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.models.chains import RIGID, STIFF, TURNING, ChainLayout, ChainScale, internal_coordinates
+from surrogate.data.poses import fitted_atoms
+from surrogate.models.chains import (
+    RIGID,
+    STIFF,
+    TURNING,
+    ChainCode,
+    ChainFeatures,
+    ChainLayout,
+    ChainScale,
+    internal_coordinates,
+)
 from systems.chemistry import backbone_torsions, bonded_graph, ring_bonds
 from systems.errors import InputError
 from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from surrogate.models.lam_slide.peptides import PeptideConfig
 
 # A length that varies by less, by rounding alone, is one that the reference holds rigid.
 RIGID_NM = 2e-4
@@ -114,6 +128,16 @@ class _Builder:
         if away == 0:
             return self.names[atom]
         return f"{'CA' if self.names[atom] == 'CH3' else self.names[atom]}{away:+d}"
+
+
+def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
+    """Return what a model of peptides is told of one. Raises InputError as `chain_layout` and `settled` do."""
+    if config.scale is None:
+        raise InputError("these weights do not say how peptides' coordinates are scaled.")
+    layout = settled(chain_layout(scene), config.scale)
+    fitted = fitted_atoms(scene)
+    template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
+    return ChainFeatures(ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted)
 
 
 def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -> ChainScale:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from surrogate.data.chains import chain_features
 from surrogate.data.poses import fitted_atoms
 from surrogate.models.atom_features import AtomFeatures, features_of_graph
 from surrogate.models.interface import Molecule, Surrogate
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 def describe(model: Surrogate, scene: Scene) -> Molecule:
     """Return what this model wants to be told of a scene, which is posed as its frames are."""
     molecule = Molecule.of(scene)
+    if model.knows_chains:
+        return replace(molecule, chain=chain_features(scene, model.config))
     return replace(molecule, atoms=features_of_scene(scene)) if model.knows_bonds else molecule
 
 

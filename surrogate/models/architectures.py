@@ -11,6 +11,7 @@ from surrogate.models.interface import Surrogate
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.heavy import lam_slide_model
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.peptides import PeptideConfig, PeptideSlide
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
 from systems.errors import UnknownNameError, nearest
@@ -26,6 +27,7 @@ class Architecture:
 
 ARCHITECTURES: dict[str, Architecture] = {
     LamSlide.arch: Architecture(LamSlideConfig.from_dict, lam_slide_model),
+    PeptideSlide.arch: Architecture(PeptideConfig.from_dict, PeptideSlide),
     Painet.arch: Architecture(PainetConfig.from_dict, Painet),
     EgnnForecaster.arch: Architecture(PainetConfig.from_dict, EgnnForecaster),
     **{kind.arch: Architecture(BaselineConfig.from_dict, kind) for kind in BASELINES},

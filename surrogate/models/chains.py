@@ -12,9 +12,12 @@ Each number belongs to one residue and has a place (slot) in that residue's toke
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -146,6 +149,20 @@ class ChainCode(nn.Module):
                 lengths[..., which], angles[..., which], dihedrals[..., which],
             )  # fmt: skip
         return x
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFeatures:
+    """What a model of peptides is told of one: its `code`, the types of its residues and their neighbours as numbers
+    `places` (n_residues, 3), and the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`."""
+
+    code: ChainCode
+    places: Tensor
+    template_nm: npt.NDArray[np.float64]
+    fitted: npt.NDArray[np.int64]
+
+    def to(self, device: torch.device) -> ChainFeatures:
+        return ChainFeatures(copy.deepcopy(self.code).to(device), self.places.to(device), self.template_nm, self.fitted)
 
 
 def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, primary: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.models.atom_features import AtomFeatures
+from surrogate.models.chains import ChainFeatures
 from systems.elements import ATOMIC_NUMBERS, PARTICLE
 from systems.errors import InputError
 
@@ -22,13 +23,15 @@ class Molecule:
     """What a model is told of a scene, beside its frames.
 
     `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
-    `bonds` (n_bonds, 2) int64; `atoms`: features of the covalent graph, for a model that asks for them.
+    `bonds` (n_bonds, 2) int64; `atoms`: features of the covalent graph, and `chain`: of a peptide's
+    residues, each for a model that asks for them.
     """
 
     elements: Tensor
     masses_da: Tensor
     bonds: Tensor
     atoms: AtomFeatures | None = None
+    chain: ChainFeatures | None = None
 
     @staticmethod
     def of(scene: Scene) -> Molecule:
@@ -46,7 +49,8 @@ class Molecule:
 
     def to(self, device: torch.device) -> Molecule:
         atoms = None if self.atoms is None else self.atoms.to(device)
-        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), atoms)
+        chain = None if self.chain is None else self.chain.to(device)
+        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), atoms, chain)
 
     def permuted(self, order: Tensor) -> Molecule:
         """Return the molecule whose atom k is this one's atom order[k]."""
@@ -116,6 +120,11 @@ class Surrogate(nn.Module, ABC):
     @property
     def knows_bonds(self) -> bool:
         """Whether the model wants a molecule's features of the covalent graph (`Molecule.atoms`)."""
+        return False
+
+    @property
+    def knows_chains(self) -> bool:
+        """Whether the model wants a peptide's residues (`Molecule.chain`)."""
         return False
 
     def at_lag(self, lag_ps: float) -> Surrogate:

@@ -85,7 +85,7 @@ class Subject:
             return model.encode(x, self.molecule.elements, atoms), atoms
 
 
-def pick(subjects: Sequence[Subject], generator: torch.Generator) -> int:
+def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
     """Return which subject a batch is of, each as likely; a single one costs no random number."""
     if len(subjects) == 1:
         return 0

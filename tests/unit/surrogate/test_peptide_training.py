@@ -1,0 +1,97 @@
+"""Training the model of peptides: windows of any spacing, what is measured before, and a loss that falls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.chains import chain_features
+from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.splits import Split
+from surrogate.data.weights import load_weights
+from surrogate.models.lam_slide.peptides import PeptideConfig, PeptideSlide
+from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.training.peptides import PeptideSubject, PeptideTraining, _with_scale, normalise, train_peptides
+from systems.sequence import build_peptide
+from systems.trajectory import open_trajectory
+
+SMALL = PeptideConfig(width=32, n_layers=1, n_heads=2, chunk_frames=4, longest_ps=40.0)
+CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0}
+
+
+@pytest.fixture(scope="module")
+def frames() -> TrainingFrames:
+    """Four runs in which every atom trembles with correlation 0.9 from frame to frame."""
+    scene = build_peptide("ACE-ALA-NME")
+    rng = np.random.default_rng(0)
+    x = np.zeros((4, 200, scene.n_atoms, 3))
+    x[:, 0] = rng.normal(size=x[:, 0].shape)
+    for k in range(1, 200):
+        x[:, k] = 0.9 * x[:, k - 1] + 0.436 * rng.normal(size=x[:, 0].shape)
+    posed = canonicalise(scene.positions_nm + 0.004 * x.reshape(-1, scene.n_atoms, 3), scene)
+    return TrainingFrames(scene, quantise(posed), np.arange(5) * 200, 1.0, True, CONDITIONS, (), split=Split(0.2))
+
+
+@pytest.fixture(scope="module")
+def config(frames: TrainingFrames) -> PeptideConfig:
+    return _with_scale(SMALL, [frames])
+
+
+@pytest.mark.parametrize("validation", [False, True])
+@pytest.mark.parametrize("time_reversal", [False, True])
+def test_windows_stay_within_a_run_and_its_part(
+    frames: TrainingFrames, config: PeptideConfig, validation: bool, time_reversal: bool
+) -> None:
+    subject = PeptideSubject(frames, chain_features(frames.scene, config))
+    idx, times = subject.windows(
+        500, config, torch.Generator().manual_seed(1), validation=validation, time_reversal=time_reversal
+    )
+    assert idx.shape == (500, 5) and times.shape == (500, 4)
+    assert (idx // 200 == idx[:, :1] // 200).all(), "all of one run"
+    part = idx % 200
+    assert ((part >= 160) == validation).all(), "and of one side of the split"
+    apart = (idx[:, 1:] - idx[:, :1]).abs()
+    assert (apart.float() == times).all() or time_reversal
+    assert (times.diff(dim=1) > 0).all() and times.min() >= 1 and times.max() <= 40
+    lags = times[(times[:, 1:2] == 2 * times[:, :1]).ravel() & (times[:, 3:] == 4 * times[:, :1]).ravel(), 0]
+    assert len(lags) > 150 and len(lags.unique()) > 4, "half of them evenly spaced, at several lags"
+    if time_reversal:
+        assert 150 < int((idx[:, 1] < idx[:, 0]).sum()) < 350
+
+
+def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: PeptideConfig) -> None:
+    model = PeptideSlide(config)
+    normalise(model, [PeptideSubject(frames, chain_features(frames.scene, config))], 0)
+    types = torch.tensor([config.types.index("ALA") + 2])
+    chain = chain_features(frames.scene, config)
+    filled = chain.code.filled[1]
+    found = model.correlation_at(torch.tensor([[1.0, 5.0, 40.0]]), types)[0, :, 0, filled].mean(-1)
+    np.testing.assert_allclose(found, [0.9, 0.9**5, 0.9**40], atol=0.08)
+    numbers = PeptideSubject(frames, chain).numbers(model, torch.arange(0, 160))
+    assert float(numbers[:, 1, filled].std()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frames: TrainingFrames) -> None:
+    seen: list[dict[str, float]] = []
+    training = PeptideTraining(steps=300, batch=32, learning_rate=3e-3, validate_every_s=1e9)
+    out = train_peptides(
+        [frames], tmp_path / "w.safetensors", replace(SMALL, conditioning_noise=0.0), training,
+        progress=lambda stage, share, metrics: seen.append(metrics) if metrics else None,
+    )  # fmt: skip
+    assert seen[-1]["validation_flow"] < 0.999
+    assert not list(tmp_path.glob("*.train.*"))
+    weights = load_weights(out)
+    assert weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
+    for lag_ps in (1.0, 20.0):
+        trajectory = tmp_path / f"{lag_ps:g}.h5"
+        rollout(
+            frames.scene, weights, [trajectory],
+            RolloutConfig(time_ps=6 * lag_ps, lag_ps=lag_ps, precision="fp32", solver_steps=3),
+        )  # fmt: skip
+        with open_trajectory(trajectory) as reader:
+            assert reader.n_frames == 6
+            assert np.isfinite(reader.read()).all()
