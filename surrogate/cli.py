@@ -45,7 +45,7 @@ from surrogate.cli_printing import print_comparison, print_json, print_library, 
 from surrogate.cli_reproduce import reproduce
 from surrogate.md_options import MDOptions, Preparation, Replicas
 from systems.errors import SurromdError
-from systems.interrupts import interrupt_on_signals
+from systems.interrupts import interrupted_by_signals
 from systems.units import (
     parse_temperature_k,
     parse_time_ps,
@@ -446,9 +446,9 @@ def main() -> None:
     # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when
     # the numerical libraries load, which is later; a user's own setting stands.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    interrupt_on_signals()
     try:
-        app(prog_name="surromd")
+        with interrupted_by_signals():
+            app(prog_name="surromd")
     except KeyboardInterrupt:  # outside any verb: while starting
         sys.exit(130)
 

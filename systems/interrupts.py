@@ -18,10 +18,11 @@ _CLEAN_UP_S = 30.0
 _thread = threading.local()
 
 
-def interrupt_on_signals() -> None:
-    """Have SIGTERM and SIGHUP interrupt this process as Ctrl-C does: KeyboardInterrupt in the main thread.
+@contextmanager
+def interrupted_by_signals() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP interrupt the block as Ctrl-C does: KeyboardInterrupt in the main thread.
 
-    For a program of ours, when it starts: Python's own way, to end at once, leaves folders and processes behind. SIGINT
+    For a program of ours, all of it: Python's own way, to end at once, leaves folders and processes behind. SIGINT
     is heeded also where a shell has started the program in the background and had it ignored; SIGHUP stays ignored
     where it is (nohup). What cleans up after the first signal is not disturbed by another one for half a minute, but
     by Ctrl-C a second later.
@@ -35,8 +36,12 @@ def interrupt_on_signals() -> None:
             asked_at = now
             raise KeyboardInterrupt
 
-    for number in _numbers():
-        signal.signal(number, handle)
+    previous = {number: signal.signal(number, handle) for number in _numbers()}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def stop_if_asked() -> None:

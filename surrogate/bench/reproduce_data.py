@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from md_reference.parent_watch import end_with_parent
 from md_reference.replicas import available_cores
 from surrogate.data.particle_sets import SPLITS, ParticleSet, append_systems, create_sets, n_complete
 from systems.model_systems import N_BODY
@@ -79,10 +81,19 @@ def _simulated(name: str, todo: list[tuple[str, range]], workers: int) -> Iterat
         for split, seeds in todo:
             yield split, make_systems(name, seeds)
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker) as pool:
         futures: list[Future[ParticleSet]] = [pool.submit(make_systems, name, seeds) for _, seeds in todo]
         try:
             for (split, _), future in zip(todo, futures, strict=True):
                 yield split, future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which ends its workers
+    end_with_parent()

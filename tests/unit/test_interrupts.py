@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from systems import interrupts
-from systems.interrupts import deferred_interrupt, interrupt_on_signals, stop_if_asked, stop_when
+from systems.interrupts import deferred_interrupt, interrupted_by_signals, stop_if_asked, stop_when
 
 
 @pytest.fixture(autouse=True)
@@ -87,12 +87,8 @@ def test_a_thread_is_asked_to_stop_by_whoever_runs_it() -> None:
 @pytest.fixture
 def as_a_program() -> Iterator[None]:
     """The handlers of a program of ours, for one test."""
-    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    before = {number: signal.getsignal(number) for number in numbers}
-    interrupt_on_signals()
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    with interrupted_by_signals():
+        yield
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no hang-up on this system")
@@ -122,18 +118,20 @@ def test_a_program_asked_again_much_later_is_interrupted_again(
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no hang-up on this system")
-def test_nohup_stays_nohup() -> None:
+def test_nohup_stays_nohup_and_the_old_handlers_come_back() -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        interrupt_on_signals()
-        signal.raise_signal(signal.SIGHUP)
-        with deferred_interrupt() as asked_to_stop:
+        with interrupted_by_signals():
             signal.raise_signal(signal.SIGHUP)
-            assert not asked_to_stop()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+            with deferred_interrupt() as asked_to_stop:
+                signal.raise_signal(signal.SIGHUP)
+                assert not asked_to_stop()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) is before[signal.SIGTERM]
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

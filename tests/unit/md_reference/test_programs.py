@@ -78,11 +78,10 @@ _CHILD = """
 import contextlib, os, sys
 from pathlib import Path
 from md_reference.programs import run_program, scratch_folder
-from systems.interrupts import deferred_interrupt, interrupt_on_signals
+from systems.interrupts import deferred_interrupt, interrupted_by_signals
 
-interrupt_on_signals()
 try:
-    with deferred_interrupt() if sys.argv[1] == "deferred" else contextlib.nullcontext():
+    with interrupted_by_signals(), deferred_interrupt() if sys.argv[1] == "deferred" else contextlib.nullcontext():
         with scratch_folder("surromd-test-") as folder:
             (folder / "deep").mkdir()
             (folder / "deep" / "file").touch()
