@@ -8,13 +8,15 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from md_reference.campaign_file import JOB_LOGS, ClusterSpec
+from md_reference.programs import scratch_folder
 from md_reference.replicas import available_cores
 from systems.errors import InputError, SimulationError
+from systems.interrupts import deferred_interrupt, stop_if_asked
 
 _CLASSES = {
     "slurm": "SLURMCluster",
@@ -41,7 +43,7 @@ def open_client(
     retries: int = 2,
     folder: Path = Path(),
 ) -> Iterator[Any]:
-    """Yield a `distributed.Client` and close what was started for it.
+    """Yield a `distributed.Client` and close what was started for it. An interruption waits until all is started.
 
     `scheduler` (tcp://host:port) goes before `cluster`, and both before local workers, one thread each (`workers`, as
     many as there are cores by default). Raises InputError when no scheduler answers or dask-jobqueue is not installed.
@@ -50,18 +52,21 @@ def open_client(
     import dask
     from distributed import Client
 
-    with _quiet(), dask.config.set({"distributed.scheduler.allowed-failures": retries}):
+    with _quiet(), dask.config.set({"distributed.scheduler.allowed-failures": retries}), ExitStack() as stack:
         if scheduler is not None:
             try:
-                client = Client(scheduler, timeout=_ANSWER_S, set_as_default=False)
+                client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S, set_as_default=False))
             except (OSError, ValueError) as error:
                 raise InputError(f"no Dask scheduler answers at {scheduler} ({error}).") from error
-            with client:
-                yield client
-            return
-        started = _local(workers or available_cores()) if cluster is None else _jobs(cluster, folder)
-        with started, Client(started, set_as_default=False) as client:
-            yield client
+        else:
+            if cluster is None:
+                scratch = stack.enter_context(scratch_folder("surromd-dask-"))
+                stack.enter_context(dask.config.set({"temporary-directory": str(scratch)}))
+            with deferred_interrupt():  # Dask cannot be stopped while it starts
+                started = _local(workers or available_cores()) if cluster is None else _jobs(cluster, folder)
+                client = stack.enter_context(Client(stack.enter_context(started), set_as_default=False))
+                stop_if_asked()
+        yield client
 
 
 def _refuse_both(workers: int | None, scheduler: str | None) -> None:

@@ -119,8 +119,7 @@ def simulate_run(task: RunTask) -> dict[str, Any]:
         os.environ["OPENMM_CPU_THREADS"] = "1"
         session.frames[task.run.name] = 0
         try:
-            with stop_when(session.should_stop):
-                return _simulate(task, folder, session)
+            return _simulate(task, folder, session)
         finally:
             session.frames.pop(task.run.name, None)
 
@@ -128,7 +127,10 @@ def simulate_run(task: RunTask) -> dict[str, Any]:
 
 
 def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own."""
+    """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own.
+
+    What waits within it, for a frame or for another program's charges, hears when the campaign is to stop.
+    """
     session = _session(token)
     if session.stopped:
         return {"status": "stopped"}
@@ -136,7 +138,8 @@ def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> di
         # A file system that lags behind, or is not shared, is the only reason for its absence.
         if not (folder / MANIFEST_NAME).is_file():
             raise StorageError(f"{socket.gethostname()} does not see {folder}; all workers must share that folder.")
-        return {"status": "complete", **work()}
+        with stop_when(session.should_stop):
+            return {"status": "complete", **work()}
     except KeyboardInterrupt:
         return {"status": "stopped"}
     except SurromdError as error:

@@ -80,8 +80,12 @@ def run_program(
 def scratch_folder(prefix: str) -> Iterator[Path]:
     """Yield a new folder among the system's temporary ones; it goes with the block, and with this process.
 
-    Raises StorageError where it cannot be made.
+    Raises StorageError where it cannot be made. Where there is no shell (Windows) it goes with the block alone.
     """
+    if os.name != "posix":
+        with tempfile.TemporaryDirectory(prefix=prefix) as name:
+            yield Path(name)
+        return
     path = Path(tempfile.gettempdir()) / f"{prefix}{uuid.uuid4().hex[:12]}"
     with subprocess.Popen(
         ["/bin/sh", "-c", _FOLDER, "surromd-guard", str(path)],

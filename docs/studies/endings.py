@@ -141,11 +141,17 @@ def end(verb: str, number: signal.Signals, after_s: float, data: Path) -> Ending
 
 
 def _left(place: Path) -> list[str]:
-    """Return what should be gone: anything among the temporary files, and hidden or unfinished ones elsewhere."""
-    found = [path.relative_to(place) for path in (place / "tmp").rglob("*")]
+    """Return what should be gone: anything among the temporary files, but for the cache that torch keeps there on
+    purpose, and files begun and not finished elsewhere."""
+    found = [p.relative_to(place) for p in (place / "tmp").rglob("*") if not _of_torch(p.relative_to(place))]
     for folder in ("work", "cache"):
-        found += [p.relative_to(place) for p in (place / folder).rglob("*") if p.suffix == ".new" or p.name[0] == "."]
+        unfinished = (p for p in (place / folder).rglob("*") if p.suffix == ".new" or p.name.startswith(".surromd-"))
+        found += [p.relative_to(place) for p in unfinished]
     return sorted(map(str, found))
+
+
+def _of_torch(path: Path) -> bool:
+    return path.parts[1].startswith("torchinductor_")
 
 
 def undisturbed_s(verb: str, longest_s: float, data: Path) -> float:
