@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from systems.errors import InputError, PreparationError
+from systems.errors import InputError, PreparationError, first_line
 from systems.mmcif_file import read_blocks
 from systems.mol_file import settle_molecule
 from systems.molecule import RESIDUE_NAME, scene_from_rdkit
@@ -35,7 +35,10 @@ def scene_from_component(text: str, path: Path) -> Scene:
         notes.append(f"{len(blocks)} components in the file: the first is taken")
     block = blocks[0]
     with rdBase.BlockLogs():
-        molecule, names = _molecule(block, path, notes)
+        try:
+            molecule, names = _molecule(block, path, notes)
+        except RuntimeError as error:  # gemmi's, of tables whose tags do not go together
+            raise InputError(f"{path} is damaged ({first_line(error)}); fetch it again.") from error
         try:
             settled = settle_molecule(molecule, notes)
         except PreparationError as error:

@@ -23,11 +23,19 @@ Address = tuple[str, str, str, str]
 
 
 def read_blocks(text: str, path: Path) -> Any:
-    """Return the `gemmi.cif.Document` of a file. Raises InputError where the syntax is broken."""
+    """Return the `gemmi.cif.Document` of a file. Raises InputError where the syntax is broken.
+
+    What other programs get wrong beside the atoms (a tag twice, one without a value, letters beyond ASCII in a title)
+    does no harm.
+    """
     from gemmi import cif
 
+    if not text.isascii():
+        if any(not line.isascii() for line in text.splitlines() if line.startswith(("ATOM", "HETATM"))):
+            raise InputError(f"{path}: a row of atoms has letters beyond ASCII; the file is damaged, fetch it again.")
+        text = text.encode("ascii", "replace").decode()
     try:
-        return cif.read_string(text)
+        return cif.read_string(text, check_level=0)
     except (ValueError, RuntimeError) as error:
         reason = first_line(error).removeprefix("string:")
         raise InputError(f"{path} is no whole CIF ({reason}); the file is cut or damaged, fetch it again.") from error
@@ -40,13 +48,22 @@ def is_component(text: str) -> bool:
 
 def read_mmcif(text: str, path: Path) -> StructureFile:
     """Return the first model of the first block that has atoms. Raises InputError for a row that cannot be read."""
+    try:
+        return _read_mmcif(text, path)
+    except RuntimeError as error:  # gemmi's, of tables whose tags do not go together
+        raise InputError(f"{path} is damaged ({first_line(error)}); fetch it again.") from error
+
+
+def _read_mmcif(text: str, path: Path) -> StructureFile:
     found = StructureFile([])
     blocks = [b for b in read_blocks(text, path) if b.find_mmcif_category("_atom_site.")]
     if not blocks:
         return found
     if len(blocks) > 1:
         found.notes.append(f"{len(blocks)} structures in the file: the first is taken")
-    tags = {tag.split(".", 1)[-1].lower() for tag in blocks[0].find_mmcif_category("_atom_site.").tags}
+    tags = [tag.split(".", 1)[-1].lower() for tag in blocks[0].find_mmcif_category("_atom_site.").tags]
+    if len(set(tags)) < len(tags):
+        raise InputError(f"{path}: its _atom_site loop has a column twice; the file is damaged, fetch it again.")
     missing = [tag for tag in _NEEDED if tag.lower() not in tags]
     if missing:
         raise InputError(f"{path}: its _atom_site loop lacks {', '.join(sorted(t.lower() for t in missing))}.")

@@ -40,7 +40,7 @@ _RESIDUE_ALIASES = {
     "HID": "HIS", "HIE": "HIS", "HIP": "HIS", "HSD": "HIS", "HSE": "HIS", "HSP": "HIS", "HISD": "HIS", "HISE": "HIS",
     "HISH": "HIS", "HISA": "HIS", "HISB": "HIS", "HIS1": "HIS", "HIS2": "HIS", "ASH": "ASP", "ASPH": "ASP",
     "ASPP": "ASP", "GLH": "GLU", "GLUH": "GLU", "GLUP": "GLU", "LYN": "LYS", "LYSH": "LYS", "LYP": "LYS", "LSN": "LYS",
-    "CYX": "CYS", "CYM": "CYS", "CYS2": "CYS", "CYSH": "CYS", "CYN": "CYS", "NMA": "NME", "NHE": "NH2",
+    "CYX": "CYS", "CYM": "CYS", "CYS2": "CYS", "CYSH": "CYS", "CYN": "CYS", "NMA": "NME", "CBX": "NME", "NHE": "NH2",
 }  # fmt: skip
 _ATOM_ALIASES: dict[str, dict[str, str]] = {
     "ILE": {"CD": "CD1"},

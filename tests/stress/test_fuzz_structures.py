@@ -140,14 +140,17 @@ _NO_ATOM = ("CRYST1", "REMARK")
 def atoms_of(data: bytes) -> list[tuple[float, float, float]] | None:
     """What the bytes say, column by column, of the first model, read as strictly as the format is written."""
     found: list[tuple[float, float, float]] = []
+    ended = False
     for line in data.decode("utf-8", errors="replace").splitlines():
         fields = [line[k : k + 8] for k in (30, 38, 46)]
         plain = all(_NUMBER.match(f) and f.strip() for f in fields)
+        ended |= bool(found) and line[:6].rstrip() == "END"
         if line.startswith("ENDMDL") or (line.startswith("MODEL") and found):
             if found:
                 break
         elif line.startswith(("ATOM  ", "HETATM")) and not plain:
-            return None
+            if not ended:  # after END nothing is read, and what is there counts as lost
+                return None
         elif (
             plain and (len(line) > 66 or line.startswith(("ATOM  ", "HETATM"))) and not line.startswith(_NO_ATOM)
         ):  # whatever it calls itself
@@ -236,3 +239,48 @@ def test_ten_thousand_mutated_structures(tmp_path: Path, sources: list[bytes]) -
     counts, faults = fuzz(range(1_000, 11_000), tmp_path, sources)
     assert not faults, "\n".join(faults[:20])
     assert sum(counts.values()) > 9_900
+
+
+def _as_mmcif(pdb: bytes) -> bytes:
+    import gemmi
+
+    structure = gemmi.read_pdb_string(pdb.decode())
+    structure.setup_entities()
+    return structure.make_mmcif_document().as_string().encode()
+
+
+def fuzz_mmcif(seeds: range, folder: Path, sources: list[bytes]) -> tuple[Counter[str], list[str]]:
+    """As `fuzz`, of mmCIF: each coordinate stands in the file, in a plain notation, or something is said."""
+    counts: Counter[str] = Counter()
+    faults = []
+    path = folder / "mutated.cif"
+    for seed in seeds:
+        rng = random.Random(seed)
+        data, done = rng.choice(sources), []
+        for mutation in rng.choices(
+            (flip_bits, random_bytes, cut, drop_line, repeat_line, swap_lines), k=rng.choice((1, 1, 2))
+        ):
+            data = mutation(data, rng) or b"x"
+            done.append(mutation.__name__)
+        path.write_bytes(data)
+        try:
+            with time_limit(SECONDS_A_FILE):
+                scene = prepare(str(path))
+        except SurromdError as error:
+            counts["refused" if "\n" not in str(error) else "fault"] += 1
+            continue
+        except Exception as error:
+            faults.append(f"seed {seed} ({'+'.join(done)}): {type(error).__name__}: {error}")
+            continue
+        numbers = {round(float(word), 3) for word in data.split() if re.fullmatch(rb"[-+]?[0-9]*\.?[0-9]+", word)}
+        unsaid = [x for x in (scene.positions_nm * 10).ravel().tolist() if round(x, 3) not in numbers]
+        if unsaid and not scene.provenance["repairs"]:
+            faults.append(f"seed {seed} ({'+'.join(done)}): {len(unsaid)} coordinates from nowhere, and nothing said")
+        counts["read"] += 1
+    return counts, faults
+
+
+def test_mutated_mmcif(tmp_path: Path, sources: list[bytes]) -> None:
+    counts, faults = fuzz_mmcif(range(100), tmp_path, [_as_mmcif(source) for source in sources])
+    assert not faults, "\n".join(faults)
+    assert counts["read"] > 10 and counts["refused"] > 20 and not counts["fault"]

@@ -146,3 +146,27 @@ def test_rows_wrapped_over_lines_uncertainties_and_links(tmp_path: Path) -> None
         wrong = [*rows[:5], rows[5].replace(rows[5].split()[10], number), *rows[6:]]
         with pytest.raises(InputError, match="atom row 6: a coordinate is not a number"):
             prepare(_write(tmp_path / "x.cif", wrong))
+
+
+def test_faults_beside_the_atoms_do_no_harm_and_those_among_them_do(tmp_path: Path) -> None:
+    path = tmp_path / "x.cif"
+    text = Path(_write(path, _peptide())).read_text()
+    beside = (
+        "_entry.id OTHER",
+        "_citation.title 'Übersicht'",
+        "_cell.length_a",
+        "data_TEST",
+        "loop_",
+        "_e.f",
+        "_e.g",
+        "#",
+    )
+    path.write_text(
+        text.replace("data_TEST", "\n".join(("data_TEST", *beside[:3], *beside[4:]))) + "\n".join(beside[3:])
+    )
+    assert prepare(str(path)).molecule_key == ALA2.molecule_key
+    for old, new in (("_atom_site.Cartn_y", "_atom_site.Cartn_x"), ("HETATM ", "HETATM é"), ("ATOM 7", "ATOM 7é")):
+        path.write_text(text.replace(old, new))
+        if old in text:
+            with pytest.raises(InputError, match=r"x.cif"):
+                prepare(str(path))
