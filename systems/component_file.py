@@ -11,6 +11,7 @@ from systems.errors import InputError, PreparationError, first_line
 from systems.mmcif_file import read_blocks
 from systems.mol_file import settle_molecule
 from systems.molecule import RESIDUE_NAME, scene_from_rdkit
+from systems.salts import main_molecule
 from systems.scene import Scene
 
 _IDEAL = ("pdbx_model_Cartn_x_ideal", "pdbx_model_Cartn_y_ideal", "pdbx_model_Cartn_z_ideal")
@@ -40,6 +41,8 @@ def scene_from_component(text: str, path: Path) -> Scene:
         except RuntimeError as error:  # gemmi's, of tables whose tags do not go together
             raise InputError(f"{path} is damaged ({first_line(error)}); fetch it again.") from error
         try:
+            if main_molecule(molecule, []).GetNumAtoms() < molecule.GetNumAtoms():
+                raise PreparationError("it is a salt of several molecules; give one of them.")
             settled = settle_molecule(molecule, notes)
         except PreparationError as error:
             raise PreparationError(f"{path}: {error}") from error

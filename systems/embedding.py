@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from systems.errors import PreparationError
+from systems.salts import main_molecule
 
 # What some force field or GFN2-xTB describes as part of a molecule; metals are not embedded with any confidence.
 _ELEMENTS = ("H", "B", "C", "N", "O", "F", "Si", "P", "S", "Cl", "Se", "Br", "I")
@@ -26,6 +27,7 @@ def parse_smiles(text: str, notes: list[str]) -> Any:
     if molecule is None:
         raise PreparationError(f"SMILES {text!r} cannot be read; check brackets, ring numbers and letters.")
     try:
+        molecule = main_molecule(molecule, notes)
         require(molecule)
         sanitise(molecule)
     except PreparationError as error:
@@ -36,22 +38,13 @@ def parse_smiles(text: str, notes: list[str]) -> Any:
 
 
 def require(molecule: Any) -> None:
-    """Raise PreparationError for wildcards, several fragments, metals, elements without a model, and giants."""
-    from rdkit import Chem
-
+    """Raise PreparationError for wildcards, metals, elements without a model, and giants."""
     symbols = sorted({a.GetSymbol() for a in molecule.GetAtoms()})
     if not symbols:
         raise PreparationError("it has no atoms.")
     if "*" in symbols or any(a.HasQuery() for a in molecule.GetAtoms()):
         raise PreparationError("it holds wildcard atoms (*); write the elements.")
     metals = [s for s in symbols if s not in _NOT_METALS]
-    fragments = Chem.GetMolFrags(molecule, asMols=True, sanitizeFrags=False)
-    if len(fragments) > 1:
-        parts = sorted((Chem.MolToSmiles(f) for f in fragments), key=len, reverse=True)
-        raise PreparationError(
-            f"it has {len(parts)} fragments ({', '.join(parts[:4])}{', ...' if len(parts) > 4 else ''}), a salt or a "
-            f"mixture; give one molecule, for instance smiles:{parts[0]}."
-        )
     if metals:
         raise PreparationError(
             f"it holds {', '.join(metals)}: metals have no parameters and no reliable 3-D embedding; "

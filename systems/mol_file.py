@@ -7,9 +7,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from systems.embedding import drop_isotopes, embed, require, sanitise
 from systems.errors import InputError, PreparationError
 from systems.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
+from systems.salts import main_molecule
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
 
@@ -25,7 +28,7 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
         molecule = Chem.MolFromMolBlock(_first_mol_block(text, notes), sanitize=False, removeHs=False)
     if molecule is None:
         raise InputError(f"{path} holds no molecule that can be read as {suffix_of(path)[1:].upper()}; write it again.")
-    return settle_molecule(molecule, notes)
+    return settle_molecule(main_molecule(molecule, notes), notes)
 
 
 def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
@@ -37,7 +40,7 @@ def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
         molecule = _by_types(found) or molecule_of(found, notes)
     if molecule is None:
         raise missing_hydrogens(found)
-    return settle_molecule(molecule, notes)
+    return settle_molecule(main_molecule(molecule, notes), notes)
 
 
 def _by_types(found: Mol2) -> Any | None:
@@ -61,12 +64,68 @@ def _by_types(found: Mol2) -> Any | None:
 def settle_molecule(molecule: Any, notes: list[str]) -> Any:
     """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones.
 
-    Raises PreparationError for what is no molecule, or has atoms on one point.
+    Valences that are impossible as written are perceived anew, and said. Raises PreparationError for what is no
+    molecule, or has atoms on one point.
     """
     require(molecule)
-    sanitise(molecule)
+    try:
+        sanitise(molecule)
+    except PreparationError as error:
+        repaired = _with_charges(molecule, notes) or _reperceived(molecule, notes)
+        if repaired is None:
+            raise error
+        molecule = repaired
     drop_isotopes(molecule, notes)
     return _with_geometry(molecule, notes)
+
+
+def _with_charges(molecule: Any, notes: list[str]) -> Any | None:
+    """With the charge that nitrogen of four bonds, oxygen of three and boron of four have, where none is written."""
+    from rdkit import Chem
+
+    out = Chem.Mol(molecule)
+    changed = []
+    for atom in out.GetAtoms():
+        valence = sum(bond.GetBondTypeAsDouble() for bond in atom.GetBonds())
+        charge = {("N", 4): 1, ("O", 3): 1, ("B", 4): -1}.get((atom.GetSymbol(), valence))
+        if charge is not None and not atom.GetFormalCharge():
+            atom.SetFormalCharge(charge)
+            changed.append(f"{atom.GetSymbol()}{atom.GetIdx() + 1} {charge:+d}")
+    try:
+        sanitise(out)
+    except PreparationError:
+        return None
+    notes.append(f"charges that the file leaves out, from the number of bonds: {', '.join(changed)}")
+    return out
+
+
+def _reperceived(molecule: Any, notes: list[str]) -> Any | None:
+    """With the bond orders and charges of its elements and bonds, all of whose hydrogens must be there, in space."""
+    if not molecule.GetNumConformers() or not molecule.GetConformer().Is3D():
+        return None
+    elements = tuple(atom.GetSymbol() for atom in molecule.GetAtoms())
+    rows = {
+        tuple(sorted((b.GetBeginAtomIdx(), b.GetEndAtomIdx()))): b.GetBondTypeAsDouble() for b in molecule.GetBonds()
+    }
+    found = Mol2(
+        names=elements,
+        elements=elements,
+        positions_nm=np.array(molecule.GetConformer().GetPositions()) / 10.0,
+        bonds=np.array(sorted(rows), dtype=np.int64).reshape(-1, 2),
+        orders={(i, j): round(order) for (i, j), order in rows.items() if order in (1, 2, 3)},
+        charge=None,
+        residues=(),
+        block="",
+    )
+    out = molecule_of(found, [])
+    if out is not None:
+        try:
+            sanitise(out)
+        except PreparationError:
+            return None
+        total = sum(atom.GetFormalCharge() for atom in out.GetAtoms())
+        notes.append(f"its valences are impossible as written: orders and charges perceived, total {total:+d}")
+    return out
 
 
 def suffix_of(path: Path) -> str:
@@ -133,7 +192,6 @@ def _is_unplaced(conformer: Any, n_atoms: int) -> bool:
 
 
 def _refuse_coincident(molecule: Any) -> None:
-    import numpy as np
     from scipy.spatial import cKDTree
 
     positions = np.array(molecule.GetConformer().GetPositions())
