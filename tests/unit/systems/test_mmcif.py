@@ -151,19 +151,8 @@ def test_rows_wrapped_over_lines_uncertainties_and_links(tmp_path: Path) -> None
 def test_faults_beside_the_atoms_do_no_harm_and_those_among_them_do(tmp_path: Path) -> None:
     path = tmp_path / "x.cif"
     text = Path(_write(path, _peptide())).read_text()
-    beside = (
-        "_entry.id OTHER",
-        "_citation.title 'Übersicht'",
-        "_cell.length_a",
-        "data_TEST",
-        "loop_",
-        "_e.f",
-        "_e.g",
-        "#",
-    )
-    path.write_text(
-        text.replace("data_TEST", "\n".join(("data_TEST", *beside[:3], *beside[4:]))) + "\n".join(beside[3:])
-    )
+    beside = "data_TEST\n_entry.id OTHER\n_citation.title 'Übersicht'\n_cell.length_a"
+    path.write_text(text.replace("data_TEST", beside) + "data_TEST\nloop_\n_e.f\n_e.g\n")
     assert prepare(str(path)).molecule_key == ALA2.molecule_key
     for old, new in (("_atom_site.Cartn_y", "_atom_site.Cartn_x"), ("HETATM ", "HETATM é"), ("ATOM 7", "ATOM 7é")):
         path.write_text(text.replace(old, new))
