@@ -106,7 +106,7 @@ def hold_against(test: TrainingFrames, first_nm: FloatArray, frames_nm: FloatArr
     flags = check_frames(frames_nm.reshape(-1, *frames_nm.shape[2:]), geometry)
     phi, psi = (_correlation(np.cos(first[:, k]), np.cos(found[:, 0, k])) for k in (0, 1))
     valid = float(((flags & INVALID) == 0).mean())
-    jsd = _joint_distance(found.reshape(-1, 2), everything)
+    jsd = joint_distance(found.reshape(-1, 2), everything)
     return Row(lag_ps, source, valid, jsd, psi, phi, len(first))
 
 
@@ -116,7 +116,8 @@ def _correlation(x: FloatArray, y: FloatArray) -> float:
     return float(((x - both.mean()) * (y - both.mean())).mean() / both.var())
 
 
-def _joint_distance(x: FloatArray, y: FloatArray) -> float:
+def joint_distance(x: FloatArray, y: FloatArray) -> float:
+    """Return the Jensen-Shannon distance of two sets of (phi, psi), each `(n, 2)` rad."""
     from surrogate.judge.distributions import distance
 
     edges = np.linspace(-np.pi, np.pi, _BINS + 1)

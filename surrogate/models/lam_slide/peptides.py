@@ -190,7 +190,7 @@ class PeptideSlide(Surrogate):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     solvers = flow.solvers_for("linear")
-    float32_layers: tuple[str, ...] = ()
+    float32_layers: tuple[str, ...] = ("flow.of_time",)
     config: PeptideConfig
     token_mean: Tensor
     token_scale: Tensor

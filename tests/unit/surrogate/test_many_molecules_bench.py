@@ -66,8 +66,8 @@ def test_correlation_and_distance_of_known_processes() -> None:
     assert lags._correlation(x, 0.6 * x + 0.8 * rng.normal(size=20_000)) == pytest.approx(0.6, abs=0.02)
     assert lags._correlation(x, rng.normal(size=20_000)) == pytest.approx(0.0, abs=0.02)
     angles = rng.uniform(-np.pi, np.pi, (20_000, 2))
-    assert lags._joint_distance(angles, angles) == 0.0
-    assert lags._joint_distance(angles, 0.1 * angles) > 0.7
+    assert lags.joint_distance(angles, angles) == 0.0
+    assert lags.joint_distance(angles, 0.1 * angles) > 0.7
 
 
 def test_rows_of_a_lag_hold_md_and_the_model(
