@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from md_reference import born
+from md_reference.glycans import GLYCAM_FILE, covered_by_glycam, glycan_templates
 from md_reference.mixture import is_water, molecules_of
 from md_reference.regrouping import permuted, regroup
 from systems.errors import InputError, PreparationError
@@ -94,6 +95,8 @@ def uncovered_residue(scene: Scene, protein: str) -> str | None:
     force_field = force_field_of(chain_files(protein))
     try:
         found = unmatched_residues(scene, force_field)
+        if found and protein == "ff14SB":
+            found = sorted(set(found) - covered_by_glycam(scene))
     except InputError:
         found = [0]  # residues that are not contiguous
     if found:
@@ -131,6 +134,11 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         wanted.append("amber99_obc.xml")
     elif spec.solvent == "obc2" and not native_gb:
         wanted.append("implicit/obc2.xml")
+    names = glycan_templates(scene) if spec.force_field == "ff14SB" else {}
+    if names:
+        wanted.insert(1, GLYCAM_FILE)
+        # GLYCAM has an acetyl, ACX, with the bonds of ACE.
+        names |= {r: "ACE" for r, name in enumerate(scene.residue_names) if name == "ACE"}
     force_field = force_field_of(tuple(wanted))
     settings: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
     if spec.is_explicit:
@@ -142,13 +150,16 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     real: list[int] = list(range(scene.n_atoms))
     try:
         if spec.solvent == "opc":
-            topology, real = _with_virtual_sites(topology, scene, force_field)
-        elif spec.force_field != "charmm36":  # its terminal residues are patches, which only createSystem tries
+            topology, real = _with_virtual_sites(topology, scene, force_field, names)
+        elif spec.force_field != "charmm36" and not names:
+            # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
             for residue in force_field.getUnmatchedResidues(topology):
                 raise Unmatched(_describe(scene, residue.index))
         system = force_field.createSystem(
             topology,
-            residueTemplates=_chosen_templates(topology) if spec.force_field == "charmm36" else {},
+            residueTemplates=_chosen_templates(topology)
+            if spec.force_field == "charmm36"
+            else _by_residue(topology, names),
             **settings,
             constraints=app.HBonds if spec.constrain_hydrogens else None,
             rigidWater=True,
@@ -175,12 +186,16 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     return system
 
 
-def _with_virtual_sites(topology: Any, scene: Scene, force_field: Any) -> tuple[Any, list[int]]:
+def _by_residue(topology: Any, names: dict[int, str]) -> dict[Any, str]:
+    return {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
+
+
+def _with_virtual_sites(topology: Any, scene: Scene, force_field: Any, names: dict[int, str]) -> tuple[Any, list[int]]:
     """Return the topology with the force field's extra particles in place, and which of its particles are atoms."""
     from openmm import app, unit
 
     modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
-    modeller.addExtraParticles(force_field)
+    modeller.addExtraParticles(force_field, residueTemplates=_by_residue(topology, names))
     return modeller.topology, [a.index for a in modeller.topology.atoms() if a.element is not None]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from md_reference.ambertools import find_ambertools, run
 from md_reference.capped_residues import cap
 from md_reference.charge_cost import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
 from md_reference.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.glycans import glycan_templates
 from md_reference.regrouping import regroup
 from md_reference.residue_templates import make_template
 from systems.bond_orders import perceive
@@ -22,6 +24,7 @@ from systems.chemistry import backbone_torsions
 from systems.errors import PreparationError
 from systems.library import load
 from systems.molecule import scene_from_smiles
+from systems.prepare import prepare
 from systems.scene import FloatArray, Scene
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
@@ -41,12 +44,20 @@ def energies(system: Any, positions_nm: FloatArray) -> dict[str, float]:
     }
 
 
-def leap_scene(sequence: str, folder: Path, sources: tuple[str, ...]) -> tuple[Scene, Any]:
-    """A sequence as tleap builds it, 0.05 Å off its own geometry, and the System of tleap's prmtop."""
+def leap_scene(
+    sequence: str,
+    folder: Path,
+    sources: tuple[str, ...],
+    *,
+    lines: Sequence[str] = (),
+    names: Mapping[str, str] | None = None,
+) -> tuple[Scene, Any]:
+    """A sequence (or what `lines` make of x) as tleap builds it, 0.05 Å off its own geometry, residues under new
+    `names`, and the System of tleap's prmtop."""
     from openmm import app, unit
 
     script = [f"source leaprc.{name}" for name in sources]
-    script += [f"x = sequence {{ {sequence} }}", "saveamberparm x x.prmtop x.inpcrd", "quit", ""]
+    script += [*(lines or [f"x = sequence {{ {sequence} }}"]), "saveamberparm x x.prmtop x.inpcrd", "quit", ""]
     (folder / "leap.in").write_text("\n".join(script))
     run("tleap", ["-f", "leap.in"], folder)
     prmtop = app.AmberPrmtopFile(str(folder / "x.prmtop"))
@@ -63,7 +74,7 @@ def leap_scene(sequence: str, folder: Path, sources: tuple[str, ...]) -> tuple[S
         atom_names=tuple(a.name for a in topology.atoms()),
         elements=tuple(elements),
         residue_of_atom=np.array([a.residue.index for a in topology.atoms()], dtype=np.int64),
-        residue_names=tuple(r.name for r in residues),
+        residue_names=tuple((names or {}).get(r.name, r.name) for r in residues),
         residue_ids=tuple(str(r.index + 1) for r in residues),
         chain_of_residue=tuple("A" for _ in residues),
         bonds=bonds,
@@ -218,6 +229,45 @@ def test_nucleic_acids_have_tleaps_energies(sequence: str, source: str, tmp_path
             assert ours[force] == pytest.approx(energy, rel=2e-4, abs=0.3), force
 
 
+# ---- sugars --------------------------------------------------------------------------------------------------------
+
+# GLYCAM's names, and the Protein Data Bank's.
+_PDB_NAMES = {"4YB": "NAG", "VMB": "BMA", "0MA": "MAN", "NLN": "ASN", "0fA": "FUC", "UYB": "NAG"}
+
+
+def glycopeptide(folder: Path, names: dict[str, str]) -> tuple[Scene, Any]:
+    """ACE-ASN-NME with NAG(FUC)-NAG-BMA(MAN)MAN, 0.05 Å off tleap's geometry, residues renamed; and tleap's System."""
+    lines = [
+        "p = sequence { ACE NLN NME }", "a = sequence { UYB }", "b = sequence { 4YB }", "c = sequence { VMB }",
+        "d = sequence { 0MA }", "e = sequence { 0MA }", "f = sequence { 0fA }", "x = combine { p a b c d e f }",
+        "bond x.2.ND2 x.4.C1", "bond x.4.O4 x.5.C1", "bond x.5.O4 x.6.C1", "bond x.6.O3 x.7.C1", "bond x.6.O6 x.8.C1",
+        "bond x.4.O6 x.9.C1",
+    ]  # fmt: skip
+    return leap_scene("", folder, ("protein.ff14SB", "GLYCAM_06j-1"), lines=lines, names=names)
+
+
+@needs_ambertools
+@pytest.mark.parametrize("names", [{}, _PDB_NAMES], ids=["glycam", "pdb"])
+def test_a_glycopeptide_has_tleaps_energies(names: dict[str, str], tmp_path: Path) -> None:
+    scene, theirs = glycopeptide(tmp_path, names)
+    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
+    assert spec.force_field == "ff14SB"
+    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
+        assert ours[force] == pytest.approx(expected[force], rel=1e-5, abs=0.05), force
+    assert ours["PeriodicTorsionForce"] == pytest.approx(expected["PeriodicTorsionForce"], abs=0.3)
+
+
+@needs_ambertools
+def test_a_sugar_whose_handedness_is_not_its_names_has_no_template(tmp_path: Path) -> None:
+    scene, _ = glycopeptide(tmp_path, _PDB_NAMES)
+    assert sorted(glycan_templates(scene).values()) == sorted(["UYB", "4YB", "VMB", "0MA", "0MA", "0fA"])
+    galactose = replace(scene, residue_names=tuple("GAL" if n == "BMA" else n for n in scene.residue_names))
+    assert len(glycan_templates(galactose)) == 5
+    mirrored = scene.with_positions(scene.positions_nm * [1.0, 1.0, -1.0])
+    assert glycan_templates(mirrored) == {}
+
+
 # ---- what is said about charges ------------------------------------------------------------------------------------
 
 
@@ -235,3 +285,37 @@ def test_charges_are_announced_where_they_take_long(caplog: pytest.LogCaptureFix
     before, after = (record.getMessage() for record in caplog.records)
     assert "aspirin: AM1-BCC charges of 21 atoms, about 2 s on an idle core" in before
     assert "charges computed in" in after
+
+
+@needs_ambertools
+def test_a_glycopeptide_without_hydrogens_is_completed_and_covered(tmp_path: Path) -> None:
+    from scipy.spatial.transform import Rotation
+
+    scene, _ = glycopeptide(tmp_path, _PDB_NAMES)
+    dictionary = {"C2N": "C7", "O2N": "O7", "CME": "C8"}
+    # Sugars stand where tleap makes them, on one another: link by link they are moved to a bond's length.
+    x = np.array(scene.positions_nm)
+    at = {(int(r), n): i for i, (r, n) in enumerate(zip(scene.residue_of_atom, scene.atom_names, strict=True))}
+    links = [((1, "ND2"), 3), ((3, "O4"), 4), ((4, "O4"), 5), ((5, "O3"), 6), ((5, "O6"), 7), ((3, "O6"), 8)]
+    near = scene.neighbours()
+    for anchor, sugar in links:
+        a, c1 = at[anchor], at[sugar, "C1"]
+        inner = next(j for j in near[a] if scene.residue_of_atom[j] == anchor[0] and scene.elements[j] == "C")
+        outward = (x[a] - x[inner]) / np.linalg.norm(x[a] - x[inner])
+        members = np.flatnonzero(scene.residue_of_atom == sugar)
+        free = -sum((x[j] - x[c1]) / np.linalg.norm(x[j] - x[c1]) for j in near[c1] if j in members)
+        turn, _ = Rotation.align_vectors([-outward], [free])
+        x[members] = x[a] + 0.143 * outward + turn.apply(x[members] - x[c1])
+    lines = []
+    for i in scene.heavy_idx.tolist():
+        r = int(scene.residue_of_atom[i])
+        name = dictionary.get(scene.atom_names[i], scene.atom_names[i])
+        head = f"ATOM  {len(lines) + 1:5d}  {name:<4s}{scene.residue_names[r]:>3s} A{r + 1:4d}"
+        position = "".join(f"{v:8.3f}" for v in (x[i] * 10).tolist())
+        lines.append(f"{head}    {position}  1.00  0.00          {scene.elements[i]:>2s}")
+    path = tmp_path / "glycan.pdb"
+    path.write_text("\n".join([*lines, "END", ""]))
+    prepared = prepare(str(path))
+    assert prepared.formula == scene.formula
+    assert Counter(glycan_templates(prepared).values()) == Counter(glycan_templates(scene).values())
+    assert resolve(prepared, ForceFieldSpec("auto", "auto")).force_field == "ff14SB"
