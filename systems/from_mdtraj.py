@@ -42,6 +42,9 @@ def scene_from_mdtraj_topology(
     symbols = list(elements) if elements is not None else [a.element.symbol if a.element else "VS" for a in atoms]
     bonds = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
     orders = np.array([row[2] for row in rows], dtype=np.float64)
+    numbers = [r.resSeq for r in residues]
+    if numbers == list(range(len(residues))):  # no numbers were stated; people count from one
+        numbers = [n + 1 for n in numbers]
     charges = np.array([getattr(a, "formal_charge", None) or 0 for a in atoms], dtype=np.int64)
     if not orders.any():
         with contextlib.suppress(ValenceError):
@@ -52,7 +55,7 @@ def scene_from_mdtraj_topology(
         elements=tuple(symbols),
         residue_of_atom=np.array([a.residue.index for a in atoms], dtype=np.int64),
         residue_names=tuple(r.name for r in residues),
-        residue_ids=tuple(str(r.resSeq) for r in residues),
+        residue_ids=tuple(map(str, numbers)),
         chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
         bonds=bonds,
         bond_orders=orders,

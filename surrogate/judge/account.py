@@ -13,6 +13,7 @@ from surrogate.judge.rows import Sample
 from surrogate.judge.structure import first_invalid_ps
 from systems import validity
 from systems.imposed import imposed_terms
+from systems.validity import Geometry
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,13 @@ class Faults:
     first_invalid_ps: float | None
 
 
-def faults_of(sample: Sample) -> Faults:
-    """Count the flags of the frames of one sample."""
+def faults_of(sample: Sample, geometry: Geometry) -> Faults:
+    """Count the flags of the frames of one sample, of those checks that the geometry has something for."""
     features = sample.features
     flags = np.concatenate(list(features.flags))
-    counts = {validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in metrics.CHECKS}
+    counts = {
+        validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in metrics.applicable_checks(geometry)
+    }
     return Faults(
         features.label,
         len(flags),

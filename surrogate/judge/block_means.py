@@ -27,9 +27,10 @@ class Means:
     draws: FloatArray
     n_blocks: int
 
-    def estimates(self) -> list[Estimate]:
-        """Return each mean with its interval."""
-        return [estimate(float(v), self.draws[:, k], self.n_blocks) for k, v in enumerate(self.values)]
+    def estimates(self, columns: Sequence[int] | None = None) -> list[Estimate]:
+        """Return each mean with its interval, of all columns or of some."""
+        chosen = range(len(self.values)) if columns is None else columns
+        return [estimate(float(self.values[k]), self.draws[:, k], self.n_blocks) for k in chosen]
 
 
 def family_of(sample: Sample, family: Family) -> Segments:

@@ -31,6 +31,7 @@ from surrogate.judge.slow_motion import longest_correlation
 from surrogate.judge.statistics import block_length, effective_samples, make_blocks
 from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
 from surrogate.judge.survival import survival_charts
+from surrogate.judge.suspicions import bonds_that_are_none, copied_from, copy_rows, jumps, refuse_wrong_topology
 from surrogate.judge.temperature_row import temperature_rows
 from surrogate.judge.torsion_rows import other_torsion_rows
 from surrogate.judge.wasserstein_rows import wasserstein_rows
@@ -50,6 +51,7 @@ ROOMS: tuple[Room, ...] = (
     shape_rows,
     other_torsion_rows,
     within_rows,
+    copy_rows,
     contact_rows,
     hydrogen_bond_rows,
     lifetime_rows,
@@ -173,6 +175,9 @@ def compare(
         if ensemble.scene.elements != stage.elements:
             raise InputError(f"{ensemble.label}: its atoms are not those of {stage.name!r} in the same order.")
     thinned = equal_lags(everyone)
+    refuse_wrong_topology(thinned[0])
+    if replicate is not None:
+        refuse_wrong_topology(thinned[-1])
     torsions = backbone(whole, kept)
     geometry = reference_geometry(thinned[0])
     probes = reference_probes(thinned[0], parent=whole, kept=kept)
@@ -182,6 +187,10 @@ def compare(
             replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
         ]
     notes = [note for e in thinned for note in e.notes]
+    for rolled in thinned[1 : 1 + len(candidates)]:
+        long, said = bonds_that_are_none(rolled)
+        notes += [f"{rolled.label}: {said}; does its topology fit its coordinates?"] if long else []
+    notes += jumps(measured)
     truth = measured[0]
     if replicate is None:
         half = truth.n_frames // 2
@@ -257,7 +266,7 @@ def _judge(
     worth = worths(reference, candidate, replicate, torsions, options)
     words = ""
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
-    if kind != "broken" and not doubts.apart and known >= remarks.LEAST_FOR_WORTH:
+    if kind != "broken" and not (doubts.apart or doubts.copied) and known >= remarks.LEAST_FOR_WORTH:
         words = headline(worth, lambda ps: cost_ratio(ps, account, reference_account))
     return Judgement(
         account=account,
@@ -274,7 +283,11 @@ def _judge(
         correlation_ps=correlation * truth.features.lag_ps,
         effective_samples=samples,
         speed_ratio=speed_ratio(account, reference_account),
-        faults=(faults_of(trio.reference), faults_of(trio.candidate), faults_of(trio.replicate)),
+        faults=(
+            faults_of(trio.reference, geometry),
+            faults_of(trio.candidate, geometry),
+            faults_of(trio.replicate, geometry),
+        ),
         skipped=(
             *remarks.skipped(trio),
             *skipped,
@@ -285,6 +298,7 @@ def _judge(
         notes=tuple(
             remarks.trimming(trio, reference, candidate, replicate)
             + remarks.unlike(judged, options)
+            + copied_from(trio)[1]
             + imposed_notes(account.label, judged, account.imposed)
         ),
         curves=Curves(

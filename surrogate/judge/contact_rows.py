@@ -142,7 +142,7 @@ def _mean_row(
 def _chart(labels: Sequence[str], single: Sequence[Means], order: Sequence[int]) -> list[Chart]:
     if not order:
         return []
-    made = [[m.estimates()[k] for k in order] for m in single]
+    made = [m.estimates(order) for m in single]
 
     def pick(which: int, name: str) -> np.ndarray:
         return np.array([100.0 * getattr(e, name) for e in made[which]])

@@ -19,6 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 AnyFloat = npt.NDArray[np.floating]
 
 MAX_LAG_FRAMES = 50_000
+FRAMES_A_FEATURE = 2
+WITHOUT_TICA = "the torsions of the reference do not move, or its frames are too few for so many torsions"
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +193,8 @@ def circular_features(*torsions_rad: AnyFloat) -> FloatArray:
 
 
 def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
-    """Fit TICA (reversible, mean removed; deeptime) to features `(n_frames, n_features)`; None when nothing varies.
+    """Fit TICA (reversible, mean removed; deeptime) to features `(n_frames, n_features)`; None when nothing varies, or
+    frames are so few that a slow combination would be found in any noise.
 
     Pairs never cross a segment, nor a frame that is not finite. The sign of TIC 0 is chosen so that its skewness is
     positive: the rare state lies on the right. Source: Perez-Hernandez et al., J. Chem. Phys. 139, 015102 (2013).
@@ -199,7 +202,7 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     from deeptime.decomposition import TICA
 
     runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
-    if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
+    if not can_be_fitted(runs):
         return None
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
     for run in runs:
@@ -211,6 +214,14 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     if float(((projected - projected.mean()) ** 3).sum()) < 0:
         vector = -vector
     return Tica(mean, vector, lag_frames, float(np.real(model.singular_values[0])))
+
+
+def can_be_fitted(runs: Sequence[FloatArray]) -> bool:
+    """Return whether TICA of `runs` `(n_frames, n_features)` means anything: something varies, and there are at least
+    `FRAMES_A_FEATURE` frames for each feature."""
+    if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
+        return False
+    return sum(map(len, runs)) >= FRAMES_A_FEATURE * runs[0].shape[1]
 
 
 def finite_runs(features: FloatArray) -> list[FloatArray]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.kinetics import PairSums, finite_runs, timescale
+from surrogate.judge.kinetics import PairSums, can_be_fitted, finite_runs, timescale
 from surrogate.judge.statistics import Blocks
 
 FloatArray = npt.NDArray[np.float64]
@@ -82,7 +82,7 @@ class Model:
 def fit_projection(
     segments: Sequence[FloatArray], lag_frames: int, dim: int = MAX_DIMENSIONS, *, least: float = 0.01
 ) -> Projection | None:
-    """Fit TICA with kinetic-map scaling to features `(n, k)`; None when nothing varies.
+    """Fit TICA with kinetic-map scaling to features `(n, k)`; None when nothing varies or frames are too few.
 
     At most `dim` coordinates are kept, those whose eigenvalue exceeds `least` and in any case the first.
 
@@ -90,8 +90,8 @@ def fit_projection(
     """
     from deeptime.decomposition import TICA
 
-    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames]
-    if not runs or max(float(run.std(0).max()) for run in runs) < 1e-9:
+    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
+    if not can_be_fitted(runs):
         return None
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
     for run in runs:

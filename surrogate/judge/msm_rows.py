@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions, msm
 from surrogate.judge.charts import BarChart, Chart, Landscape, Line, LineChart, Role
-from surrogate.judge.kinetics import lagged_eigenvalue, timescale
+from surrogate.judge.kinetics import WITHOUT_TICA, lagged_eigenvalue, timescale
 from surrogate.judge.relaxation import speed_words
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
 from surrogate.judge.slow_motion import tica_features
@@ -55,7 +55,7 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
         return [], [], [(name, "the segments are shorter than ten lags")]
     projection = msm.fit_projection(features[0], lag)
     if projection is None:
-        return [], [], [(name, "the torsions of the reference do not move")]
+        return [], [], [(name, WITHOUT_TICA)]
     coordinates = [[projection.project(x) for x in segments] for segments in features]
     model = msm.fit_model(projection, coordinates[0], lag)
     if model is None:

@@ -81,8 +81,7 @@ def slow_states(trio: Trio) -> list[list[IntArray]]:
     lag = max(1, round(_TICA_LAG_PS / trio.reference.features.lag_ps))
     features = [tica_features(s.features) for s in trio.samples]
     truth = [*features[0], *features[2]]
-    enough = truth[0].shape[1] and sum(map(len, truth)) > 20 * truth[0].shape[1] and max(map(len, truth)) > 10 * lag
-    model = kinetics.fit_tica(truth, lag) if enough else None
+    model = kinetics.fit_tica(truth, lag) if max(map(len, truth)) > 10 * lag else None
     if model is None:
         return [[np.zeros(n, dtype=np.int64) for n in s.features.segment_lengths] for s in trio.samples]
     values = np.concatenate([model.project(x) for x in truth])

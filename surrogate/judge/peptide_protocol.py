@@ -167,7 +167,7 @@ def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, 
         return [], [], [(name, "a segment holds no finite frame")]
     fit = fit_recipe(reference)
     if fit is None:
-        return [], [], [(name, "the torsions of the reference do not move")]
+        return [], [], [(name, kinetics.WITHOUT_TICA)]
     tables = [peptide_table(fit, reference, other).values() for other in (candidate, replicate)]
     known = np.isfinite(tables[1])
     n_states = "none" if fit.model is None else str(fit.model.n_states)

@@ -50,7 +50,8 @@ class Probes:
     (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
     reference forms in more than half of its frames. What the molecule's symmetry makes equal is chosen together.
     `classes` `(n_atoms,)`: equal for atoms that have no identity of
-    their own, such as the hydrogens of a methyl group. `left_out` says what is not measured, and why.
+    their own, such as the hydrogens of a methyl group. `left_out` says what is not measured, and why; `whole` is False
+    where atoms of the scene are missing.
     """
 
     scene: Scene
@@ -67,6 +68,7 @@ class Probes:
     rings: tuple[tuple[int, ...], ...]
     classes: IntArray
     left_out: tuple[tuple[str, str], ...] = ()
+    whole: bool = True
 
     def labels(self, family: Family) -> list[str]:
         """Return a name per column of a family."""
@@ -134,6 +136,7 @@ def find_probes(
         rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
         classes=classes,
         left_out=tuple(left_out),
+        whole=kept is None,
     )
 
 

@@ -23,6 +23,9 @@ from systems.units import format_time_ps
 IntArray = npt.NDArray[np.int64]
 
 _WIDEST_BOND_NM = 0.3
+# No MD saves frames this close; and a DCD header of one AKMA unit of time is a default, not a time.
+_LEAST_LAG_PS = 1e-4
+_AKMA_PS = 0.04888821
 _SETTINGS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "model", "weights_hash")
 
 
@@ -107,6 +110,11 @@ def time_axis(
         return math.nan, [], []
     if time_ps is None or not (np.isfinite(time_ps).all() and measured > 0):
         raise InputError(f"{path}: the file holds no usable times; state the time between frames with --lag 1ps.")
+    if measured < _LEAST_LAG_PS or abs(measured - _AKMA_PS) < 1e-6:
+        raise InputError(
+            f"{path}: its header says {1e3 * measured:.3g} fs between frames, which is what a writer that was told "
+            "nothing puts there; state the time between frames with --lag 1ps."
+        )
     # Times that passed through float32 are exact only to its spacing.
     tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
     odd = np.abs(steps - measured) > tolerance

@@ -197,7 +197,7 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
         return [], [], [(name, "the segments are shorter than ten lags")]
     model = kinetics.fit_tica(features[0], lag)
     if model is None:
-        return [], [], [(name, "the torsions of the reference do not move")]
+        return [], [], [(name, kinetics.WITHOUT_TICA)]
     projected = [[model.project(x) for x in segments] for segments in features]
     values, draws = [], []
     for sample, series in zip(trio.samples, projected, strict=True):

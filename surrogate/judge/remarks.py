@@ -8,6 +8,7 @@ from surrogate.judge import metrics, verdict
 from surrogate.judge.rows import Options, Row, Trio
 from surrogate.judge.slow_motion import rarely_crossed
 from surrogate.judge.structure import Features
+from surrogate.judge.suspicions import copied_from
 from systems import validity
 from systems.units import format_time_ps
 
@@ -42,7 +43,8 @@ def doubts(trio: Trio, samples: float, correlation: float) -> verdict.Doubts:
         lost = (
             f"it lies in another state of {named} than the reference, and hardly any run passes from one to the other"
         )
-    return verdict.Doubts(short, lost)
+    copied, _ = copied_from(trio)
+    return verdict.Doubts(short, lost, copied)
 
 
 def unlike(rows: Sequence[Row], options: Options) -> list[str]:
@@ -59,13 +61,16 @@ def unlike(rows: Sequence[Row], options: Options) -> list[str]:
 def skipped(trio: Trio) -> list[tuple[str, str]]:
     """Return the checks and torsions that the scene has nothing for, with the reason."""
     skipped = []
+    probes = trio.reference.features.probes
+    whole = probes is None or probes.whole
+    none = "the scene has none" if whole else "atoms that it needs are not in all files: not checked"
     done = {check.mask for check in metrics.applicable_checks(trio.geometry)}
     for flag, what, why in (
         (validity.BOND_HALF_ANGSTROM, "Bond lengths", "the scene has no bonds"),
         (validity.CLASH, "Clashes", "no two atoms are more than three bonds apart"),
-        (validity.CHIRALITY, "Stereocentres", "the scene has none"),
-        (validity.OMEGA, "Peptide and double bonds", "the scene has none"),
-        (validity.RING, "Planar rings", "the scene has none"),
+        (validity.CHIRALITY, "Stereocentres", none),
+        (validity.OMEGA, "Peptide and double bonds", none),
+        (validity.RING, "Planar rings", none),
     ):
         if flag not in done:
             skipped.append((what, why))

@@ -210,7 +210,7 @@ def distance_row(
         p_replicate=p_replicate,
         tolerance=2.0,
         tolerance_text="≤ 2 × replicate",
-        statement=statement(ratio.value),
+        statement=statement(ratio.value) if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
 
@@ -320,5 +320,5 @@ def observable_row(
         p_replicate=1.0 if abs(rep.value - ref.value) < resolution else difference_p(rep, ref, log=log),
         tolerance=tolerance * ref.value if log else tolerance,
         tolerance_text=tolerance_text,
-        statement=statement(cand.value, ref.value),
+        statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric}: it does not move",
     )

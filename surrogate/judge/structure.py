@@ -50,7 +50,8 @@ class Features:
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
     frame is not finite. `chunk_idx` and `changed` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was
-    computed, or None. `series` holds the further families `(n, k)` that
+    computed, or None; `moved_nm` `(n,)` how far atoms are, root mean square, from where they were in the frame before
+    (NaN for the first), centres of both laid together, or None. `series` holds the further families `(n, k)` that
     `probes` names (see `surrogate.judge.probes.Probes`), empty where nothing was asked for.
     """
 
@@ -65,6 +66,7 @@ class Features:
     probes: Probes | None = None
     changed: Sequence[npt.NDArray[np.bool_]] | None = None
     energy_kj: Sequence[npt.NDArray[np.float64]] | None = None
+    moved_nm: Sequence[Series] | None = None
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -98,6 +100,7 @@ class Features:
             chunk_idx=None if self.chunk_idx is None else cut(self.chunk_idx),
             changed=None if self.changed is None else cut(self.changed),
             energy_kj=None if self.energy_kj is None else cut(self.energy_kj),
+            moved_nm=None if self.moved_nm is None else cut(self.moved_nm),
             series={family: cut(values) for family, values in self.series.items()},
         )
 
@@ -158,7 +161,7 @@ def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: 
     from systems.validity import check_frames
 
     bonds = np.asarray(geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
-    phi, psi, lengths, flags = [], [], [], []
+    phi, psi, lengths, flags, moved = [], [], [], [], []
     series: dict[Family, list[npt.NDArray[Any]]] = {family: [] for family in FAMILIES} if probes else {}
     size = max(min(_BLOCK_FRAMES, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 1)
     for segment in ensemble.segments:
@@ -167,10 +170,13 @@ def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: 
         psi.append(np.empty((n, len(torsions.psi)), dtype=np.float32))
         lengths.append(np.empty((n, len(bonds)), dtype=np.float32))
         flags.append(np.empty(n, dtype=np.uint16))
+        moved.append(np.full(n, np.nan, dtype=np.float32))
+        before = np.empty((0, ensemble.scene.n_atoms, 3), dtype=np.float32)
         for start in range(0, n, size):
             part = slice(start, min(start + size, n))
             block = segment[part]
             broken = ~np.isfinite(block).all(axis=(1, 2))
+            before = _moved(before, block, moved[-1][part])
             with np.errstate(invalid="ignore", over="ignore"):
                 for first, x in column_blocks(block, max(len(bonds), 1)):
                     rows = slice(start + first, start + first + x.shape[2])
@@ -196,7 +202,19 @@ def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: 
         series=series,
         probes=probes,
         changed=ensemble.changed,
+        moved_nm=moved,
     )
+
+
+def _moved(before: Series, block: Series, out: Series) -> Series:
+    """Write how far each frame of `block` is from the one before it, `before` `(0 or 1, n_atoms, 3)` being that of the
+    first; return the last frame."""
+    frames = np.concatenate([before, block])
+    with np.errstate(invalid="ignore", over="ignore"):
+        centred = frames - frames.mean(axis=1, keepdims=True)
+        step = np.sqrt((np.diff(centred, axis=0) ** 2).sum(axis=2).mean(axis=1))
+    out[len(out) - len(step) :] = step
+    return np.asarray(frames[-1:])
 
 
 def bond_label(scene: Scene, i: int, j: int) -> str:

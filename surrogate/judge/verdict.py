@@ -24,10 +24,12 @@ ALL_KEY = "valid:all"
 
 class Doubts(NamedTuple):
     """Why a verdict must wait, in words, empty where it need not: `short` for slow motion sampled too little for
-    anything to agree, `apart` for states between which hardly any run passes, so that a difference says nothing."""
+    anything to agree, `apart` for states between which hardly any run passes, so that a difference says nothing,
+    `copied` for frames that are the truth's own."""
 
     short: str = ""
     apart: str = ""
+    copied: str = ""
 
 
 SURE = Doubts()
@@ -64,11 +66,16 @@ def _word(row: Row, p: float, significance: float) -> Word:
     if not math.isfinite(p):
         return "undecided"
     within = _within_tolerance(row)
-    if p < significance:
+    if p < significance and not _beats_replicate(row):
         return "close" if within else "differs"
     if row.kind == "distance":
         return "agrees" if within else "undecided"
     return "agrees" if _resolution(row) <= row.tolerance else "undecided"
+
+
+def _beats_replicate(row: Row) -> bool:
+    """Whether a distance is no greater than the replicate's own: nothing is off by it."""
+    return row.kind == "distance" and row.ratio is not None and row.ratio.value <= 1.0
 
 
 def _within_tolerance(row: Row) -> bool:
@@ -112,6 +119,8 @@ def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
     words = [r.verdict for r in rows]
     if "fails" in words:
         return "broken"
+    if doubts.copied:
+        return "undecided"
     if doubts.apart and not any(r.verdict == "differs" and r.group == "validity" for r in rows):
         return "undecided"
     if "differs" in words:
@@ -127,6 +136,9 @@ def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
 def findings(rows: Sequence[Row]) -> tuple[str, ...]:
     """Return what is wrong, worst first; within one severity validity first, then by how far beyond the tolerance."""
     bad = [r for r in rows if _SEVERITY[r.verdict] > 0 and r.key != ALL_KEY and r.statement]
+    # Beside what is wrong, what is within its tolerance is no finding.
+    if any(_SEVERITY[r.verdict] > _SEVERITY["close"] for r in bad):
+        bad = [r for r in bad if r.verdict != "close"]
     bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.key != FINITE_KEY, r.group != "validity", -_excess(r)))
     return tuple(r.statement for r in bad)
 

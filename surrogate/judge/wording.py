@@ -32,9 +32,18 @@ def number(estimate: Estimate | None) -> str:
     if not math.isfinite(value):
         return "not defined"
     if math.isfinite(error) and error > 0:
-        decimals = min(max(1 - math.floor(math.log10(error)), 0), 4 if abs(value) < 10 else 3)
-        return f"{value:.{decimals}f}"
+        return _rounded(value, _decimals(abs(value), error))
     return f"{value:.4g}"
+
+
+def _decimals(size: float, error: float) -> int:
+    return min(max(1 - math.floor(math.log10(error)), 0), 4 if size < 10 else 3)
+
+
+def _rounded(value: float, decimals: int) -> str:
+    """Return the value with so many decimals, or with two digits where it would read as zero."""
+    shown = f"{value:.{decimals}f}"
+    return f"{value:.2g}" if value and not float(shown) else shown
 
 
 def interval(estimate: Estimate | None) -> str:
@@ -43,9 +52,13 @@ def interval(estimate: Estimate | None) -> str:
         return ""
     if estimate.low == estimate.high:
         return ""
-    low = number(Estimate(estimate.low, error=estimate.error))
-    high = number(Estimate(estimate.high, error=estimate.error))
-    return f"[{low}, {high}]"
+    low, high, error = estimate.low, estimate.high, estimate.error
+    if not (math.isfinite(error) and error > 0):
+        return f"[{low:.4g}, {high:.4g}]"
+    decimals = _decimals(max(abs(low), abs(high)), error)
+    if f"{low:.{decimals}f}" == f"{high:.{decimals}f}":
+        return f"[{low:.2g}, {high:.2g}]"
+    return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
 
 
 def plain(estimate: Estimate | None) -> str:

@@ -22,6 +22,7 @@ FloatArray = npt.NDArray[np.float64]
 Kind = Literal["distribution", "kinetics"]
 
 _MANY_PIECES = 8
+_UNITS = (("us", 1e6), ("ns", 1e3), ("ps", 1.0))
 _NORMAL_95 = 1.959964
 
 
@@ -53,8 +54,13 @@ class Worth:
         length = format_time_ps(_round(self.worth_ps))
         if self.bound == "less than" or (self.bound == "at least" and self.low_ps is None):
             return f"{self.bound} {length}"
-        low = f"< {format_time_ps(_round(self.lengths_ps[0]))}" if self.low_ps is None else _words(self.low_ps)
-        high = f"> {format_time_ps(_round(self.lengths_ps[-1]))}" if self.high_ps is None else _words(self.high_ps)
+        unit, factor = next((u for u in _UNITS if self.worth_ps >= u[1]), _UNITS[-1])
+
+        def words(time_ps: float) -> str:
+            return f"{float(f'{time_ps / factor:.2g}'):g} {unit}"
+
+        low = f"< {words(self.lengths_ps[0])}" if self.low_ps is None else words(self.low_ps)
+        high = f"> {words(self.lengths_ps[-1])}" if self.high_ps is None else words(self.high_ps)
         if self.bound:
             return f"{self.bound} {length} [{low}, ...]"
         return f"{length} [{low}, {high}]"
@@ -214,10 +220,6 @@ def _crossing(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> f
 
 def _round(time_ps: float) -> float:
     return float(f"{time_ps:.2g}")
-
-
-def _words(time_ps: float) -> str:
-    return format_time_ps(_round(time_ps))
 
 
 def headline(found: Sequence[Worth], cost_ratio: Callable[[float], float | None]) -> str:

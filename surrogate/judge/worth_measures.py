@@ -109,11 +109,11 @@ def _torsion_columns(three: Three, torsions: Backbone) -> tuple[str, list[tuple[
     where there are none, rotatable torsions; rotors of what has nothing else that turns."""
     backbone = [(_phi, k) for k in range(len(torsions.phi))] + [(_psi, k) for k in range(len(torsions.psi))]
     if backbone:
-        return "each φ and ψ alone", evenly(backbone, MOST_HISTOGRAMS)
+        return "single φ and ψ", evenly(backbone, MOST_HISTOGRAMS)
     probes = three[0].probes
     if probes is None or "torsions" not in three[0].series:
         return "", []
-    for kinds, name in ((SLOW_KINDS, "each rotatable torsion alone"), (("rotor",), "each rotor alone")):
+    for kinds, name in ((SLOW_KINDS, "single rotatable torsions"), (("rotor",), "single rotors")):
         chosen = [(_further, k) for k, t in enumerate(probes.torsions) if t.kind in kinds]
         if chosen:
             return name, evenly(chosen, MOST_HISTOGRAMS)
