@@ -38,7 +38,7 @@ class Simulation:
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
-    the time of a step, of weights that were trained for several.
+    the time of a step, of weights that were trained for several. `stiff`: as `rollout` takes it.
     Raises OutOfDomainError, InputError, WeightsError.
     """
 
@@ -54,6 +54,7 @@ class Simulation:
         energy_fn: EnergyFn | None = None,
         force: bool = False,
         lag_ps: Quantity | None = None,
+        stiff: str | None = None,
     ) -> None:
         import openmm
         from openmm import unit
@@ -68,7 +69,9 @@ class Simulation:
             self.system.addParticle(mass * unit.dalton)
         self.reporters: list[Any] = []
         self.currentStep = 0
-        self._sampler = ChunkSampler(weights, solver_steps=solver_steps, solver=solver, precision=precision)
+        self._sampler = ChunkSampler(
+            weights, solver_steps=solver_steps, solver=solver, precision=precision, stiff=stiff
+        )
         self._seed = seed
         self._order, self._back = match.order, np.argsort(match.order)
         self._last: npt.NDArray[np.float32]
@@ -155,6 +158,7 @@ class Simulation:
     def _settings(self) -> dict[str, Any]:
         lag_ps = self.weights.model.lag_ps
         return ({} if lag_ps is None else {"lag_ps": lag_ps}) | {
+            "imposed": list(self._sampler.imposed) or None,
             "weights_hash": self.weights.hash,
             "topology_hash": self.scene.topology_hash,
             "seed": self._seed,

@@ -12,6 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
+from surrogate.bench.stiff_terms import energies
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.data.shipped import weights_path
 from surrogate.data.stiff import drawn_terms, plan_terms, rigid_hydrogens, rigid_terms
@@ -221,6 +222,10 @@ def test_rollouts_of_shipped_weights_are_as_wide_as_md_and_say_what_is_imposed(
     assert widths[0] < 0.025 and widths[1] == pytest.approx(0.0278, rel=0.05)
     # But for a frame that is no frame of the ensemble.
     assert held[0] == 0.0 and held[1] > 0.98
+    # The median energy of MD's frames; a network that is too narrow is as if it were colder.
+    off = [abs(float(np.median(energies(alanine_dipeptide, shipped.domain.conditions, x))) + 83.5)
+           for x in (modelled, imposed)]  # fmt: skip
+    assert off[0] > 6.0 and off[1] < 4.0
     with pytest.raises(InputError, match="no stiff terms"):
         roll("none", without, "imposed")
     with pytest.raises(InputError, match="choose modelled or imposed"):
