@@ -36,6 +36,8 @@ _CARBANION: _State = (3, -1, 25.0)
 _CYANIDE: _State = (3, -1, 20.0)
 _AZIDE_END: _State = (2, -1, 13.0)
 _OXONIUM: _State = (3, 1, 22.0)
+# Real molecules take milliseconds; a protein without its hydrogens may be hopeless.
+_LONGEST_S = 30.0
 # Of a net charge on a group of conjugated atoms, an elementary charge.
 _NET_CHARGE = 4.0
 # Ties: an order other than the file's, bonds that rarely are double, hydrogens on a nitrogen that takes a charge.
@@ -210,8 +212,9 @@ def _solve(
         integrality=whole,
         bounds=Bounds(np.zeros(n), upper),
         constraints=LinearConstraint(matrix.tocsr(), low, high),
+        options={"time_limit": _LONGEST_S},
     )
-    if found.x is None:
+    if found.status != 0:
         return None
     x = np.round(found.x)
     charges = np.zeros(n_atoms, dtype=np.int64)

@@ -21,7 +21,7 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
     """Return the first molecule of the file. Raises InputError or PreparationError; `notes` says what was changed."""
     from rdkit import Chem, rdBase
 
-    text = _text(path)
+    text = read_text(path)
     with rdBase.BlockLogs():
         if suffix_of(path) == ".mol2":
             return _read_mol2(text, path, notes)
@@ -136,7 +136,8 @@ def suffix_of(path: Path) -> str:
     return suffixes[-1] if suffixes else ""
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Return the text of a file, gzipped or not. Raises InputError where it cannot be read or is empty."""
     if not path.exists():
         raise InputError(f"{path} does not exist; check the path.")
     if path.is_dir():

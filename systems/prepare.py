@@ -19,6 +19,7 @@ from systems.mmcif_file import is_component
 from systems.modified_residues import describe_residue, standardise
 from systems.mol_file import SUFFIXES, suffix_of
 from systems.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
+from systems.peptide_mol2 import is_peptide_mol2, read_peptide_mol2
 from systems.residues import template_for
 from systems.scene import Scene
 from systems.structure import scene_from_records
@@ -72,13 +73,13 @@ def prepare(
     if text in library.names():
         return library.load(text)
     suffix = suffix_of(path)
-    if suffix in SUFFIXES:
+    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
         from systems.molecule import scene_from_mol_file
 
         return scene_from_mol_file(path)
     if suffix in _OTHER_SUFFIXES:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
-    if suffix in _FILE_SUFFIXES or path.exists() or "/" in text:
+    if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
         return prepare_file(
             path,
             ph=ph,
@@ -99,7 +100,7 @@ def prepare_file(
     keep_water: bool = False,
     cap_breaks: bool = False,
 ) -> Scene:
-    """Return the scene of a PDB or mmCIF file; see `prepare`."""
+    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `prepare`."""
     if is_mmcif(path) and is_component(text := read_text(path)):
         from systems.component_file import scene_from_component
 
@@ -115,7 +116,7 @@ def prepare_file(
 def _prepare_file(
     path: Path, ph: float, keep_ligand: bool, drop_ligand: bool, keep_water: bool, cap_breaks: bool
 ) -> Scene:
-    found = read_structure(path)
+    found = read_peptide_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
     repairs = list(found.notes)
     kept = _choose_alternates(found.atoms, repairs)
     kept, wet = settle_solvent(found.atoms, kept, keep_water=keep_water, keep_ions=keep_ligand, notes=repairs)

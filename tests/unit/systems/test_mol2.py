@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from systems import library
 from systems.errors import InputError, PreparationError
 from systems.mol2_file import element_of
 from systems.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles
+from systems.prepare import prepare
 from systems.scene import Scene
 
 SYBYL = {"C": "C.3", "N": "N.3", "O": "O.3", "S": "S.3", "P": "P.3"}
@@ -143,3 +145,28 @@ def test_broken_records_are_named(tmp_path: Path) -> None:
         text = good.replace(old, new, 1).replace("      1 C1 ", "      1 Xx " if new == "Du" else "      1 C1 ")
         with pytest.raises(InputError, match=said):
             _read(tmp_path, text)
+
+
+def _peptide(residue: str = "{name}{number}") -> str:
+    scene = library.load("alanine-dipeptide")
+    lines = _mol2(scene, AMBER).splitlines()
+    first = lines.index("@<TRIPOS>ATOM") + 1
+    for i in range(scene.n_atoms):
+        number = int(scene.residue_of_atom[i]) + 1
+        name = residue.format(name=scene.residue_names[number - 1], number=number)
+        lines[first + i] = lines[first + i].replace("1 LIG", f"{number} {name}")
+    return "\n".join(lines)
+
+
+def test_a_peptide_keeps_its_residues_and_is_one_for_its_force_field(tmp_path: Path) -> None:
+    known = library.load("alanine-dipeptide")
+    for residue in ("{name}{number}", "{name}"):
+        path = tmp_path / "x.mol2"
+        path.write_text(_peptide(residue))
+        scene = prepare(str(path))
+        assert scene.residue_names == ("ACE", "ALA", "NME")
+        assert (scene.atom_names, scene.molecule_key) == (known.atom_names, known.molecule_key)
+        assert scene.provenance["repairs"] == []
+    path.write_text(_peptide("LIG"))
+    scene = prepare(str(path))
+    assert (scene.residue_names, scene.molecule_key) == (("MOL",), known.molecule_key)
