@@ -9,10 +9,10 @@ from typing import Any
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.run_config import MDConfig, settings_of
 from systems.errors import InputError, nearest
-from systems.units import PARSERS
+from systems.units import parser_of
 
 # Settings whose names end so are written without it, as texts with a unit.
-_PARSERS = {ending: PARSERS[ending] for ending in ("_per_ps", "_ps", "_k", "_da")}
+_ENDINGS = ("_per_ps", "_ps", "_k", "_da")
 # These belong to a run's place in the campaign.
 _NOT_SETTINGS = ("seed", "force")
 # As on the command line: what the user leaves open is settled for the scene.
@@ -34,7 +34,7 @@ def _known_fields() -> dict[str, Field[Any]]:
 
 def key_of(name: str) -> str:
     """Return the key in a file of a field: `timestep` of `timestep_ps`."""
-    return next((name.removesuffix(ending) for ending in _PARSERS if name.endswith(ending)), name)
+    return next((name.removesuffix(ending) for ending in _ENDINGS if name.endswith(ending)), name)
 
 
 def read_settings(
@@ -76,14 +76,14 @@ def _switch(key: str, value: Any, default: Any, prefix: str) -> Any:
 
 
 def _value(key: str, name: str, known: Field[Any], value: Any, prefix: str) -> Any:
-    ending = next((ending for ending in _PARSERS if name.endswith(ending)), "")
+    has_unit = name.endswith(_ENDINGS)
     optional = "None" in str(known.type)
     if optional and value in ("natural", "none"):
         return None
-    if ending:
+    if has_unit:
         if isinstance(value, bool) or not isinstance(value, (str, int, float)):
             raise InputError(f"{prefix}{key} = {value!r} must be a quantity with its unit, as a text.")
-        return _PARSERS[ending](str(value), f"{prefix}{key}")
+        return parser_of(name)(str(value), f"{prefix}{key}")
     kinds = {"bool": bool, "int": int, "float": float, "str": str}
     wanted = kinds.get(str(known.type).removesuffix(" | None"))
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):

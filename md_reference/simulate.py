@@ -201,9 +201,9 @@ class _Run:
         return engine
 
     def _equilibrate(self, engine: Engine) -> None:
-        n_steps = max(1, round(self.config.equilibrate_ps / self.config.timestep_ps))
+        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
         done = int(self.header.get("equilibrated_steps", 0))
-        self.preparing(done / n_steps)
+        self.preparing(done / max(n_steps, 1))
         if self.blob:
             engine.restore(self.blob)
         else:

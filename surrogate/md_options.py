@@ -21,6 +21,7 @@ from systems.units import (
     parse_pressure_bar,
     parse_rate_per_ps,
     parse_temperature_k,
+    parse_time_or_none_ps,
     parse_time_ps,
 )
 
@@ -94,7 +95,7 @@ class MDSettings(TypedDict, total=False):
     ]
     equilibrate_ps: Annotated[
         Quantity | None,
-        Flag("--equilibrate", "So long before the first frame, unwritten. [default: 100ps]", read=parse_time_ps),
+        Flag("--equilibrate", "So long before frames are written. [default: 100ps]", read=parse_time_or_none_ps),
     ]
     ensemble: Annotated[str | None, Flag("--ensemble", "nvt, nve or npt. [default: nvt]")]
     pressure_bar: Annotated[

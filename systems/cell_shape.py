@@ -38,6 +38,12 @@ def box_vectors(lengths_nm: npt.ArrayLike, angles_deg: npt.ArrayLike) -> Float64
     return scaled
 
 
+def read_cells(lengths_nm: npt.ArrayLike, angles_deg: npt.ArrayLike) -> Float64Array | None:
+    """Return the box vectors of what a file says of its cells, None where lengths of zero say that it has none."""
+    lengths = np.asarray(lengths_nm, dtype=np.float64)
+    return None if (lengths == 0.0).any() else box_vectors(lengths, angles_deg)
+
+
 def volumes_nm3(cell_nm: npt.ArrayLike) -> Float64Array:
     """Return the volumes `(n,)` nm³ of box vectors `(n, 3, 3)` nm."""
     volume: Float64Array = np.abs(np.linalg.det(np.asarray(cell_nm, dtype=np.float64)))

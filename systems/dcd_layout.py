@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.cell_shape import box_vectors, lengths_and_angles
+from systems.cell_shape import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
 
 AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
@@ -154,13 +154,16 @@ def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
     return out
 
 
-def cells_of_blocks(blocks: npt.NDArray[np.int32], byte_order: str) -> npt.NDArray[np.float64]:
-    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks; some programs write the cosines of the angles."""
+def cells_of_blocks(blocks: npt.NDArray[np.int32], byte_order: str) -> npt.NDArray[np.float64] | None:
+    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks, None of such as hold zeros.
+
+    Some programs write the cosines of the angles.
+    """
     raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
     angles = raw[:, [4, 3, 1]]
     if (np.abs(angles) <= 1.0).all():
         angles = np.degrees(np.arccos(angles))
-    return box_vectors(0.1 * raw[:, [0, 2, 5]], angles)
+    return read_cells(0.1 * raw[:, [0, 2, 5]], angles)
 
 
 def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float, *, has_cell: bool = False) -> bytes:

@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.cell_shape import box_vectors, lengths_and_angles
+from systems.cell_shape import lengths_and_angles
+from systems.cell_shape import read_cells as cells_of
 from systems.errors import InputError
 from systems.frame_store import EDGES, add_column
 from systems.scene import Scene
@@ -88,5 +89,5 @@ def read_cells(file: h5py.File, start: int, stop: int, stride: int) -> npt.NDArr
         cells: npt.NDArray[np.float64] = np.asarray(file[EDGES][frames], dtype=np.float64)
         return cells
     if "cell_lengths" in file and "cell_angles" in file:
-        return box_vectors(file["cell_lengths"][frames], file["cell_angles"][frames])
+        return cells_of(file["cell_lengths"][frames], file["cell_angles"][frames])
     return None

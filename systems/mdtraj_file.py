@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from systems.cell_shape import box_vectors
+from systems.cell_shape import read_cells
 from systems.distance_bonds import with_bonds_by_distance
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.from_mdtraj import scene_from_mdtraj_topology, scene_from_structure
@@ -118,7 +118,7 @@ class MdtrajReader(TrajectoryReader):
         if self._nm != 1.0:  # NetCDF: lengths in Å and angles
             if stored[2] is None:
                 return None
-            return box_vectors(np.asarray(stored[2])[::stride] * self._nm, np.asarray(stored[3])[::stride])
+            return read_cells(np.asarray(stored[2])[::stride] * self._nm, np.asarray(stored[3])[::stride])
         cells = None if stored[3] is None else np.asarray(stored[3], dtype=np.float64)
         return cells[::stride] if cells is not None and cells.ndim == 3 and cells.any() else None
 

@@ -26,7 +26,7 @@ _PRESSURE_BAR = {"bar": 1.0, "atm": 1.01325, "": 1.0}
 _NUMBER = re.compile(r"^\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*$")
 
 
-def _parse(text: str, table: dict[str, float], what: str, example: str) -> float:
+def _parse(text: str, table: dict[str, float], what: str, example: str, *, zero: bool = False) -> float:
     match = _NUMBER.match(text)
     known = ", ".join(unit for unit in table if unit and unit != "\u03bcs")
     if match is None:
@@ -39,14 +39,20 @@ def _parse(text: str, table: dict[str, float], what: str, example: str) -> float
         value = float(number) * table[unit]
     except ValueError:
         raise UnitError(f"{what} {text!r} is not a number with a unit; write it like {example}.") from None
-    if not math.isfinite(value) or value <= 0:
-        raise UnitError(f"{what} {text!r} must be positive and finite; write it like {example}.")
+    if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
+        least = "not negative" if zero else "positive"
+        raise UnitError(f"{what} {text!r} must be {least} and finite; write it like {example}.")
     return value
 
 
 def parse_time_ps(text: str, what: str = "time") -> float:
     """Return a simulated duration in ps. Raises UnitError for a missing, unknown or non-positive quantity."""
     return _parse(text, _TIME_PS, what, "10ns")
+
+
+def parse_time_or_none_ps(text: str, what: str = "time") -> float:
+    """Return a simulated duration in ps, which may be none: `0ps`. Raises UnitError."""
+    return _parse(text, _TIME_PS, what, "100ps", zero=True)
 
 
 def parse_wall_s(text: str, what: str = "budget") -> float:
@@ -77,7 +83,7 @@ def parse_length_nm(text: str, what: str = "length") -> float:
 
 def parse_molar(text: str, what: str = "concentration") -> float:
     """Return a concentration in mol/l (`0.15M`, `150mM`, `0.15` or `0`). Raises UnitError."""
-    return 0.0 if text.strip() in ("0", "0M", "0mM") else _parse(text, _MOLAR, what, "0.15M")
+    return _parse(text, _MOLAR, what, "0.15M", zero=True)
 
 
 def parse_pressure_bar(text: str, what: str = "pressure") -> float:
@@ -98,6 +104,13 @@ PARSERS: dict[str, Callable[[str, str], float]] = {
 }
 
 
+def parser_of(name: str) -> Callable[[str, str], float]:
+    """Return what reads the text of a setting by its name (`time_ps`): text and what to call it -> its value inside."""
+    if name == "equilibrate_ps":
+        return parse_time_or_none_ps
+    return next(parse for ending, parse in PARSERS.items() if name.endswith(ending))
+
+
 @overload
 def quantity(name: str, value: Quantity) -> float: ...
 @overload
@@ -110,9 +123,9 @@ def quantity(name: str, value: Any) -> float | None:
     """
     if value is None:
         return None
-    ending, parse = next(item for item in PARSERS.items() if name.endswith(item[0]))
+    ending = next(ending for ending in PARSERS if name.endswith(ending))
     if isinstance(value, str):
-        return parse(value, name)
+        return parser_of(name)(value, name)
     unit = ending.strip("_").replace("per_", "1/")
     if isinstance(value, bool) or not isinstance(value, Real):
         raise UnitError(f"{name} = {value!r} must be a number in {unit}, or a text with its unit.")

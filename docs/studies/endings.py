@@ -72,7 +72,7 @@ VERBS: dict[str, list[str]] = {
     "compare": ["compare", "{data}/ref.h5", "{data}/ref.h5", "-o", "report.html"],
     "bench reference": ["bench", "reference", "--quick", "--cores", "2"],
     "stress": ["stress", "alanine-dipeptide", "--quick"],
-    "reproduce": ["reproduce", "nbody-charged", "--quick"],
+    "reproduce": ["reproduce", "n-body-charged", "--workers", "2"],
     "demo": ["demo"],
 }  # fmt: skip
 

@@ -12,6 +12,7 @@ from systems.units import (
     parse_mass_da,
     parse_rate_per_ps,
     parse_temperature_k,
+    parse_time_or_none_ps,
     parse_time_ps,
     parse_wall_s,
     quantity,
@@ -133,11 +134,21 @@ def test_uneven_divisions_are_refused_however_long_the_run(duration_ps: float, s
         ("ionic_strength_molar", "150mM", 0.15),
         ("pressure_bar", "1atm", 1.01325),
         ("equilibrate_ps", 0.0, 0.0),
+        ("equilibrate_ps", "0ps", 0.0),
+        ("equilibrate_ps", "0.0 ns", 0.0),
+        ("equilibrate_ps", "1ns", 1000.0),
+        ("ionic_strength_molar", "0", 0.0),
         ("lag_ps", None, None),
     ],
 )
 def test_a_quantity_is_a_number_or_a_text_with_its_unit(name: str, value: float | str, expected: float) -> None:
     assert quantity(name, value) == (None if expected is None else pytest.approx(expected))
+
+
+@pytest.mark.parametrize(("text", "said"), [("-1ps", "not negative"), ("0", "no unit"), ("0 parsecs", "unknown unit")])
+def test_only_what_has_a_unit_is_none_at_all(text: str, said: str) -> None:
+    with pytest.raises(UnitError, match=f"--equilibrate .*{said}"):
+        parse_time_or_none_ps(text, "--equilibrate")
 
 
 @pytest.mark.parametrize("value", ["10", "soon", -1.0, float("nan"), float("inf"), True, [1.0], b"10ns"])

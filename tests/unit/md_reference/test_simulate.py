@@ -56,6 +56,16 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate(load("alanine-dipeptide"), LONG, tmp_path_factory.mktemp("whole") / "whole.h5")
 
 
+def test_without_equilibration_the_run_begins_at_the_minimum(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    told: list[float] = []
+    config = replace(SHORT, equilibrate_ps=0.0)
+    simulate(alanine_dipeptide, config, tmp_path / "a.h5", preparing=told.append)
+    assert told == [0.0]
+    positions, times, record = contents(tmp_path / "a.h5")
+    assert len(positions) == config.n_frames and times[0] == pytest.approx(config.save_every_ps)
+    assert record["equilibrate_ps"] == 0.0
+
+
 # ---- frames and times ----------------------------------------------------------------------------------------------
 
 

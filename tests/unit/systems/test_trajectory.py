@@ -332,6 +332,13 @@ def test_big_endian_dcd_with_cell(tmp_path: Path) -> None:
     path = tmp_path / "b.dcd"
     path.write_bytes(data)
     np.testing.assert_allclose(read(path), positions, rtol=1e-6)
+    with warnings.catch_warnings(), open_trajectory(path) as reader:
+        warnings.simplefilter("error")
+        assert reader.read_cells() is None, "a cell of zeros is none"
+    whole = data.replace(np.zeros(6, dtype=">f8").tobytes(), np.array([30, 90, 40, 90, 90, 50], ">f8").tobytes())
+    path.write_bytes(whole)
+    with open_trajectory(path) as reader:
+        np.testing.assert_allclose(reader.read_cells(), [np.diag([3.0, 4.0, 5.0])] * 3)
 
 
 # ---- what is refused before anything is touched --------------------------------------------------------------------
