@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +20,7 @@ _PEPTIDE_NM = 0.20
 _DISULFIDE_NM = 0.25
 _HYDROGEN_NM = 0.16
 _AMINE_NM = 0.16
+_AMIDE_NM = 0.145
 _PHOSPHATE_NM = 0.175
 _THIOETHER_NM = 0.19
 _GLYCOSIDE_NM = 0.155
@@ -217,10 +218,14 @@ def _bonds_by_distance(
     known: set[tuple[int, int]],
     notes: list[str],
 ) -> set[tuple[int, int]]:
-    """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers."""
+    """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers; and
+    amides of side chains."""
     found = set()
-    apart = []
+    apart, amides = [], []
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d < _AMIDE_NM and not {i, j} & free and (i, j) not in known and _are_amide(atoms[i], atoms[j]):
+            found.add((i, j))
+            amides.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
         if (i in free or j in free) and not {i, j} & ions and "H" not in (atoms[i].element, atoms[j].element):
             reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
             if d >= reach:
@@ -229,9 +234,15 @@ def _bonds_by_distance(
                 found.add((i, j))
             elif (i, j) not in known:
                 apart.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+    if amides:
+        notes.append(f"side chains bonded by distance: {listed(amides)}")
     if apart:
         notes.append(f"near and not bonded, as no CONECT or LINK record says so: {listed(apart, 3)}")
     return found
+
+
+def _are_amide(first: AtomRecord, second: AtomRecord) -> bool:
+    return first.residue_key != second.residue_key and {first.element, second.element} == {"C", "N"}
 
 
 def _links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
@@ -339,15 +350,19 @@ def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: n
         neighbours[i].append(j)
         neighbours[j].append(i)
 
+    skeleton = [[j for j in around if atoms[j].element != "H"] for around in neighbours]
+
     def hydrogens(i: int) -> int:
-        return sum(atoms[j].element == "H" for j in neighbours[i])
+        return len(neighbours[i]) - len(skeleton[i])
 
     for residue in residues:
         template, heavy = residue.template, residue.heavy
         if template is None or not heavy:
             continue
-        residue.missing = [a for a in template.heavy if a not in heavy and a not in template.optional]
-        needed = dict(template.hydrogens)
+        links = links_of(residue, skeleton)
+        absent = [a for a in template.heavy if a not in heavy and a not in template.optional]
+        residue.missing = [a for a in absent if not _has_left(template, a, links, absent)]
+        needed = {a: max(0, n - links.get(a, 0)) for a, n in template.hydrogens.items()}
         found = component(residue.key[2]) if template_for(residue.key[2]) is None else None
         if found is not None:
             needed = _least_hydrogens(residue, found, neighbours)
@@ -359,8 +374,7 @@ def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: n
             if found is None:
                 needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
             if template.name == "CYS" and residue.key[2].upper() not in ("CYM", "CYX", "CYS2"):
-                partners = [j for j in neighbours[heavy["SG"]] if atoms[j].element == "S"] if "SG" in heavy else [0]
-                needed["SG"] = 0 if partners else 1
+                needed["SG"] = 0 if "SG" in links or "SG" not in heavy else 1
         residue.lacks_hydrogens = any(hydrogens(heavy[a]) < n for a, n in needed.items() if a in heavy)
         if template.name == "HIS" and {"ND1", "NE2"} <= set(heavy):
             residue.lacks_hydrogens |= not (hydrogens(heavy["ND1"]) or hydrogens(heavy["NE2"]))
@@ -371,6 +385,15 @@ def links_of(residue: Residue, neighbours: Sequence[Sequence[int]]) -> dict[str,
     own = set(residue.atoms)
     counts = {name: sum(j not in own for j in neighbours[i]) for name, i in residue.heavy.items()}
     return {name: n for name, n in counts.items() if n}
+
+
+def _has_left(template: ResidueTemplate, name: str, links: Mapping[str, int], absent: Sequence[str]) -> bool:
+    """Whether an absent atom has made place for a bond to another residue: an oxygen of an acid that is an amide."""
+    around = [b if a == name else a for a, b in template.bonds if name in (a, b)]
+    if len(around) != 1 or name[0] not in "NO" or around[0] in ("C", "CA"):
+        return False
+    rivals = [a for a in absent if (around[0], a) in template.bonds or (a, around[0]) in template.bonds]
+    return len(rivals) <= links.get(around[0], 0)
 
 
 def _least_hydrogens(residue: Residue, found: Component, neighbours: list[list[int]]) -> dict[str, int]:

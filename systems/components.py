@@ -151,6 +151,8 @@ def _ionise(
             linked = links.get(residue.heavy[k], 0)
             if residue.charges[k] == 0 and single and saturated and not linked and len(near[k]) + counts[k] < 4:
                 counts[k] += ph < _PKA_AMINE
+            elif residue.charges[k] == 1 and single and linked and counts[k]:  # an amide where lysine has its amine
+                counts[k] -= 1
             for j, order in near[k]:
                 others = [n for n, _ in near[j] if symbol[n] == "N" and n != k]
                 if order != 2 or symbol[j] != "C" or not others:

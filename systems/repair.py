@@ -64,7 +64,7 @@ def complete(
             fixer = PDBFixer(pdbfile=io.StringIO(text), platform=reference)
             fixer.missingResidues = {}
             fixer.findMissingAtoms()
-            _forget_ends(fixer, residues)
+            _forget_linked(fixer, residues)
             fixer.addMissingAtoms(seed=1)
             _add_bonds(fixer.topology, residues, bonding.bonds)
             modeller = app.Modeller(fixer.topology, fixer.positions)
@@ -88,13 +88,13 @@ def complete(
     return records, bonds, account
 
 
-def _forget_ends(fixer: Any, residues: Sequence[Residue]) -> None:
-    """Take from PDBFixer's list the OXT of residues whose C is bonded onwards, in a cycle or to something unusual."""
+def _forget_linked(fixer: Any, residues: Sequence[Residue]) -> None:
+    """Take from PDBFixer's list what is not missing: a residue bonded to another one has lost an atom for it."""
     for residue, built in zip(residues, fixer.topology.residues(), strict=True):
         if "OXT" not in residue.missing:
             fixer.missingTerminals.pop(built, None)
-            if built in fixer.missingAtoms:
-                fixer.missingAtoms[built] = [a for a in fixer.missingAtoms[built] if a.name != "OXT"]
+        if built in fixer.missingAtoms:
+            fixer.missingAtoms[built] = [a for a in fixer.missingAtoms[built] if a.name in residue.missing]
 
 
 def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: npt.NDArray[np.int64]) -> None:
@@ -250,10 +250,15 @@ def _built(residue: Residue, atoms: Sequence[AtomRecord]) -> dict[str, list[floa
 def _with_usual_lengths(
     records: list[AtomRecord], bonds: npt.NDArray[np.int64], kept: set[tuple[tuple[str, str, str], str]]
 ) -> list[AtomRecord]:
-    """Put each added hydrogen at the usual distance from its atom (Modeller leaves some 10 % too much); refuse heavy
-    atoms that were put nowhere near theirs. `kept`: residue and name of the atoms that the file had.
+    """Put each added hydrogen at the usual distance from its atom (Modeller leaves some 10 % too much), and on a carbon
+    with two other neighbours into their plane (beside residues that it does not know Modeller may not find it); refuse
+    heavy atoms that were put nowhere near theirs. `kept`: residue and name of the atoms that the file had.
     """
     out = list(records)
+    neighbours: dict[int, list[int]] = {}
+    for a, b in bonds.tolist():
+        neighbours.setdefault(a, []).append(b)
+        neighbours.setdefault(b, []).append(a)
     for i, j in bonds.tolist():
         if records[i].element == "H":
             i, j = j, i
@@ -263,7 +268,12 @@ def _with_usual_lengths(
         length = float(np.linalg.norm(y - x))
         usual = _HYDROGEN_ANGSTROM.get(records[i].element)
         if records[j].element == "H" and usual is not None and length > 0:
-            x_new, y_new, z_new = (x + usual / length * (y - x)).tolist()
+            away = (y - x) / length
+            others = [np.array(records[k].position_angstrom) - x for k in neighbours[i] if records[k].element != "H"]
+            if records[i].element == "C" and len(neighbours[i]) == 3 and len(others) == 2:
+                away = -sum(arm / np.linalg.norm(arm) for arm in others)
+                away = away / np.linalg.norm(away)
+            x_new, y_new, z_new = (x + usual * away).tolist()
             out[j] = replace(records[j], position_angstrom=(x_new, y_new, z_new))
             continue
         expected = 10.0 * (covalent_radius_nm(records[i].element) + covalent_radius_nm(records[j].element))

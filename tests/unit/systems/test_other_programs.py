@@ -145,3 +145,26 @@ def test_atoms_in_each_other_are_refused_and_close_ones_said(gap: float, element
     else:
         assert expected in " ".join(check_contacts(atoms, np.empty((0, 2), dtype=np.int64)))
     assert check_contacts(atoms, np.array([[0, 1]])) == []
+
+
+@pytest.mark.parametrize("left_out", [(), ("H",), ("H", "LINK", "CONECT")], ids=["whole", "heavy", "heavy-unlinked"])
+def test_a_lactam_keeps_what_it_lost(shared_data: Path, tmp_path: Path, left_out: tuple[str, ...]) -> None:
+    """2N0N: lysine 5 and glutamate 9 are an amide; neither an oxygen nor a charge is added to it."""
+    path = shared_data / "structures" / "rcsb_pdb__biopython__2n0n_M1.pdb"
+    if not path.exists():
+        pytest.skip("no 2N0N there")
+    lines = [
+        line
+        for line in path.read_text().splitlines()
+        if line[:6].strip() not in left_out
+        and ("H" not in left_out or line[:4] == "LINK" or line[76:78].strip() != "H")
+    ]
+    scene = read(tmp_path, lines)
+    at = {(scene.residue_ids[scene.residue_of_atom[i]], name): i for i, name in enumerate(scene.atom_names)}
+    for key, expected in ((("9", "CD"), ["CG", "NZ", "OE1"]), (("5", "NZ"), ["CD", "CE", "H"])):
+        around = [j for bond in scene.bonds.tolist() if at[key] in bond for j in bond if j != at[key]]
+        assert sorted(scene.atom_names[j][: 1 if scene.elements[j] == "H" else 4] for j in around) == expected
+    charged = dict(zip(at, scene.formal_charges.tolist(), strict=True))
+    assert charged["5", "NZ"] == charged["9", "OE1"] == 0
+    assert ("side chains bonded by distance" in said(scene)) == ("LINK" in left_out)
+    assert scene.n_atoms == (182 if left_out else 183)  # histidine 1 is charged in the file
