@@ -97,7 +97,7 @@ def find_bonds(
                 "remove one of them."
             )
     residues = _residues(atoms)
-    ions = {r.atoms[0] for r in residues if len(r.atoms) == 1 and is_lone_ion(atoms[r.atoms[0]].element)}
+    ions = {i for r in residues if are_ions([atoms[i] for i in r.atoms]) for i in r.atoms}
     of_atom = {i: r for r in residues for i in r.atoms}
     bonds: set[tuple[int, int]] = set()
     notes: list[str] = []
@@ -117,6 +117,11 @@ def find_bonds(
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
     _note_missing(residues, atoms, bonded)
     return Bonding(bonded, residues, notes, peptide)
+
+
+def are_ions(atoms: Sequence[AtomRecord]) -> bool:
+    """Whether the atoms of a residue are monatomic ions: one, or several of one name under one number."""
+    return is_lone_ion(atoms[0].element) and len({a.name for a in atoms}) == 1
 
 
 def _pair(i: int, j: int) -> tuple[int, int]:

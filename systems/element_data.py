@@ -21,8 +21,9 @@ _NOT_METALS = frozenset(
      "I", "Xe")
 )  # fmt: skip
 # Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
-_ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CIO": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
+_ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
               "BAR": "Ba", "CAD": "Cd", "IOD": "I", "BRO": "Br", "CU1": "Cu", "3CO": "Co", "3NI": "Ni"}  # fmt: skip
+_ANY_ION = ("ION", "IONS", "IO", "CIO", "IP", "IM", "CIP", "CIM")
 _HALOGENS = ("F", "Cl", "Br", "I")
 _UNNAMED_RESIDUES = ("UNL", "UNK", "LIG", "MOL", "DRG")
 _TWO_LETTER_IN_LIGANDS = ("Cl", "Br", "Si", "Se", "Na", "Mg", "Zn", "Fe", "Li", "As")
@@ -77,8 +78,8 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     (`1HH3`). `CA` is calcium in a residue called CA and carbon elsewhere; an atom called as its residue is the ion of
     that name whatever the column says (programs that guess make sulfur of sodium's SOD).
     """
-    ion = ion_symbol(residue_name)
-    if ion is not None and ion == ion_symbol(name_field):
+    ion = ion_symbol(name_field)
+    if ion is not None and (residue_name.upper() in _ANY_ION or ion == ion_symbol(residue_name)):
         return ion
     symbol = written.strip("0123456789+- ").capitalize()
     if symbol == "D":

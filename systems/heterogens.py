@@ -9,8 +9,7 @@ from itertools import groupby
 import networkx as nx
 import numpy as np
 
-from systems.bonding import Bonding
-from systems.element_data import is_lone_ion
+from systems.bonding import Bonding, are_ions
 from systems.errors import PreparationError
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
@@ -47,7 +46,7 @@ def settle_solvent(
     """
     runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
     water = [run for run in runs if is_water([atoms[i] for i in run])]
-    ions = [run for run in runs if len(run) == 1 and is_lone_ion(atoms[run[0]].element)]
+    ions = [[i] for run in runs if are_ions([atoms[i] for i in run]) for i in run]
     wet = {i for run in water for i in run}
     apart = wet | {i for run in ions for i in run}
     solute = [i for i in kept if i not in apart]

@@ -156,7 +156,7 @@ def molecule_of(found: Mol2, notes: list[str]) -> Any | None:
     conformer = Chem.Conformer(len(found.elements))
     for i, (a, b, c) in enumerate((10.0 * found.positions_nm).tolist()):
         conformer.SetAtomPosition(i, Point3D(a, b, c))
-    conformer.Set3D(not _is_drawing(found, graph))
+    conformer.Set3D(True)
     molecule.AddConformer(conformer, assignId=True)
     return molecule
 

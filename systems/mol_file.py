@@ -165,7 +165,7 @@ def _with_geometry(molecule: Any, notes: list[str]) -> Any:
 
     n_atoms = molecule.GetNumAtoms()
     conformer = molecule.GetConformer() if molecule.GetNumConformers() else None
-    if conformer is None or not conformer.Is3D() or _is_unplaced(conformer, n_atoms):
+    if conformer is None or _is_drawing(molecule, conformer):
         if conformer is not None and n_atoms > 1:
             Chem.AssignChiralTypesFromBondDirs(molecule)
             Chem.DetectBondStereochemistry(molecule)
@@ -186,10 +186,16 @@ def _with_geometry(molecule: Any, notes: list[str]) -> Any:
     return out
 
 
-def _is_unplaced(conformer: Any, n_atoms: int) -> bool:
-    """Whether a file calls 3-D what has no depth, or has all atoms on one point."""
+def _is_drawing(molecule: Any, conformer: Any) -> bool:
+    """Whether positions are none: the file says so, or all atoms are on one point, or in one plane that cannot be."""
     positions = conformer.GetPositions()
-    return n_atoms > 1 and float(abs(positions - positions[0]).max()) < 1e-6
+    if not conformer.Is3D():
+        return True
+    if len(positions) > 1 and float(abs(positions - positions[0]).max()) < 1e-6:
+        return True
+    return not positions[:, 2].any() and any(
+        atom.GetSymbol() == "C" and atom.GetTotalDegree() == 4 and atom.GetDegree() > 2 for atom in molecule.GetAtoms()
+    )
 
 
 def _refuse_coincident(molecule: Any) -> None:

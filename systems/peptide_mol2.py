@@ -12,19 +12,20 @@ from systems.residues import canonical_heavy_name, template_for
 
 
 def is_peptide_mol2(path: Path) -> bool:
-    """Whether the first molecule of a MOL2 file has two or more residues, all standard by their names and atoms."""
+    """Whether the first molecule of a MOL2 file has two or more standard residues, by their names and atoms."""
     try:
         found = read_mol2(read_text(path), path, [])
     except InputError:
         return False  # to be refused where it is read
-    keys = set(found.residues)
-    if len(keys) < 2:
-        return False
+    standard: set[tuple[str, str]] = set()
     for (number, written), name, element in zip(found.residues, found.names, found.elements, strict=True):
         template = template_for(_residue_name(number, written))
-        if template is None or (element != "H" and canonical_heavy_name(template, name) is None):
+        if template is None:
+            continue
+        if element != "H" and canonical_heavy_name(template, name) is None:
             return False
-    return True
+        standard.add((number, written))
+    return len(standard) > 1
 
 
 def read_peptide_mol2(path: Path) -> StructureFile:

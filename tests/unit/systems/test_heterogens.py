@@ -135,6 +135,17 @@ def test_an_ion_is_bonded_to_nothing_by_distance_or_conect() -> None:
     assert any("ions coordinate" in note for note in found.notes)
 
 
+def test_ions_under_one_number_are_ions_each(tmp_path: Path) -> None:
+    x, y, z = 10 * ALA2.positions_nm[5] + (0.0, 0.0, 2.5)
+    near, far = _line(910, "SOD", "SOD", 10, (x, y, z)), _line(911, "SOD", "SOD", 10, (x, y, z + 30.0))
+    with pytest.raises(InputError, match="SOD W10; add --keep-ligand"):
+        prepare(_write(tmp_path / "x.pdb", PEPTIDE, near, far))
+    scene = prepare(_write(tmp_path / "y.pdb", PEPTIDE, far, far.replace("911", "912").replace(" 10 ", " 10 ")))
+    assert scene.n_atoms == 22
+    generic = _line(910, "NA", "ION", 10, (x, y, z + 30.0)).replace("HETATM", "ATOM  ")
+    assert prepare(_write(tmp_path / "z.pdb", PEPTIDE, generic)).provenance["repairs"] == ["free ion ION left out"]
+
+
 def test_waters_alone_are_the_scene(tmp_path: Path) -> None:
     scene = prepare(_write(tmp_path / "w.pdb", _water(1, (0, 0, 0)), _water(2, (5, 0, 0))))
     assert (scene.formula, scene.n_atoms) == ("H4O2", 6)

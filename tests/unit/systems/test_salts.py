@@ -101,3 +101,19 @@ def test_deuterium_v3000_and_several_records_are_read(tmp_path: Path) -> None:
     text = Chem.MolToMolBlock(Chem.AddHs(Chem.MolFromSmiles("CO")))
     (tmp_path / "x.sdf").write_text(text.replace(" H  ", " D  ", 1))
     assert prepare(str(tmp_path / "x.sdf")).formula == "CH4O"
+
+
+def test_a_file_that_calls_its_drawing_three_dimensional_is_embedded(tmp_path: Path) -> None:
+    molecule = Chem.AddHs(Chem.MolFromSmiles("CC(C)O"))
+    rdDistGeom.EmbedMolecule(molecule, randomSeed=1)
+    for i in range(molecule.GetNumAtoms()):
+        x, y, _ = molecule.GetConformer().GetAtomPosition(i)
+        molecule.GetConformer().SetAtomPosition(i, (x, y, 0.0))
+    (tmp_path / "x.sdf").write_text(Chem.MolToMolBlock(molecule).replace("          2D", "          3D", 1))
+    scene = prepare(str(tmp_path / "x.sdf"))
+    assert np.abs(scene.positions_nm[:, 2]).max() > 0.01
+    flat = Chem.AddHs(Chem.MolFromSmiles("c1ccccc1"))
+    rdDistGeom.EmbedMolecule(flat, randomSeed=1)
+    block = Chem.MolToMolBlock(flat)
+    (tmp_path / "y.sdf").write_text(block)
+    assert prepare(str(tmp_path / "y.sdf")).provenance["repairs"] == []
