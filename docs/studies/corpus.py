@@ -150,6 +150,7 @@ def _forces(scene: Any, charges: bool) -> tuple[str, str, float | None]:
     """Return the state, a message and the energy of the scene as it stands, kJ/mol, where forces were built."""
     import openmm
 
+    from md_reference.ambertools import find_ambertools
     from md_reference.forcefield import ForceFieldSpec, build_system
     from systems.errors import SurromdError
 
@@ -166,6 +167,8 @@ def _forces(scene: Any, charges: bool) -> tuple[str, str, float | None]:
     except _WouldComputeCharges:
         return "charges", "AM1-BCC charges would be computed", None
     except SurromdError as error:
+        if not charges and find_ambertools() is None and "AmberTools" in str(error):
+            return "charges", "AM1-BCC charges would be computed, by AmberTools, which is not here", None
         return "prepared", f"no forces: {error}", None
     finally:
         subprocess.Popen.__init__ = started  # type: ignore[method-assign]
