@@ -151,6 +151,7 @@ def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> di
 def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     from md_reference.campaign_scene import load_prepared
     from md_reference.simulate import simulate
+    from systems.topology_file import topology_path
     from systems.trajectory import companions, open_trajectory
 
     def report(done: int, _: int) -> None:
@@ -178,7 +179,8 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
             f"{out} is not what this campaign once wrote there (its frames differ from {MANIFEST_NAME}); delete it to "
             "have the run made again."
         )
-    files = [path for path in (out, *companions(out)) if path.is_file()]
+    # The PDB is for other programs: a run without it is whole.
+    files = [path for path in (out, *companions(out)) if path.is_file() and path != topology_path(out)]
     return {
         "n_frames": n_frames,
         "size_bytes": out.stat().st_size,

@@ -66,7 +66,7 @@ def demo(
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
-    return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"])
+    return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)
 
 
 def campaign(

@@ -405,6 +405,7 @@ def compare(
     energies: Annotated[
         bool, typer.Option("--energies", help="Energies of every k-th frame too, by the reference's force field.")
     ] = False,
+    overwrite: OverwriteOpt = False,
     quiet: QuietOpt = False,
     as_json: JsonOpt = False,
 ) -> None:
@@ -419,6 +420,7 @@ def compare(
         top=top,
         lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
         energies=energies,
+        overwrite=overwrite,
     )
     print_comparison(result, out, as_json=as_json, quiet=quiet)
 

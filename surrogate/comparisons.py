@@ -29,6 +29,7 @@ def compare(
     lag_ps: Quantity | None = None,
     labels: str | Sequence[str] | None = None,
     energies: bool = False,
+    overwrite: bool = False,
 ) -> Comparison:
     """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
@@ -36,7 +37,8 @@ def compare(
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
     `candidates` is one candidate, and a sequence holds one each. `top`: topology for
     files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. `energies`:
-    judge the potential energy of every k-th frame too, by the force field that the reference's file names.
+    judge the potential energy of every k-th frame too, by the force field that the reference's file names. A report
+    that is there stays unless `overwrite`.
     Raises InputError, TrajectoryError, OutOfDomainError.
     """
     from surrogate.judge.comparison import compare as judge
@@ -51,7 +53,9 @@ def compare(
     if labels is not None and len(labels) != len(candidates):
         raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
     if out_html is not None:
-        check_outputs([Path(out_html)], [".html"], overwrite=True)
+        page = Path(out_html)
+        check_outputs([page], [".html"], overwrite=overwrite)
+        check_outputs([page.with_suffix(".json"), page.with_suffix(".md")], [".json", ".md"], overwrite=overwrite)
     truth = load_ensemble(find_trajectories(reference), top=top, lag_ps=lag_ps)
     others = [
         load_ensemble(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 from systems.errors import InputError
 from systems.units import format_time_ps
+
+UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
 
 
 def describe_file(path: Path) -> dict[str, Any]:
@@ -42,7 +45,12 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "account": summary_lines(record.get("summary") or {}) + precision_lines(record) + intervention_lines(record),
+        "account": [
+            *summary_lines(record.get("summary") or {}),
+            *training_lines(record),
+            *precision_lines(record),
+            *intervention_lines(record),
+        ],
         "scene": None if scene is None else scene.name,
         "formula": None if scene is None else scene.formula,
         "topology_hash": None if scene is None else scene.topology_hash,
@@ -63,6 +71,21 @@ def precision_lines(record: dict[str, Any]) -> list[str]:
     return [] if reason is None else [f"network in {record['precision']}: {reason}"]
 
 
+def training_lines(record: dict[str, Any]) -> list[str]:
+    """Return how the molecule of a rollout stands to what its weights were trained on, where it is not of it."""
+    lines = [UNSEEN] if record.get("unseen_molecule") else []
+    beyond = record.get("out_of_domain") or []
+    return [*lines, *(f"outside the training domain (--force): {d['what']}: {d['reason']}" for d in beyond)]
+
+
+def _percent(share: float) -> str:
+    """Return such as '0.12 %', '7.4 %', '62 %', '100 %'; the last of nothing less than all."""
+    percent = 100.0 * share
+    if 99.0 <= percent < 100.0:
+        return f"{math.floor(10.0 * percent) / 10.0:g} %"
+    return f"{percent:.2g} %" if percent < 99.0 else f"{percent:.0f} %"
+
+
 def intervention_lines(record: dict[str, Any]) -> list[str]:
     """Return what a rollout's guards caught and did, and what that cost; nothing of other files."""
     account = record.get("interventions")
@@ -72,12 +95,12 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
     line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
     if helped:
         reasons = sorted(account["reasons"].items(), key=lambda r: -r[1])
-        line += f" ({100 * helped / chunks:.2g} %): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
+        line += f" ({_percent(helped / chunks)}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
     lines = [line]
     if account["frames"]:
         done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
         extra = {name: value for name, value in account["seconds"].items() if name != "draw"}
-        shares = ", ".join(f"{name} {100 * v / account['seconds']['draw']:.2g} %" for name, v in extra.items())
+        shares = ", ".join(f"{name} {_percent(v / account['seconds']['draw'])}" for name, v in extra.items())
         lines += [
             f"frames that are not the surrogate's first draw: {done}",
             f"cost beside drawing chunks: {shares}",

@@ -11,6 +11,7 @@ from systems.checkpoint import checkpoint_path
 from systems.claim import frames_in
 from systems.errors import InputError
 from systems.manifest import campaign_folder, campaign_trajectories
+from systems.topology_file import refuse_foreign_topology
 
 PathLike = str | Path
 # A file, a folder, a glob, a comma-separated list, or a sequence of these: replicas of each other.
@@ -24,7 +25,7 @@ def check_outputs(
     """Refuse outputs that cannot be meant, before anything is computed.
 
     Raises InputError for another suffix, a folder that does not exist, an existing file (unless `resume` or
-    `overwrite`), or both switches at once.
+    `overwrite`), or both switches at once; TrajectoryError where a trajectory's NAME.pdb is another program's.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other.")
@@ -37,6 +38,8 @@ def check_outputs(
             raise InputError(f"{path} is a folder; name a file.")
         if path.exists() and not (resume or overwrite):
             raise InputError(f"{path} exists; add --overwrite to replace it, or choose another name.")
+        if path.suffix.lower() in TRAJECTORY_SUFFIXES and suffixes == TRAJECTORY_SUFFIXES and not resume:
+            refuse_foreign_topology(path)
 
 
 @contextmanager

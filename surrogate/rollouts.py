@@ -10,7 +10,7 @@ from surrogate.data.shipped import weights_path
 from surrogate.md_options import Preparation, takes
 from surrogate.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.progress import progress_bar
-from surrogate.scenes import prepare_scene
+from surrogate.scenes import prepare_scene, tell
 from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
@@ -110,4 +110,13 @@ def rollout(
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=quiet, ps_per_frame=saved_ps * replicas) as progress,
     ):
-        return roll(molecule, loaded, outs, config, resume=resume, overwrite=overwrite, progress=progress)
+        return roll(
+            molecule,
+            loaded,
+            outs,
+            config,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            announce=None if quiet else lambda line: tell(molecule.name, line),
+        )

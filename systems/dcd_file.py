@@ -28,8 +28,8 @@ from systems.frame_store import (
     read_run_id,
 )
 from systems.hdf5_file import check_read, read_checksums, read_columns
-from systems.pdb_text import pdb_text
 from systems.scene import Scene
+from systems.topology_file import is_our_topology, refuse_other_topology, topology_path, write_topology
 from systems.trajectory_types import (
     Float32Array,
     FrameBlock,
@@ -39,12 +39,10 @@ from systems.trajectory_types import (
 )
 from systems.whole_file import create_whole, refuse_existing, storage_error, write_whole
 
-_OUR_PDB = b"REMARK   1 surromd scene"
-
 
 def companions(path: Path) -> tuple[Path, Path]:
     """Return the paths of `NAME.pdb` and `NAME.meta.h5` that stand beside `NAME.dcd`."""
-    return path.with_suffix(".pdb"), path.with_suffix(".meta.h5")
+    return topology_path(path), path.with_suffix(".meta.h5")
 
 
 class DcdWriter(TrajectoryWriter):
@@ -81,11 +79,10 @@ class DcdWriter(TrajectoryWriter):
             raise
 
     def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
-        for file in (self.path, self._meta, self._pdb):
+        for file in (self.path, self._meta):
             refuse_existing(file, overwrite)
-        if self._pdb.exists() and not self._pdb.read_bytes().startswith(_OUR_PDB):
-            raise TrajectoryError(f"{self._pdb} is not ours and would be replaced; choose another name for the DCD.")
-        topology = pdb_text(self.scene).encode("ascii", "replace")
+        refuse_other_topology(self.path, self.scene, overwrite=overwrite)
+        had_topology = self._pdb.exists()
         made: list[Path] = []
         try:
             create_store(
@@ -98,8 +95,8 @@ class DcdWriter(TrajectoryWriter):
                 checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
             )
             made.append(self._meta)
-            create_whole(self._pdb, topology)
-            made.append(self._pdb)
+            write_topology(self.path, self.scene)
+            made += [] if had_topology else [self._pdb]
             header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
             create_whole(self.path, header + title_bytes(self.scene.n_atoms))
         except SurromdError:
@@ -193,7 +190,7 @@ class DcdReader(TrajectoryReader):
             self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
             self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
             self.scene = None
-            if top is not None or _is_ours(pdb):
+            if top is not None or is_our_topology(pdb):
                 self.scene = _scene_from_top(top or pdb, path, self.n_atoms)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{path} holds {self.n_atoms} atoms a frame, its record {self.scene.n_atoms}.")
@@ -240,14 +237,6 @@ def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, complet
             f"{path} holds {whole} whole frames where {companions(path)[1].name} records {n_frames}: one of them is "
             "cut short or replaced; restore both from one copy."
         )
-
-
-def _is_ours(pdb: Path) -> bool:
-    try:
-        with pdb.open("rb") as file:
-            return file.read(len(_OUR_PDB)) == _OUR_PDB
-    except OSError:
-        return False
 
 
 def _scene_from_top(top: Path, path: Path, n_atoms: int) -> Scene:

@@ -38,6 +38,7 @@ from systems.frame_store import (
     read_run_id,
 )
 from systems.scene import Scene
+from systems.topology_file import refuse_other_topology, topology_path, write_topology
 from systems.trajectory_types import (
     Float32Array,
     Float64Array,
@@ -46,6 +47,7 @@ from systems.trajectory_types import (
     TrajectoryWriter,
     check_same_topology,
 )
+from systems.whole_file import refuse_existing
 
 _CHUNK_BYTES = 131_072
 _STRIDED_READ_FRAMES = 8192
@@ -70,6 +72,8 @@ class Hdf5Writer(TrajectoryWriter):
         self.path, self.scene = path, scene
         check_wanted(columns, path)
         if not append:
+            refuse_existing(path, overwrite)
+            refuse_other_topology(path, scene, overwrite=overwrite)
             names = (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS]))
             create_store(
                 path,
@@ -85,6 +89,8 @@ class Hdf5Writer(TrajectoryWriter):
             check_same_topology(path, self._store.scene, scene)
             if "coordinates" not in self._store.file:
                 raise TrajectoryError(f"{path} holds no coordinates; it is the companion of a DCD file.")
+            if not append or not topology_path(path).exists():
+                write_topology(path, scene)
             new = {key: value for key, value in record.items() if key not in self._store.record}
             if append and new:
                 self._store.update_record(new)

@@ -6,19 +6,27 @@ from systems.errors import InputError
 from systems.hybrid36 import encode
 from systems.scene import Scene
 
+MOST_ATOMS = 99_999
+# Between these a coordinate in Å fits its columns.
+_LEAST_A, _MOST_A = -999.999, 9999.999
+
 
 def pdb_text(scene: Scene) -> str:
     """Return PDB text in the scene's atom order, with CONECT records for all bonds.
 
-    Raises InputError above 99,999 atoms (the format's limit).
+    A scene too far from the origin for the columns is centred. Raises InputError above 99,999 atoms (the format's
+    limit).
     """
-    if scene.n_atoms > 99_999:
-        raise InputError(f"Scene {scene.name!r} has {scene.n_atoms} atoms; a PDB file holds at most 99,999.")
+    if scene.n_atoms > MOST_ATOMS:
+        raise InputError(f"Scene {scene.name!r} has {scene.n_atoms} atoms; a PDB file holds at most {MOST_ATOMS:,}.")
+    angstrom = scene.positions_nm * 10.0
+    if scene.n_atoms and (angstrom.min() < _LEAST_A or angstrom.max() > _MOST_A):
+        angstrom = angstrom - angstrom.mean(axis=0)
     lines = [f"REMARK   1 surromd scene {scene.name}"]
     for i, (name, element) in enumerate(zip(scene.atom_names, scene.elements, strict=True)):
         res = scene.residue_of_atom[i]
         padded = name[:4] if len(name) >= 4 or len(element) == 2 else f" {name}"
-        x, y, z = scene.positions_nm[i] * 10.0
+        x, y, z = angstrom[i]
         resid = scene.residue_ids[res]
         number, insertion = (resid[:-1], resid[-1]) if resid and resid[-1].isalpha() else (resid, " ")
         if number.lstrip("-").isdigit():

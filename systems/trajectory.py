@@ -30,11 +30,12 @@ def open_writer(
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5` or `.dcd`), or continue one with `append=True`.
 
-    A DCD is accompanied by `NAME.pdb` (topology) and `NAME.meta.h5` (record, exact times, flags). With `append` the
-    file must be ours and hold the same ordered topology; what it records stays, new keys of `record` are added, and an
-    append that a crash interrupted is cut off. `record` must be JSON-able. `columns`: what each frame has beside
-    positions, 'velocities' and 'forces' (HDF5 only); the cell of a periodic scene is kept in any case. `run_id`: whose
-    file it is. The writer holds the file's claim (systems.claim), unless its caller does (`claimed`).
+    Beside it stands `NAME.pdb`, its topology in its atom order (up to 99,999 atoms), beside a DCD also `NAME.meta.h5`
+    (record, exact times, flags). With `append` the file must be ours and hold the same ordered topology; what it
+    records stays, new keys of `record` are added, and an append that a crash interrupted is cut off. `record` must be
+    JSON-able. `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell of a
+    periodic scene is kept in any case. `run_id`: whose file it is. The writer holds the file's claim (systems.claim),
+    unless its caller does (`claimed`).
     Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
     `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
     process; StorageError when the folder is missing, not writable or full.
@@ -74,9 +75,11 @@ def open_writer(
 
 def companions(path: Path) -> tuple[Path, ...]:
     """Return the paths of what is written beside a trajectory."""
-    if path.suffix.lower() != ".dcd":
-        return (journal_path(path),)
     from systems import dcd_file
+    from systems.topology_file import topology_path
+
+    if path.suffix.lower() != ".dcd":
+        return topology_path(path), journal_path(path)
 
     pdb, meta = dcd_file.companions(path)
     return pdb, meta, journal_path(meta)

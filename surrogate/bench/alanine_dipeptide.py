@@ -178,7 +178,7 @@ def judge(
         solver_steps=solver_steps,
         resume=True,
     )
-    comparison = api.compare(held[0], [outs], folder / f"{name}.html", replicate=held[1], labels=[name])
+    comparison = api.compare(held[0], [outs], folder / f"{name}.html", replicate=held[1], labels=[name], overwrite=True)
     judgement = comparison.judgements[0]
     rows: dict[str, Any] = {key: judgement.row(key).to_dict() for key in FIGURES}
     for key, row in rows.items():

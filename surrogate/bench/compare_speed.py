@@ -127,7 +127,7 @@ def time_compare(files: Sequence[Path], report: Path, profile: Path | None = Non
     reference, candidate, replicate = (str(f) for f in files)
     start = ["-m", "surrogate.cli"] if profile is None else ["-c", _PROFILED, str(profile)]
     command = [sys.executable, *start, "compare", reference, candidate]
-    command += ["--replicate", replicate, "-o", str(report), "--quiet"]
+    command += ["--replicate", replicate, "-o", str(report), "--overwrite", "--quiet"]
     started = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)

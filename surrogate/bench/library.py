@@ -114,18 +114,13 @@ def _elsewhere(path: Path, frames: Any) -> str:
     import MDAnalysis
     import mdtraj
 
-    from systems.trajectory import open_trajectory
+    from systems.topology_file import topology_path
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not np.allclose(mdtraj.load(str(path)).xyz, frames, atol=1e-5):
             return "MDTraj reads other coordinates"
-        pdb = path.with_suffix(".pdb")
-        with open_trajectory(path) as reader:
-            if reader.scene is None:
-                return "the file carries no scene"
-            reader.scene.write_pdb(pdb)
-        universe = MDAnalysis.Universe(str(pdb), str(path), format="H5MD")
+        universe = MDAnalysis.Universe(str(topology_path(path)), str(path), format="H5MD")
         last = universe.trajectory[-1].positions / 10.0
         if universe.trajectory.n_frames != len(frames) or not np.allclose(last, frames[-1], atol=1e-5):
             return "MDAnalysis reads other coordinates"

@@ -99,8 +99,8 @@ def speed_ratio(candidate: Account, reference: Account) -> float | None:
     return candidate.ns_per_day / reference.ns_per_day
 
 
-def cost_ratio(worth_ps: float, candidate: Account, reference: Account) -> float | None:
-    """Return the wall time of `worth_ps` of the reference's MD over that of the whole candidate; None if unknown."""
+def cost_ratio(worth_ps: float, share: float, candidate: Account, reference: Account) -> float | None:
+    """Return the wall time of `worth_ps` of the reference's MD over that of a share of the candidate, or None."""
     if candidate.wall_s is None or reference.wall_s is None:
         return None
-    return worth_ps / reference.total_ps * reference.wall_s / candidate.wall_s
+    return worth_ps / reference.total_ps * reference.wall_s / (share * candidate.wall_s)

@@ -10,6 +10,13 @@ from typing import Any
 COLUMN = "intervention"
 
 
+def unseen_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return that a rollout's molecule was not trained on, else nothing."""
+    if not any(r.get("unseen_molecule") for r in records):
+        return []
+    return [f"{label}: its weights ({records[0].get('weights')}) were not trained on this molecule."]
+
+
 def intervention_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
     """Return what the guards of a rollout did, replicas together, and what it may do to statistics; else nothing."""
     accounts = [r["interventions"] for r in records if isinstance(r.get("interventions"), dict)]

@@ -267,7 +267,7 @@ def _judge(
     words = ""
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
     if kind != "broken" and not (doubts.apart or doubts.copied) and known >= remarks.LEAST_FOR_WORTH:
-        words = headline(worth, lambda ps: cost_ratio(ps, account, reference_account))
+        words = _worth_words(worth, account, reference_account)
     return Judgement(
         account=account,
         status=kind,
@@ -344,6 +344,10 @@ def _equal_terms(
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
     )
     return Trio(scene, torsions, geometry, truth, rolled, other, options), slowest
+
+
+def _worth_words(found: Sequence[Worth], account: Account, reference: Account) -> str:
+    return headline(found, lambda w: cost_ratio(w.worth_ps, w.share, account, reference), account.total_ps)
 
 
 def _with_forecast(judgement: Judgement, charts: Sequence[Chart], skipped: Sequence[tuple[str, str]]) -> Judgement:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.account_of_guards import COLUMN, intervention_notes
+from surrogate.judge.account_of_guards import COLUMN, intervention_notes, unseen_notes
 from surrogate.judge.reading import common_lag, merged_record, open_matched, time_axis
 from surrogate.judge.stored_frames import StoredFrames
 from systems.errors import InputError
@@ -160,7 +160,7 @@ def load_ensemble(
     assert template is not None
     if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
         raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
-    notes += intervention_notes(name, records)
+    notes += unseen_notes(name, records) + intervention_notes(name, records)
     lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
     part = kept[0] if len(kept[0]) < template.n_atoms else None
     return Ensemble(

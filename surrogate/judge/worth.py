@@ -33,7 +33,8 @@ class Worth:
     `candidate_error` is its distance to the truth; MD of `lengths_ps` `(n,)`, ascending, has `errors` `(n,)`, the
     geometric mean over pieces, which scatter between `errors_low` and `errors_high` (10 % and 90 % quantiles).
     `bound` says where the worth lies when the candidate is better than the longest MD at hand ("at least") or worse
-    than the shortest ("less than"); an end of the interval beyond that range is None.
+    than the shortest ("less than"); an end of the interval beyond that range is None. `share` of the candidate is what
+    this much is the worth of: all of it, or, where MD at hand ends first, the shortest parts that come as near.
     """
 
     key: str
@@ -48,6 +49,7 @@ class Worth:
     errors: tuple[float, ...]
     errors_low: tuple[float, ...]
     errors_high: tuple[float, ...]
+    share: float = 1.0
 
     def in_words(self) -> str:
         """Return such as '38 ns [25 ns, 60 ns]', 'at least 100 ns' or 'less than 0.8 ns'."""
@@ -172,7 +174,16 @@ def worth_by(measure: Measure, length_ps: float, seed: int = 0, n_draws: int = 4
         errors=tuple(math.exp(0.5 * x) for x in means),
         errors_low=tuple(float(s[0]) for s in spans),
         errors_high=tuple(float(s[1]) for s in spans),
+        share=_share_needed(measure, math.exp(0.5 * float(curve[-1]))) if bound == "at least" else 1.0,
     )
+
+
+def _share_needed(measure: Measure, error: float) -> float:
+    """Return the least share of the candidate from which on parts of it are as near to the truth as `error`."""
+    shares, errors = errors_by_length(measure, 1.0)
+    too_far = np.flatnonzero(errors > error)
+    first = int(too_far[-1]) + 1 if len(too_far) else 0
+    return float(shares[first]) if first < len(shares) else 1.0
 
 
 def _own_error(measure: Measure, truths: tuple[FloatArray, FloatArray], seed: int, n_draws: int) -> float:
@@ -222,28 +233,35 @@ def _round(time_ps: float) -> float:
     return float(f"{time_ps:.2g}")
 
 
-def headline(found: Sequence[Worth], cost_ratio: Callable[[float], float | None]) -> str:
+def headline(found: Sequence[Worth], cost_ratio: Callable[[Worth], float | None], length_ps: float) -> str:
     """Return 'Worth 38 ns [25 ns, 60 ns] of MD by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns [...].'
 
-    `cost_ratio(worth_ps)`: the cost of that much MD over the candidate's, None when a cost is unknown. Empty without
-    a measure.
+    `cost_ratio(worth)`: the cost of that much MD over that of the share of the candidate which is worth it, None when a
+    cost is unknown; `length_ps`: of the candidate. Where a part of it suffices, that is said and alone charged for.
+    Empty without a measure.
     """
     first = next((w for w in found if w.kind == "distribution"), None)
     if first is None:
         return ""
     text = f"Worth {first.in_words()} of MD by its {first.measure}"
-    ratio = cost_ratio(first.worth_ps)
+    ratio = cost_ratio(first)
     if ratio is not None and first.bound != "less than":
-        text += f", at {_cost_words(ratio)} its cost"
+        part = (
+            ""
+            if first.share >= 1.0
+            else f" for the {format_time_ps(_round(first.share * length_ps))} of it that this takes"
+        )
+        text += f", at {_cost_words(ratio)} its cost{part}"
     moving = next((w for w in found if w.kind == "kinetics"), None)
     return text + (f"; by its kinetics ({moving.measure}) {moving.in_words()}." if moving else ".")
 
 
 def _cost_words(ratio: float) -> str:
-    """Return '1/900 of' for MD that costs 900 times as much, '3.2 times' for MD that is cheaper."""
+    """Return '1/900 of' for MD that costs 900 times as much, '67 % of' for 1.5 times, '3.2 times' for MD that is
+    cheaper."""
     if ratio < 1.0:
         return f"{float(f'{1 / ratio:.2g}'):g} times"
-    return f"1/{float(f'{ratio:.2g}'):,g} of"
+    return f"{100 / ratio:.0f} % of" if ratio < 10.0 else f"1/{float(f'{ratio:.2g}'):,g} of"
 
 
 def worth_charts(found: Sequence[Worth]) -> list[LineChart]:

@@ -39,6 +39,12 @@ class DomainMatch:
     deviations: tuple[Deviation, ...] = ()
     seen: bool = True
 
+    def remarks(self, weights: str) -> tuple[str, ...]:
+        """Return what is to be said before the scene is rolled with weights of this name; nothing inside the domain."""
+        unseen = f"{weights} was not trained on this molecule; compare with MD of it before you trust the rollout"
+        beyond = (f"outside the training domain: {d.what}: {d.reason}" for d in self.deviations)
+        return (*(() if self.seen else (unseen,)), *beyond)
+
 
 def find_deviations(
     scene: Scene, domain: TrainingDomain, *, temperature_k: float | None = None

@@ -7,11 +7,12 @@ valid frame to the end of the chunk, and the surrogate takes over again.
 
 A model that has got no chunk through yet, gives one without a frame that passes, and another in a second draw, is not
 unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken
-(validity.INVALID) or stands still.
+(validity.INVALID) or stands still, and where, after some chunks or at its end, it has not got one through.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,10 @@ MOST_DRAWS = 8
 _DRAWS_FROM_LAST_VALID = 4
 MOST_MD_IN_A_ROW = 10
 _MD_ATTEMPT, _BETWEEN_ATTEMPT = 1000, 2000
+# Under 'flag': so many chunks of each replica a model has to get one through. A frame now and then, as sound weights
+# have in long chunks, does not prove it wrong: of frames, so many must be caught, and more than one.
+_CHUNKS_TO_PROVE = 8
+_WRONG_SHARE = 0.1
 
 
 @dataclass(eq=False)
@@ -46,6 +51,28 @@ class Chunk:
     energies_kj_mol: npt.NDArray[np.float64]
     velocities_nm_ps: FloatArray | None
     failure: tuple[int, str] | None = None
+
+
+def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
+    """Return the worst replica and what is wrong with a model that has got no chunk of `n_new` frames through.
+
+    None as long as it has, or may yet: `at_end` says that no chunk follows.
+    """
+    chunks, frames = sum(t.chunks for t in tallies), sum(t.frames_caught for t in tallies)
+    if any(t.chunks_caught < t.chunks for t in tallies) or frames <= max(1.0, _WRONG_SHARE * chunks * n_new):
+        return None
+    if not at_end and tallies[0].chunks < _CHUNKS_TO_PROVE:
+        return None
+    row = max(range(len(tallies)), key=lambda k: tallies[k].frames_caught)
+    reasons: Counter[str] = Counter()
+    for tally in tallies:
+        reasons.update(tally.reasons)
+    named = ", ".join(name for name, _ in reasons.most_common())
+    share = f"{100 * frames / (chunks * n_new):.0f} % of frames: {named}"
+    return (
+        row,
+        f"every one of {chunks} chunks was caught ({share})" if chunks > 1 else f"its one chunk was caught ({share})",
+    )
 
 
 @dataclass(frozen=True, eq=False)

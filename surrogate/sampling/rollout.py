@@ -18,7 +18,7 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.guards import Guard
-from surrogate.sampling.interventions import Chunk, Interventions
+from surrogate.sampling.interventions import Chunk, Interventions, none_through
 from surrogate.sampling.plan import Plan, settle_plan
 from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
 from surrogate.sampling.settings import GUARDS, RolloutConfig
@@ -39,6 +39,8 @@ __all__ = ["GUARDS", "RolloutConfig", "rollout"]
 
 # (frames done, frames in all, account of speed and interventions) of one replica -> None
 ProgressFn = Callable[[int, int, str], None]
+# A line about the run as a whole -> None
+AnnounceFn = Callable[[str], None]
 
 
 def rollout(
@@ -50,6 +52,7 @@ def rollout(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
+    announce: AnnounceFn | None = None,
     flush_every_s: float = 3.0,
 ) -> list[Path]:
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
@@ -60,6 +63,7 @@ def rollout(
     Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a replica does not depend on how many
     run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C and SIGTERM stop between two chunks,
     with everything on disk: KeyboardInterrupt. Memory that does not suffice for all replicas at once halves the batch.
+    `announce` is told how the scene leaves what was trained on.
     Raises OutOfDomainError, InputError, StorageError; SimulationError when the guard cannot bring a chunk through
     (under 'flag' and 'off' the chunk is in the file, marked; else what came before).
     """
@@ -71,6 +75,9 @@ def rollout(
         lag_ps=config.lag_ps,
         save_every_ps=config.save_every_ps,
     )
+    if announce is not None:
+        for line in match.remarks(weights.path.name):
+            announce(line)
     state_path = checkpoint_path(outs[0])
     precision = config.precision
     if resume and precision == "auto" and state_path.exists():
@@ -141,6 +148,9 @@ def rollout(
                 state.last_frames, state.velocities, state.tallies, chunk=state.chunks, step=state.steps
             )
             state.wall_s = time.monotonic() - started
+            if chunk.failure is None and config.guard == "flag":
+                at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps
+                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end)
             if chunk.failure is not None:
                 if config.guard in ("off", "flag"):
                     _buffer(plan, state, chunk, buffers)

@@ -31,9 +31,10 @@ def refusal(*arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ethanol with velocities: 160 frames, 5 fs apart, natural masses."""
+    """Ethanol with velocities as in MD17: 160 frames, 5 fs apart, natural masses."""
     path = tmp_path_factory.mktemp("moving") / "ethanol.h5"
-    done("reference", "ethanol", "--time", "0.8ps", "--save-every", "5fs", "--save-velocities", "-o", str(path))
+    asked = ("--protocol", "md17", "--time", "0.8ps", "--save-velocities")
+    done("reference", "ethanol", *asked, "-o", str(path))
     return path
 
 

@@ -259,6 +259,15 @@ def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.T
     assert result.exit_code == 0, result.stderr
     assert {p.name for p in here.iterdir()} == {"report.html", "report.json", "report.md"}
     assert "report.html" in result.stdout
+    for name in ("report.html", "report.json", "report.md"):
+        for other in ("report.html", "report.json", "report.md"):
+            (here / other).rename(here / f"{other}.away") if other != name else None
+        before = (here / name).read_bytes()
+        again = refused(run("compare", str(made / "x_r0.h5"), str(made / "x_r1.h5"), "-o", "report.html"))
+        assert f"{name} exists; add --overwrite" in again
+        assert (here / name).read_bytes() == before
+        for away in here.glob("*.away"):
+            away.rename(here / away.stem)
     rows = {row["key"]: row for row in json.loads((here / "report.json").read_text())["judgements"][0]["rows"]}
     # Stiff bonds at rest: below what the run itself recorded, by less than half of kT for each degree of freedom.
     with open_trajectory(made / "x_r0.h5") as reader:
@@ -295,7 +304,7 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
     assert 0 < kept < 2000
     assert f"x.h5 holds {kept} frames" in stderr
     assert run(*arguments, "--resume").exit_code == 0
-    assert [p.name for p in here.iterdir()] == ["x.h5"], "the checkpoint goes when the run is complete"
+    assert {p.name for p in here.iterdir()} == {"x.h5", "x.pdb"}, "the checkpoint goes when the run is complete"
 
     import numpy as np
 

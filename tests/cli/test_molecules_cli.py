@@ -49,6 +49,12 @@ def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
     with open_trajectory(out) as reader:
         assert np.allclose(reader.time_ps, 10.0 * np.arange(1, 7))
         assert reader.record["unseen_molecule"] and reader.record["lag_ps"] == 10.0
+    told = run("rollout", "smiles:CCO", *common[:-1], "--time", "60ps", "--overwrite")
+    assert "CCO: w.safetensors was not trained on this molecule" in told.stderr
+    assert "a molecule that the weights were not trained on" in told.stdout
+    assert "a molecule that the weights were not trained on" in run("info", str(out)).stdout
+    seen = run("rollout", "smiles:CCC", *common[:-1], "--time", "60ps", "--overwrite")
+    assert "not trained" not in seen.stderr + seen.stdout
     for scene, more, why in (
         ("smiles:CCO", ["--lag", "50ps"], "lags of 1 ps to 10 ps"),
         ("smiles:CCCCC", [], "size"),
@@ -58,6 +64,7 @@ def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
         assert refused.exit_code == 1 and why in refused.stderr and refused.stderr.count("\n") == 1, refused.stderr
     forced = run("rollout", "smiles:CCCC", *common, "--time", "10ps", "--lag", "5ps", "--overwrite", "--force")
     assert forced.exit_code == 0, forced.stderr
+    assert "outside the training domain (--force): size: 14 atoms" in run("info", str(out)).stdout
 
 
 def test_stress_takes_the_molecule_to_try(folder: Path) -> None:

@@ -18,7 +18,7 @@ from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory
 
-CONFIG = RolloutConfig(time_ps=21.0, solver_steps=2, precision="fp32", seed=3)
+CONFIG = RolloutConfig(time_ps=21.0, solver_steps=2, precision="fp32", seed=3, guard="off")
 
 
 def frames_of(path: Path) -> np.ndarray:

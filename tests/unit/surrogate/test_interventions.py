@@ -14,10 +14,11 @@ from torch import Tensor
 
 from surrogate.data.weights import TrainingDomain, Weights
 from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.sampling.account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED
+from surrogate.sampling.account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Tally
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import CAUGHT, Guard
+from surrogate.sampling.interventions import none_through
 from surrogate.sampling.rollout import RolloutConfig, rollout
 from systems.claim import frames_in
 from systems.errors import InputError, SimulationError, UnknownNameError
@@ -254,6 +255,41 @@ def test_a_wrong_model_is_stopped_within_one_chunk(
             assert reader.n_frames == N_NEW and (reader.flags & np.uint16(INVALID)).all()
         out.unlink()
     assert list(tmp_path.iterdir()) == [], "no invalid frame is written, and no file without frames is left"
+
+
+def tear(frames: Tensor, noise: Tensor) -> Tensor:
+    """Two frames of every chunk have a carbonyl bond that is 0.08 nm too long."""
+    for k in (2, 5):
+        step = frames[k, 5] - frames[k, 4]
+        frames[k, 5] += 0.08 * step / step.norm()
+    return frames
+
+
+@pytest.mark.parametrize(("asked", "drawn"), [(50, 8), (3, 3), (1, 1)])
+def test_a_model_that_gets_no_chunk_through_does_not_end_well(
+    tmp_path: Path, scene: Scene, domain: TrainingDomain, asked: int, drawn: int
+) -> None:
+    """None of its chunks is broken throughout, and none is whole: it stops after some, or at its end."""
+    said = f"every one of {drawn} chunks was caught" if drawn > 1 else "its one chunk was caught"
+    with pytest.raises(SimulationError, match=rf"{said} \((25|38) % of frames: bond .*are marked in"):
+        roll(tmp_path / "a.h5", scene, weights_of(domain, tear), "flag", n_chunks=asked)
+    with open_trajectory(tmp_path / "a.h5") as reader:
+        assert reader.n_frames == drawn * N_NEW and reader.record["completed"] is False
+        assert (reader.flags & np.uint16(INVALID)).any()
+    assert roll(tmp_path / "b.h5", scene, weights_of(domain, tear), "off").record["completed"]
+
+
+def test_one_chunk_got_through_and_few_frames_caught_prove_a_model() -> None:
+    def tallies(chunks: int, caught: int, frames: int) -> list[Tally]:
+        return [Tally(chunks, caught, frames, {"clash": frames}), Tally(chunks, chunks, frames)]
+
+    assert none_through(tallies(8, 8, 100), 64, at_end=False) == (
+        0,
+        "every one of 16 chunks was caught (20 % of frames: clash)",
+    )
+    assert none_through(tallies(8, 7, 100), 64, at_end=True) is None
+    assert none_through(tallies(7, 7, 100), 64, at_end=False) is None
+    assert none_through(tallies(8, 8, 8), 64, at_end=True) is None, "a frame in each chunk of 64"
 
 
 @pytest.mark.parametrize(("guard", "mark"), [("resample", DRAWN_AGAIN), ("fallback", MD_AFTER_FAILURE)])

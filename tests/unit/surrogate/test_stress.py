@@ -105,7 +105,7 @@ def test_arithmetic_and_batches(small_weights: Weights) -> None:
 
 
 def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: Weights) -> None:
-    config = StressConfig(frames=(80,), replicas=2, guards=("flag",), sections=("length", "batches"), chunks=1,
+    config = StressConfig(frames=(80,), replicas=2, guards=("off",), sections=("length", "batches"), chunks=1,
                           compiled=False)  # fmt: skip
     told: list[str] = []
     result = run_stress(small_weights, tmp_path, config, report=told.append)
@@ -120,7 +120,7 @@ def test_a_whole_stress_test_writes_its_tables(tmp_path: Path, small_weights: We
 
 def test_a_stress_test_is_added_to(tmp_path: Path, small_weights: Weights) -> None:
     def run(weights: Weights, frames: int, *sections: str) -> dict[str, Any]:
-        config = StressConfig(frames=(frames,), replicas=2, guards=("flag",), sections=sections, compiled=False)
+        config = StressConfig(frames=(frames,), replicas=2, guards=("off",), sections=sections, compiled=False)
         return run_stress(weights, tmp_path, config, report=lambda name: None)["sections"]
 
     run(small_weights, 40, "batches")

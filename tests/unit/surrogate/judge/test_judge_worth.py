@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from surrogate.judge import distributions, worth_measures
+from surrogate.judge.account import Account, cost_ratio
 from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.ensemble import Ensemble
 from surrogate.judge.rows import Options
 from surrogate.judge.worth import Measure, Worth, distance_to_truth, errors_by_length, headline, worth_by
+from systems.units import format_time_ps
 
 N_BLOCKS, PER_BLOCK = 128, 20
 
@@ -31,6 +33,11 @@ def measured(candidate: np.ndarray, rng: np.random.Generator, p: np.ndarray) -> 
     found = worth_by(Measure("x", "distribution", "x", sums, squared), 1000.0 * N_BLOCKS)
     assert found is not None
     return found
+
+
+def account(label: str, total_ns: float, wall_s: float) -> Account:
+    total_ps = 1000.0 * total_ns
+    return Account(label, (), None, None, 1, round(total_ps), 1.0, total_ps, {}, wall_s, 86_400 * total_ns / wall_s, {})
 
 
 STATES = np.full(30, 1 / 30)
@@ -148,10 +155,27 @@ def test_wrong_kinetics_are_worth_little_where_the_map_is_right(trio: tuple[Ense
 def test_the_headline_without_costs_or_measures() -> None:
     rng = np.random.default_rng(3)
     found = measured(draw_counts(STATES, 32, rng), rng, STATES)
-    assert "cost" not in headline([found], lambda _: None)
-    assert "at 1/900 of its cost" in headline([found], lambda _: 901.0)
-    assert "at 2 times its cost" in headline([found], lambda _: 0.5)
-    assert headline([], lambda _: None) == ""
+    assert "cost" not in headline([found], lambda _: None, 1e3)
+    assert "at 1/900 of its cost" in headline([found], lambda _: 901.0, 1e3)
+    assert "at 67 % of its cost" in headline([found], lambda _: 1.5, 1e3)
+    assert "at 2 times its cost" in headline([found], lambda _: 0.5, 1e3)
+    assert headline([], lambda _: None, 1e3) == ""
+
+
+def test_a_candidate_longer_than_the_md_at_hand_is_charged_for_the_part_that_is_worth_it() -> None:
+    """As good as MD and sixteen times as long: about a sixteenth is worth all the MD there is, and costs so much."""
+    rng = np.random.default_rng(11)
+    alike = measured(draw_counts(STATES, 16 * N_BLOCKS, rng), rng, STATES)
+    assert alike.bound == "at least"
+    assert 1 / 64 < alike.share < 1 / 4
+    rolled, md = account("candidate", 16.0 * N_BLOCKS, 8.0), account("reference", 1.0 * N_BLOCKS, 40.0)
+    ratio = cost_ratio(alike.worth_ps, alike.share, rolled, md)
+    assert ratio == pytest.approx(40.0 / (8.0 * alike.share))
+    said = headline([alike], lambda _: ratio, rolled.total_ps)
+    part = format_time_ps(float(f"{rolled.total_ps * alike.share:.2g}"))
+    assert f"of its cost for the {part} of it that this takes" in said
+    # Negative control: what is not worth all MD is charged for whole.
+    assert measured(draw_counts(STATES, 8, rng), rng, STATES).share == 1.0
 
 
 def test_short_trajectories_have_no_worth(simulate: Callable[..., Ensemble]) -> None:
