@@ -35,6 +35,7 @@ from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
 from systems.scene import Scene
 from systems.sequence import build_peptide
+from systems.topology_file import topology_path
 from systems.trajectory import open_trajectory, open_writer
 from systems.units import parse_wall_s
 
@@ -129,6 +130,7 @@ def run(scene: Scene, seeds: Seeds, k: int, out: Path, peptide: Peptide, choice:
                 "temperature_k": np.array([s.temperature_k for s in states]),
             },
         )
+    os.replace(topology_path(part), topology_path(out))
     os.replace(part, out)
 
 

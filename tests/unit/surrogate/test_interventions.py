@@ -254,6 +254,7 @@ def test_a_wrong_model_is_stopped_within_one_chunk(
             assert reader.record["interventions"]["chunks_caught"] == 1
             assert reader.n_frames == N_NEW and (reader.flags & np.uint16(INVALID)).all()
         out.unlink()
+        out.with_suffix(".pdb").unlink()
     assert list(tmp_path.iterdir()) == [], "no invalid frame is written, and no file without frames is left"
 
 
