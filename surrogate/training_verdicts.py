@@ -48,7 +48,7 @@ class TrainingVerdict:
         """Return it for people."""
         done = ", ".join(f"{name} {steps} steps" for name, steps in self.steps.items())
         errors = ", ".join(
-            f"{column.removeprefix('validation_').replace('_', ' ')} {value:.3g}"
+            f"{column.removeprefix('validation_')} {value:.3g}"
             for columns in self.validation.values()
             for column, value in columns.items()
         )
