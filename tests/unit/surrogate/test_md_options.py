@@ -17,12 +17,13 @@ from surrogate.md_options import MDOptions, Preparation, flags_of
 from systems.prepare import prepare
 
 FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
-# How many runs there are, and what makes the box: no fields of MDConfig or ForceFieldSpec.
-ELSEWHERE = {"replicas", "level", "padding_nm", "ionic_strength_molar"}
+# How many runs there are, what names settings of others, and what makes the box: no fields of MDConfig or ForceFieldSpec.
+ELSEWHERE = {"replicas", "level", "protocol", "padding_nm", "ionic_strength_molar"}
 TYPED = {
     "force_field": ("ff19SB", "ff19SB"),
     "solvent": ("opc", "opc"),
     "level": ("mm", "mm"),
+    "protocol": ("md17", "md17"),
     "padding_nm": ("12A", 1.2),
     "ionic_strength_molar": ("150mM", 0.15),
     "temperature_k": ("310K", 310.0),
