@@ -17,7 +17,7 @@ from surrogate.md_options import MDOptions, Preparation, flags_of
 from systems.prepare import prepare
 
 FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
-# How many runs there are, what names settings of others, and what makes the box: no fields of MDConfig or ForceFieldSpec.
+# How many runs there are, whose settings, and what makes the box: no fields of MDConfig or ForceFieldSpec.
 ELSEWHERE = {"replicas", "level", "protocol", "padding_nm", "ionic_strength_molar"}
 TYPED = {
     "force_field": ("ff19SB", "ff19SB"),
