@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from systems.residues import template_for
+
 # Symbol: (standard atomic weight in Da, IUPAC 2021 abridged; covalent radius in nm, Cordero et al., Dalton 2008, 2832).
 _TABLE: dict[str, tuple[float, float]] = {
     "H": (1.008, 0.031), "He": (4.0026, 0.028), "Li": (6.94, 0.128), "Be": (9.0122, 0.096), "B": (10.81, 0.084),
@@ -64,8 +66,6 @@ def covalent_radius_nm(symbol: str) -> float:
 
 def repeats_name(name_field: str, residue_name: str, symbol: str) -> bool:
     """Whether an element column repeats the atom's name: Ca for the alpha carbon, Hg for a hydrogen of a side chain."""
-    from systems.residues import template_for
-
     if len(symbol) < 2 or symbol == "Se" or not name_field.strip().upper().startswith(symbol.upper()):
         return False
     return template_for(residue_name) is not None
@@ -92,7 +92,10 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
         return None
     residue = residue_name.upper()
     two = letters[:2].capitalize()
-    if (hetero or residue in _UNNAMED_RESIDUES) and two in _TWO_LETTER_IN_LIGANDS:
+    # The columns of PDB files put an element's second letter where a nitrogen called NA has its first.
+    halogen = two in ("Cl", "Br") and (len(letters) == 2 or letters[2:].isdigit())
+    other = (hetero or residue in _UNNAMED_RESIDUES) and not name_field.startswith(" ")
+    if (halogen or other) and two in _TWO_LETTER_IN_LIGANDS and template_for(residue) is None:
         return two
     if residue in ("MSE", "SEC") and two == "Se":
         return two

@@ -9,6 +9,7 @@ import pytest
 
 from systems import library
 from systems.clashes import check_contacts
+from systems.element_data import element_symbol
 from systems.errors import InputError, PreparationError
 from systems.pdb_records import AtomRecord
 from systems.prepare import prepare
@@ -168,3 +169,11 @@ def test_a_lactam_keeps_what_it_lost(shared_data: Path, tmp_path: Path, left_out
     assert charged["5", "NZ"] == charged["9", "OE1"] == 0
     assert ("side chains bonded by distance" in said(scene)) == ("LINK" in left_out)
     assert scene.n_atoms == (182 if left_out else 183)  # histidine 1 is charged in the file
+
+
+@pytest.mark.parametrize(("name", "residue", "hetero", "symbol"), [
+    ("CL1 ", "00T", False, "Cl"), (" CL ", "LIG", True, "Cl"), ("BR  ", "ABC", False, "Br"), (" CL ", "ALA", True, "C"),
+    (" CLP", "ABC", False, "C"), (" CA ", "ALA", True, "C"), ("SE  ", "MSE", True, "Se"), (" NA ", "HEM", True, "N"),
+])  # fmt: skip
+def test_elements_by_names_where_the_column_is_empty(name: str, residue: str, hetero: bool, symbol: str) -> None:
+    assert element_symbol(name, residue, "", hetero=hetero) == symbol
