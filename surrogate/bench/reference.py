@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import signal
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -201,12 +202,13 @@ class _Workers:
 
 
 def _serve(pipe: Any, number: int, n_workers: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which ends its workers
     end_with_parent()
     setups: dict[str, Setup] = {}
     while True:
         try:
             verb, *arguments = pipe.recv()
-        except (EOFError, KeyboardInterrupt):
+        except EOFError:
             return
         try:
             if verb == "build":

@@ -30,7 +30,7 @@ TYPED = {
     "friction_per_ps": ("0.1/fs", 100.0),
     "timestep_ps": ("2fs", 0.002),
     "hydrogen_mass_da": ("natural", None),
-    "equilibrate_ps": ("1ns", 1000.0),
+    "equilibrate_ps": ("0ps", 0.0),
     "ensemble": ("npt", "npt"),
     "pressure_bar": ("2.5", 2.5),
     "replicas": ("3", 3),
