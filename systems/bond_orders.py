@@ -71,6 +71,8 @@ def perceive(
         rows = [k for k, (i, _) in enumerate(bonds.tolist()) if i in rank]
         own = np.array([[rank[i], rank[j]] for i, j in bonds[rows].tolist()], dtype=np.int64).reshape(-1, 2)
         found = lewis_structure([elements[i] for i in atoms], own)
+        if found is None and positions_nm is not None:  # with every carbon flat, one of them may be an ion
+            found = lewis_structure([elements[i] for i in atoms], own, carbon_ions=True)
         if found is None:
             raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
         if positions_nm is not None:

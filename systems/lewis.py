@@ -31,8 +31,10 @@ _ANY: dict[str, dict[int, tuple[_State, ...]]] = {
 _ANY |= {"Se": _ANY["S"], "Br": _ANY["Cl"], "I": _ANY["Cl"]}
 # Nitrogen between a heavy atom and a terminal one: of azides, diazo groups, nitrile oxides, diazonium.
 _MIDDLE: tuple[_State, ...] = ((3, 0, 0.0), (4, 1, 12.0), (2, -1, 14.0))
+# Four pi electrons of a five-ring take two more (cyclopentadienide); elsewhere a flat carbon is a cation (trityl).
 _CARBENIUM: _State = (3, 1, 25.0)
-_CARBANION: _State = (3, -1, 25.0)
+_CARBANION: _State = (3, -1, 30.0)
+_CYCLOPENTADIENIDE: _State = (3, -1, 20.0)
 _CYANIDE: _State = (3, -1, 20.0)
 _AZIDE_END: _State = (2, -1, 13.0)
 _OXONIUM: _State = (3, 1, 22.0)
@@ -112,7 +114,8 @@ def _states(
     if symbol == "C" and len(near) == 1 and around[0] in (("N", 1), ("N", 2), ("O", 1)):
         states = (_CYANIDE,)
     elif symbol == "C" and carbon_ions:
-        states = (*states, _CARBANION, *((_CARBENIUM,) if len(near) == 3 else ()))
+        anion = _CYCLOPENTADIENIDE if len(near) == 3 and _in_five_ring(graph, i) else _CARBANION
+        states = (*states, anion, *((_CARBENIUM,) if len(near) == 3 else ()))
     elif symbol == "N" and len(near) == 2 and any(e != "H" and degree == 1 for e, degree in around):
         states = _MIDDLE
     elif symbol == "N" and len(near) == 1 and around[0][0] in ("N", "P", "S"):
@@ -134,6 +137,12 @@ def _in_small_ring(graph: nx.Graph, i: int) -> bool:
     a, b = graph[i]
     near = nx.single_source_shortest_path_length(nx.restricted_view(graph, [i], []), a, cutoff=5)
     return b in near
+
+
+def _in_five_ring(graph: nx.Graph, i: int) -> bool:
+    rest = nx.restricted_view(graph, [i], [])
+    reached = {j: nx.single_source_shortest_path_length(rest, j, cutoff=3) for j in graph[i]}
+    return any(reached[j].get(k) == 3 for j in graph[i] for k in graph[i])
 
 
 def _oxonium_rings(elements: Sequence[str], graph: nx.Graph) -> set[int]:

@@ -315,6 +315,9 @@ def test_perceived_orders_and_charges_equal_rdkit(from_smiles: MAKE, smiles: str
         ("F[P-](F)(F)(F)(F)F", -1),
         ("CN(C)c1ccc(cc1)C(=C1C=CC(=[N+](C)C)C=C1)c1ccccc1", 1),
         ("O=C1N(C)C(C)=NC1=Cc1ccc([O-])cc1", -1),
+        ("c1ccc(cc1)[C+](c1ccccc1)c1ccccc1", 1),
+        ("[CH+]1C=CC=CC=C1", 1),
+        ("[CH-]1C=CC=C1", -1),
     ],
 )
 def test_charges_that_no_matching_finds_are_those_of_the_cheapest_lewis_structure(
