@@ -23,15 +23,19 @@ if TYPE_CHECKING:
     from surrogate.judge.ensemble import Ensemble
 
 
+_EQUILIBRATE_PS = 20.0
+
+
 @dataclass(frozen=True)
 class Molecule:
-    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each, frames every ps."""
+    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each after 20 ps unwritten, frames every `every_ps`."""
 
     name: str
     kind: str
     scene: str
     time_ps: float
     n_replicas: int = 6
+    every_ps: float = 1.0
 
 
 MOLECULES = (
@@ -43,11 +47,11 @@ MOLECULES = (
     Molecule("caffeine", "drug", "smiles:Cn1c(=O)c2c(ncn2C)n(C)c1=O", 1000.0),
     Molecule("ibuprofen", "drug", "smiles:CC(C)Cc1ccc(cc1)C(C)C(=O)O", 2000.0),
     Molecule("lidocaine", "drug", "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 2000.0),
-    Molecule("valine", "peptide", "ACE-VAL-NME", 2000.0),
-    Molecule("trialanine", "peptide", "ac-ala3-nhme", 2000.0),
-    Molecule("SDFS", "peptide", "SDFS", 600.0),
-    Molecule("chignolin", "protein", "chignolin", 300.0, 4),
-    Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 100.0, 4),
+    Molecule("valine", "peptide", "ACE-VAL-NME", 2000.0, 3),
+    Molecule("chignolin", "protein", "chignolin", 60.0, 3, 0.2),
+    Molecule("trialanine", "peptide", "ac-ala3-nhme", 300.0, 3),
+    Molecule("SDFS", "peptide", "SDFS", 200.0, 3),
+    Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 20.0, 3, 0.1),
 )
 
 
@@ -59,7 +63,16 @@ def make_runs(molecule: Molecule, folder: Path) -> list[Path]:
     for seed, path in enumerate(paths):
         if not path.exists():
             part = path.with_name(f"{path.stem}.part.h5")
-            api.reference(molecule.scene, part, time_ps=molecule.time_ps, seed=seed, overwrite=True, quiet=True)
+            api.reference(
+                molecule.scene,
+                part,
+                time_ps=molecule.time_ps,
+                save_every_ps=molecule.every_ps,
+                equilibrate_ps=_EQUILIBRATE_PS,
+                seed=seed,
+                overwrite=True,
+                quiet=True,
+            )
             part.rename(path)
     return paths
 

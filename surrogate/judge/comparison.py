@@ -247,7 +247,7 @@ def _judge(
     reference_account: Account,
     account: Account,
 ) -> Judgement:
-    trio, correlation = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
+    trio, correlation, own = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
     trio = replace(trio, temperature_k=temperature_k)
     rows = metrics.validity_rows(trio)
     lengths, bonds = bond_rows(trio)
@@ -261,7 +261,7 @@ def _judge(
     found = verdict.findings(judged)
     truth = trio.reference
     samples = effective_samples(round(trio.compared_ps / truth.features.lag_ps), correlation)
-    doubts = remarks.doubts(trio, samples, correlation)
+    doubts = remarks.doubts(trio, max(correlation, own))
     kind = verdict.status(judged, doubts)
     worth = worths(reference, candidate, replicate, torsions, options)
     words = ""
@@ -322,9 +322,9 @@ def _equal_terms(
     candidate: Features,
     replicate: Features,
     options: Options,
-) -> tuple[Trio, float]:
+) -> tuple[Trio, float, float]:
     """Divide all three into blocks of one length, of which the first of each are as long as the shortest of the three;
-    return them and the slowest time of the truth in frames.
+    return them, and in frames the slowest time of the truth and that of the candidate.
 
     All of a longer reference takes part in the tests, up to `_MOST_TIMES_AS_LONG` times the candidate's length.
     """
@@ -337,13 +337,14 @@ def _equal_terms(
     cut = [f.frames(0, min(f.n_frames, _MOST_TIMES_AS_LONG * n)) for f in (reference, candidate, replicate)]
     # A candidate that never leaves a state must not make the truth's own motion look slow, hence two times.
     slowest = longest_correlation(cut[0], cut[2])
-    each = block_length(n, max(slowest, longest_correlation(cut[1])))
+    own = longest_correlation(cut[1])
+    each = block_length(n, max(slowest, own))
     n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * metrics.FEW_RESIDUES)
     options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
     truth, rolled, other = (
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
     )
-    return Trio(scene, torsions, geometry, truth, rolled, other, options), slowest
+    return Trio(scene, torsions, geometry, truth, rolled, other, options), slowest, own
 
 
 def _worth_words(found: Sequence[Worth], account: Account, reference: Account) -> str:

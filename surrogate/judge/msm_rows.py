@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from surrogate.judge import distributions, msm
 from surrogate.judge.charts import BarChart, Chart, Landscape, Line, LineChart, Role
-from surrogate.judge.kinetics import WITHOUT_TICA, lagged_eigenvalue, timescale
+from surrogate.judge.kinetics import WITHOUT_TICA, lagged_eigenvalue, noise_timescale, timescale
 from surrogate.judge.relaxation import speed_words
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
 from surrogate.judge.slow_motion import tica_features
@@ -60,10 +60,17 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     model = msm.fit_model(projection, coordinates[0], lag)
     if model is None:
         return [], [], [(name, "the reference visits too few states")]
+    noise_ps = lag_ps * noise_timescale(len(model.centres), lag, trio.reference.features.n_frames)
+    if not len(model.timescales) or lag_ps * model.timescales[0] < noise_ps:
+        return [], [], [(name, "its slowest process cannot be told from noise")]
     states = [_states(model, s, x) for s, x in zip(trio.samples, coordinates, strict=True)]
     names = state_names(trio, states[0].macro, model.n_states)
-    rows = [_population_row(trio, states), _transition_row(trio, states, format_time_ps(lag * lag_ps))]
-    timescales, skipped = _timescale_rows(trio, model, states, names)
+    rows = [_population_row(trio, states)]
+    timescales, skipped = _timescale_rows(trio, model, states, names, noise_ps)
+    if all(s.transitions.sum() for s in states):
+        rows.append(_transition_row(trio, states, format_time_ps(lag * lag_ps)))
+    else:
+        skipped.append(("Transitions between metastable states", "one of the trajectories is in none of them"))
     rows += timescales
     charts: list[Chart] = [*_landscape(trio, states), _free_energies(trio, model, states, names)]
     charts += [_check_chart(trio, model, s, role) for s, role in zip(states[:2], ROLES, strict=False)]
@@ -144,7 +151,7 @@ def _states_of(model: msm.Model, function: FloatArray, counts: FloatArray) -> np
 
 
 def _timescale_rows(
-    trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]
+    trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str], noise_ps: float
 ) -> tuple[list[Row], list[Skipped]]:
     """Return a row for each slow process of the reference, and those that the candidate's data say nothing about.
 
@@ -168,6 +175,9 @@ def _timescale_rows(
             continue
         sums = [msm.function_sums(s.micro_counts, function) for s in states]
         values = [float(timescale(lagged_eigenvalue(own), lag)) for own in sums]
+        if values[0] < noise_ps:
+            skipped.append((metric, f"{values[0]:.2g} ps: cannot be told from noise at this lag"))
+            continue
         draws = [timescale(lagged_eigenvalue(own, s.sample.weights), lag) for own, s in zip(sums, states, strict=True)]
         if missing_in_replicate.any():
             values[2], draws[2] = math.nan, np.full_like(draws[2], np.nan)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from surrogate.judge import curves, distributions, kinetics
 from surrogate.judge.rows import Row, Sample, Trio, distance_row, observable_row
 from surrogate.judge.slow_motion import SLOW_KINDS, tica_features
-from surrogate.judge.statistics import Estimate, difference_p, estimate
+from surrogate.judge.statistics import Estimate, difference_p, estimate, widening
 from surrogate.judge.structure import Features
 from systems.units import format_time_ps
 
@@ -22,6 +22,7 @@ Skipped = tuple[str, str]
 MAX_DRAWN_LAGS = 240
 _MIN_BOUNDARIES = 20
 _MOST_RELAXING = 6
+_SHARE_OF_WINDOW = 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +122,31 @@ def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: 
         drawn = kinetics.autocorrelation(sums, sample.weights[start : start + batch])
         times.append(kinetics.correlation_time(drawn))
         values.append(drawn[:, kept])
-    return _Correlated(
-        curve, float(kinetics.correlation_time(curve)), np.concatenate(times), kept, np.concatenate(values)
-    )
+    time = float(kinetics.correlation_time(curve))
+    below = np.flatnonzero(~(curve > 0))
+    crossing = int(below[0]) if len(below) else n_lags
+    draws = _widened(np.concatenate(times), sample.blocks.n_blocks, crossing, sum(map(len, series)))
+    return _Correlated(curve, time, draws, kept, np.concatenate(values))
+
+
+def _widened(draws: FloatArray, n_blocks: int, crossing: int, n_frames: int) -> FloatArray:
+    """Return bootstrap draws of an integrated autocorrelation time, spread as the sum over so many lags is at least.
+
+    Blocks cut off what is remembered beyond them, so that their draws know too little of the tail: the relative
+    variance of a sum to lag W over n frames is 2 (2 W + 1) / n (Madras and Sokal, J. Stat. Phys. 50, 109, 1988), of
+    which `_SHARE_OF_WINDOW` is left where the window ends at the first zero (measured on series of known time).
+    """
+    known = np.isfinite(draws) & (draws > 0)
+    if known.sum() < 2 or n_blocks < 2:
+        return draws
+    logs = np.log(draws[known])
+    spread = float(logs.std()) * widening(n_blocks)
+    least = _SHARE_OF_WINDOW * math.sqrt(2.0 * (2.0 * crossing + 1.0) / n_frames)
+    if not 0.0 < spread < least:
+        return draws
+    out = draws.copy()
+    out[known] = np.exp(logs.mean() + (logs - logs.mean()) * least / spread)
+    return out
 
 
 def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
@@ -204,6 +227,7 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
         sums = kinetics.pair_sums(series, sample.blocks, lag)
         values.append(float(kinetics.timescale(kinetics.lagged_eigenvalue(sums), lag * lag_ps)))
         draws.append(kinetics.timescale(kinetics.lagged_eigenvalue(sums, sample.weights), lag * lag_ps))
+    skipped: list[Skipped] = []
     bins = distributions.reference_bins(projected[0])
     counts = [
         distributions.block_counts(series, bins, sample.blocks)
@@ -232,7 +256,11 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
             log=True,
         ),
     ]
-    return rows, [curves.histogram(trio, projected, bins, "TIC 0", "")], []
+    noise = kinetics.noise_timescale(features[0][0].shape[1], lag, trio.reference.features.n_frames)
+    if values[0] < lag_ps * noise:
+        rows.pop()
+        skipped.append((f"Timescale of {name}", "it cannot be told from noise"))
+    return rows, [curves.histogram(trio, projected, bins, "TIC 0", "")], skipped
 
 
 def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from surrogate.judge import metrics, verdict
 from surrogate.judge.rows import Options, Row, Trio
 from surrogate.judge.slow_motion import rarely_crossed
+from surrogate.judge.statistics import effective_samples
 from surrogate.judge.structure import Features
 from surrogate.judge.suspicions import copied_from
 from systems import validity
@@ -28,10 +29,11 @@ def trimming(trio: Trio, reference: Features, candidate: Features, replicate: Fe
     ]
 
 
-def doubts(trio: Trio, samples: float, correlation: float) -> verdict.Doubts:
-    """Return which slow motions are not sampled, in words."""
+def doubts(trio: Trio, correlation: float) -> verdict.Doubts:
+    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any trajectory, frames."""
     short = lost = ""
     lag_ps = trio.reference.features.lag_ps
+    samples = effective_samples(round(trio.compared_ps / lag_ps), correlation)
     if samples < LEAST_SAMPLES:
         short = (
             f"the slowest motion is remembered for {format_time_ps(float(f'{correlation * lag_ps:.2g}'))}, which "

@@ -35,7 +35,7 @@ def within_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     if not (len(trio.torsions.phi) or len(trio.torsions.psi) or _rotatable(trio)):
         return [], [], [("Steps of torsions from frame to frame", "the scene has no torsion to turn about")]
     skipped: list[Skipped] = []
-    rows = []
+    rows: list[Row | None] = []
     states = slow_states(trio)
     if are_many(trio):
         skipped.append(("φ given ψ's basin", f"{len(trio.torsions.residues)} residues share their rows"))
@@ -43,8 +43,10 @@ def within_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
         rows += [_phi_row(trio, residue.phi, residue.psi, residue.label) for residue in trio.torsions.residues]
     elif len(_rotatable(trio)) > 1:
         rows.append(_given_slowest(trio, states))
+    if None in rows:
+        skipped.append(("Torsions within the states of slower ones", "the three trajectories share none of them"))
     step = _step_row(trio, states)
-    return [*rows, step], [], skipped
+    return [*(row for row in rows if row is not None), step], [], skipped
 
 
 def _rotatable(trio: Trio) -> list[int]:
@@ -52,7 +54,7 @@ def _rotatable(trio: Trio) -> list[int]:
     return [] if probes is None else [k for k, t in enumerate(probes.torsions) if t.kind in SLOW_KINDS]
 
 
-def _phi_row(trio: Trio, phi: int, psi: int, label: str) -> Row:
+def _phi_row(trio: Trio, phi: int, psi: int, label: str) -> Row | None:
     """The two basins of psi with phi < 0, and what else there is: a third state that is slow in itself, left out."""
     angles = [[x[:, phi] for x in s.features.phi] for s in trio.samples]
     states = [
@@ -72,7 +74,7 @@ def _phi_row(trio: Trio, phi: int, psi: int, label: str) -> Row:
     )
 
 
-def _given_slowest(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row:
+def _given_slowest(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row | None:
     columns = _rotatable(trio)[:_MOST_TORSIONS]
     angles = [[[x[:, k] for x in s.features.series["torsions"]] for s in trio.samples] for k in columns]
     return _conditional_row(
@@ -93,15 +95,19 @@ def _conditional_row(
     key: str,
     metric: str,
     what: str,
-) -> Row:
-    """`angles`: for each torsion those of (reference, candidate, replicate); `states`: of each frame, -1 for none."""
+) -> Row | None:
+    """`angles`: for each torsion those of (reference, candidate, replicate); `states`: of each frame, -1 for none. None
+    where no state holds one frame in twenty of each of the three."""
+    shares = [np.bincount(np.concatenate(list(s)) + 1, minlength=2) / sum(map(len, s)) for s in states]
+    n_states = min(map(len, shares)) - 1
+    kept = [k for k in range(n_states) if min(share[k + 1] for share in shares) >= _LEAST_SHARE]
+    if not kept:
+        return None
     slowest, chosen = -1.0, trio
     for three in angles:
         fine = with_own_blocks(trio, residuals([[np.cos(x.astype(np.float64)) for x in v] for v in three], states))
         if fine.reference.blocks.n_frames_each > slowest:
             slowest, chosen = fine.reference.blocks.n_frames_each, fine
-    truth = np.concatenate([*states[0], *states[2]])
-    kept = [k for k in np.unique(truth[truth >= 0]).tolist() if (truth == k).mean() >= _LEAST_SHARE]
     counts, strata = [], []
     for which, sample in enumerate(chosen.samples):
         masked = [

@@ -56,7 +56,8 @@ class Worth:
         length = format_time_ps(_round(self.worth_ps))
         if self.bound == "less than" or (self.bound == "at least" and self.low_ps is None):
             return f"{self.bound} {length}"
-        unit, factor = next((u for u in _UNITS if self.worth_ps >= u[1]), _UNITS[-1])
+        longest = self.worth_ps if self.bound else self.lengths_ps[-1] if self.high_ps is None else self.high_ps
+        unit, factor = next((u for u in _UNITS if longest >= u[1]), _UNITS[-1])
 
         def words(time_ps: float) -> str:
             return f"{float(f'{time_ps / factor:.2g}'):g} {unit}"

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surrogate.judge import kinetics, relaxation
 from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.ensemble import Ensemble, load_ensemble
 from surrogate.judge.rows import Options
 from surrogate.judge.slow_motion import longest_correlation, rarely_crossed
-from surrogate.judge.statistics import permutation_p
+from surrogate.judge.statistics import block_length, bootstrap_weights, estimate, make_blocks, permutation_p
 from surrogate.judge.structure import Features
 
 OPTIONS = Options(peptide_recipe=False)
@@ -82,7 +83,8 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     from surrogate.judge.within_rows import within_rows
 
     torsions, geometry = structure.backbone(reference.scene), structure.reference_geometry(reference)
-    trio, _ = comparison._equal_terms(reference.scene, torsions, geometry, measured[0], candidate, measured[2], OPTIONS)
+    three = (measured[0], candidate, measured[2])
+    trio = comparison._equal_terms(reference.scene, torsions, geometry, *three, OPTIONS)[0]
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
 
 
@@ -131,6 +133,30 @@ def test_the_slowest_motion_is_found_whatever_the_molecule() -> None:
     assert fast < 5 and slow == pytest.approx(100, rel=0.5), "two states of a mean stay of 200 frames: 100 frames"
     stuck = longest_correlation(*(torsion_features(two_states(k, 2_000, 1e9, k)) for k in (0, 1)))
     assert stuck > 500, "two runs that stay apart have not sampled what lies between"
+
+
+def test_intervals_of_relaxation_times_hold_what_they_say() -> None:
+    """Two states with a mean stay of 200 frames, 10,000 frames: some fifty independent samples."""
+    rng = np.random.default_rng(3)
+    dwell, noise, n, n_trials = 200.0, 0.5, 10_000, 60
+    a = 1 - 2 / dwell
+    truth = 0.5 + a / (1 - a) / (1 + noise**2)
+    held, plain = 0, 0
+    for _ in range(n_trials):
+        state = np.cumsum(rng.random(n) < 1 / dwell) % 2
+        series = [2.0 * state - 1.0 + noise * rng.standard_normal(n)]
+        crossing, time = kinetics.zero_crossing(series)
+        blocks = make_blocks([n], block_length(n, time))
+        weights = bootstrap_weights(blocks.n_blocks, 200, rng)
+        sums = kinetics.lag_sums(series, blocks, 3 * crossing + 2)
+        draws = kinetics.correlation_time(kinetics.autocorrelation(sums, weights))
+        wide = relaxation._widened(draws, blocks.n_blocks, crossing, n)
+        for k, d in enumerate((wide, draws)):
+            found = estimate(time, d, blocks.n_blocks, log=True)
+            inside = found.low <= truth <= found.high
+            held, plain = held + (inside and k == 0), plain + (inside and k == 1)
+    assert held >= 54, "95 % of 60; fewer than 54 is chance once in 200 times"
+    assert plain <= held, "negative control: the bootstrap alone holds it less often"
 
 
 def test_states_that_no_run_passes_between_are_told_from_a_wrong_population() -> None:
