@@ -28,7 +28,7 @@ _EQUILIBRATE_PS = 20.0
 
 @dataclass(frozen=True)
 class Molecule:
-    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each after 20 ps unwritten, frames every `every_ps`."""
+    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each, a frame every `every_ps`."""
 
     name: str
     kind: str
