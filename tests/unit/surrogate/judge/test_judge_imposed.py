@@ -19,7 +19,7 @@ from systems.trajectory import open_writer
 
 QUICK = Options(n_bootstrap=60, n_permutations=20, peptide_recipe=False)
 _IMPOSED = {"bond_shift", "bond_width:flexible bonds", "bond_jsd", "bond_wasserstein",
-            "angle_shift", "angle_jsd", "angle_wasserstein"}  # fmt: skip
+            "angle_shift", "angle_jsd", "angle_wasserstein", "temperature"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
