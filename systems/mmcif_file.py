@@ -93,15 +93,17 @@ def _read_mmcif(text: str, path: Path) -> StructureFile:
 
 
 def addressed(ends: Iterable[Sequence[Address]], atoms: Sequence[AtomRecord]) -> set[tuple[int, int]]:
-    """Return the index pairs of atoms that are named by chain, residue and name; of alternates, the first."""
-    index: dict[Address, int] = {}
+    """Return the index pairs of atoms named by chain, residue and name; of alternates, those that go together."""
+    index: dict[Address, list[int]] = {}
     for i, atom in enumerate(atoms):
-        index.setdefault((atom.chain, atom.residue_id, atom.residue_name, atom.name), i)
+        index.setdefault((*atom.residue_key, atom.name), []).append(i)
     pairs = set()
     for first, second in ends:
-        i, j = index.get(first, -1), index.get(second, -1)
-        if min(i, j) >= 0 and i != j:
-            pairs.add((min(i, j), max(i, j)))
+        for i in index.get(first, ()):
+            for j in index.get(second, ()):
+                labels = {atoms[i].altloc, atoms[j].altloc} - {""}
+                if i != j and len(labels) < 2:
+                    pairs.add((min(i, j), max(i, j)))
     return pairs
 
 

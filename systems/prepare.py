@@ -281,13 +281,13 @@ def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomReco
 
 
 def _refuse_long_double_bonds(scene: Scene) -> None:
-    """Two carbons that each lack a hydrogen look like a double bond; its length tells."""
+    """Two carbons that each lack a hydrogen look like a double bond, methanol without any like C≡O; lengths tell."""
     for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
-        if order >= 2 and scene.elements[i] == scene.elements[j] == "C":
+        if order >= 3 or (order >= 2 and scene.elements[i] == scene.elements[j] == "C"):
             length = float(np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j]))
-            if length > 0.150:
+            if length > (0.150 if order < 3 else 0.130):
                 a, b = (f"{scene.residue_names[scene.residue_of_atom[k]]} {scene.atom_names[k]}" for k in (i, j))
                 raise PreparationError(
-                    f"{a} and {b} lack hydrogens (a double bond of {length * 10:.2f} Å is none); "
-                    "give the structure with all hydrogens."
+                    f"{a} and {b} lack hydrogens (a {'double' if order < 3 else 'triple'} bond of {length * 10:.2f} Å "
+                    "is none); give the structure with all hydrogens."
                 )

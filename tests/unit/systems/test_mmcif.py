@@ -8,6 +8,7 @@ import pytest
 
 from systems import library
 from systems.errors import InputError, PreparationError
+from systems.pdb_records import read_structure
 from systems.prepare import prepare
 
 ALA2 = library.load("alanine-dipeptide")
@@ -159,3 +160,22 @@ def test_faults_beside_the_atoms_do_no_harm_and_those_among_them_do(tmp_path: Pa
         if old in text:
             with pytest.raises(InputError, match=r"x.cif"):
                 prepare(str(path))
+
+
+def test_a_stated_link_holds_for_the_alternate_that_stays(tmp_path: Path) -> None:
+    link = (
+        "loop_ _struct_conn.conn_type_id _struct_conn.ptnr1_auth_asym_id _struct_conn.ptnr1_auth_seq_id "
+        "_struct_conn.ptnr1_auth_comp_id _struct_conn.ptnr1_label_atom_id _struct_conn.ptnr2_auth_asym_id "
+        "_struct_conn.ptnr2_auth_seq_id _struct_conn.ptnr2_auth_comp_id _struct_conn.ptnr2_label_atom_id "
+        "_struct_conn.ptnr2_symmetry covale X 101 ALA CB X 301 LIG C1 ? metalc X 101 ALA O X 301 LIG C1 ?"
+    )
+    rows = [row.replace(" B ", " ? ") for row in _peptide()]
+    beta = ALA2.positions_nm[ALA2.atom_names.index("CB")] * 10
+    for alt, occupancy, shift in (("A", 0.3, 1.6), ("B", 0.7, 1.5)):
+        rows.append(
+            _row(40, "C1", "LIG", "301", (beta[0], beta[1], beta[2] + shift), "C", alt=alt, occupancy=occupancy)
+        )
+    path = Path(_write(tmp_path / "x.cif", rows))
+    path.write_text(path.read_text() + link)
+    cb = ALA2.atom_names.index("CB")
+    assert read_structure(path).conect == [(cb, 22), (cb, 23)]

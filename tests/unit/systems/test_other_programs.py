@@ -177,3 +177,11 @@ def test_a_lactam_keeps_what_it_lost(shared_data: Path, tmp_path: Path, left_out
 ])  # fmt: skip
 def test_elements_by_names_where_the_column_is_empty(name: str, residue: str, hetero: bool, symbol: str) -> None:
     assert element_symbol(name, residue, "", hetero=hetero) == symbol
+
+
+def test_methanol_without_hydrogens_is_no_carbon_monoxide(tmp_path: Path) -> None:
+    lines = ["HETATM{:5d}  {:<3s} MOH A   1    {:8.3f}   0.000   0.000  1.00  0.00           {}".format(*row)
+             for row in ((1, "C", 0.0, "C"), (2, "O", 1.41, "O"))]  # fmt: skip
+    with pytest.raises(PreparationError, match=r"lack hydrogens \(a triple bond of 1.41 Å is none\)"):
+        read(tmp_path, lines)
+    assert read(tmp_path, [lines[0], lines[1].replace("1.410", "1.130")]).n_atoms == 2
