@@ -18,6 +18,7 @@ from surrogate.cli_options import (
     DeviceOpt,
     EnergyEveryOpt,
     EntitiesOpt,
+    FailOn,
     ForceOpt,
     Guard,
     GuardOpt,
@@ -400,11 +401,23 @@ def compare(
         "report.html"
     ),
     replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
-    top: Annotated[Path | None, typer.Option("--top", help="Topology of files that carry none.")] = None,
-    lag: Annotated[str | None, typer.Option("--lag", help="Time between frames, where a file does not say.")] = None,
+    top: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--top", help="Topology of files without one: once for all, or for REF, each TRAJ, the replicate."
+        ),
+    ] = None,
+    lag: Annotated[
+        list[str] | None,
+        typer.Option("--lag", help="Time between frames, where a file does not say; as --top. '-' leaves one out."),
+    ] = None,
     energies: Annotated[
         bool, typer.Option("--energies", help="Energies of every k-th frame too, by the reference's force field.")
     ] = False,
+    show_all: Annotated[bool, typer.Option("--all", help="Print every row, not the verdict alone.")] = False,
+    fail_on: Annotated[
+        FailOn | None, typer.Option("--fail-on", help="Exit 1 when a candidate is judged so, or worse.")
+    ] = None,
     overwrite: OverwriteOpt = False,
     quiet: QuietOpt = False,
     as_json: JsonOpt = False,
@@ -417,12 +430,15 @@ def compare(
         candidates,
         out,
         replicate=replicate,
-        top=top,
-        lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
+        top=None if not top else [None if x == "-" else x for x in top],
+        lag_ps=None if not lag else [None if x == "-" else parse_time_ps(x, "--lag") for x in lag],
         energies=energies,
         overwrite=overwrite,
     )
-    print_comparison(result, out, as_json=as_json, quiet=quiet)
+    print_comparison(result, out, as_json=as_json, quiet=quiet, show_all=show_all)
+    bad = {FailOn.different: ("different", "broken"), FailOn.broken: ("broken",)}
+    if fail_on is not None and any(j.status in bad[fail_on] for j in result.judgements):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -32,6 +32,11 @@ class Stiff(StrEnum):
     imposed = "imposed"
 
 
+class FailOn(StrEnum):
+    different = "different"
+    broken = "broken"
+
+
 class Precision(StrEnum):
     auto = "auto"
     fp32 = "fp32"

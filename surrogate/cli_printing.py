@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison
+    from surrogate.judge.comparison import Comparison, Judgement
 
 
 def print_json(value: Any) -> None:
@@ -77,18 +77,18 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
                 typer.echo(f"  {line}")
 
 
-def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool) -> None:
-    """Print each candidate's verdict and its figures between reference and replicate."""
+def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool, show_all: bool = False) -> None:
+    """Print each candidate's verdict, what is wrong with it and what it is worth; with `show_all` every row between
+    reference and replicate."""
     if as_json:
         print_json(result.to_dict())
         return
     for judgement in () if quiet else result.judgements:
         typer.echo(f"{judgement.account.label}: {judgement.verdict}")
-        typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
-        for row in judgement.rows:
-            figures = (row.reference, row.candidate, row.replicate)
-            numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
-            typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
+        for finding in judgement.findings:
+            typer.echo(f"  - {finding}")
+        if show_all:
+            _print_rows(judgement)
         if judgement.speed_ratio is not None:
             typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
         for note in judgement.notes:
@@ -96,3 +96,11 @@ def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: 
     for note in () if quiet else result.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"report: {report}")
+
+
+def _print_rows(judgement: Judgement) -> None:
+    typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+    for row in judgement.rows:
+        figures = (row.reference, row.candidate, row.replicate)
+        numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
+        typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")

@@ -25,8 +25,8 @@ def compare(
     out_html: PathLike | None = None,
     *,
     replicate: Trajectories | None = None,
-    top: PathLike | None = None,
-    lag_ps: Quantity | None = None,
+    top: PathLike | Sequence[PathLike | None] | None = None,
+    lag_ps: Quantity | Sequence[Quantity | None] | None = None,
     labels: str | Sequence[str] | None = None,
     energies: bool = False,
     overwrite: bool = False,
@@ -36,9 +36,10 @@ def compare(
     The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
     `candidates` is one candidate, and a sequence holds one each. `top`: topology for
-    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. `energies`:
-    judge the potential energy of every k-th frame too, by the force field that the reference's file names. A report
-    that is there stays unless `overwrite`.
+    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
+    stands for all, or there is one for the reference, each candidate and the replicate in this order, None where the
+    file says it itself. `energies`: judge the potential energy of every k-th frame too, by the force field that the
+    reference's file names. A report that is there stays unless `overwrite`.
     Raises InputError, TrajectoryError, OutOfDomainError.
     """
     from surrogate.judge.comparison import compare as judge
@@ -47,7 +48,6 @@ def compare(
     if isinstance(candidates, str | Path):
         candidates = [candidates]
     labels = [labels] if isinstance(labels, str) else labels
-    lag_ps = quantity("lag_ps", lag_ps)
     if not candidates:
         raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
     if labels is not None and len(labels) != len(candidates):
@@ -56,20 +56,23 @@ def compare(
         page = Path(out_html)
         check_outputs([page], [".html"], overwrite=overwrite)
         check_outputs([page.with_suffix(".json"), page.with_suffix(".md")], [".json", ".md"], overwrite=overwrite)
-    truth = load_ensemble(find_trajectories(reference), top=top, lag_ps=lag_ps)
+    n = 1 + len(candidates) + (replicate is not None)
+    tops = _one_each("top", top, n)
+    lags = [None if x is None else quantity("lag_ps", x) for x in _one_each("lag_ps", lag_ps, n)]
+    truth = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
     others = [
         load_ensemble(
             find_trajectories(candidate),
             label=labels[k] if labels else None,
             template=truth.scene,
-            top=top,
-            lag_ps=lag_ps,
+            top=tops[1 + k],
+            lag_ps=lags[1 + k],
         )
         for k, candidate in enumerate(candidates)
     ]
     floor = None
     if replicate is not None:
-        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=top, lag_ps=lag_ps)
+        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=tops[-1], lag_ps=lags[-1])
     energy_fn = _relaxed_energy(truth.scene, truth.record) if energies else None
     result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
     if out_html is not None:
@@ -77,6 +80,21 @@ def compare(
 
         write_report(result, Path(out_html))
     return result
+
+
+def _one_each(name: str, given: Any, n: int) -> list[Any]:
+    """Return what is said of each of `n` trajectories, one value standing for all. Raises InputError."""
+    if given is None or isinstance(given, str | Path | float | int):
+        return [given] * n
+    values = list(given)
+    if len(values) == 1:
+        return values * n
+    if len(values) != n:
+        raise InputError(
+            f"{len(values)} values of {name} for {n} trajectories: give one for all, or one for the reference, each "
+            "candidate and the replicate, in this order."
+        )
+    return values
 
 
 def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
