@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from itertools import groupby
@@ -31,9 +32,12 @@ def is_water(atoms: Sequence[AtomRecord]) -> bool:
         return False
     if len(hydrogens) < 2 * len(oxygens):
         return is_water_name(atoms[0].residue_name) and (not hydrogens or len(oxygens) == 1)
-    gaps = np.linalg.norm(np.subtract(np.array(hydrogens)[:, None], np.array(oxygens)[None]), axis=2)
-    owners = Counter(gaps.argmin(axis=1).tolist())
-    return bool((gaps.min(axis=1) < _WATER_BOND_ANGSTROM).all()) and set(owners.values()) == {2}
+    if len(oxygens) == 1:  # of a box of water, each
+        return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < _WATER_BOND_ANGSTROM for h in hydrogens)
+    from scipy.spatial import cKDTree
+
+    gaps, owners = cKDTree(oxygens).query(hydrogens)
+    return bool((gaps < _WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
 
 
 def settle_solvent(
