@@ -252,7 +252,10 @@ def train(
     if arch not in FITTED and is_first_process():
         from surrogate.training_verdicts import judge_training, write_verdict
 
-        verdict = judge_training(written)
+        try:
+            verdict = judge_training(written)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
         write_verdict(written, verdict)
         if not quiet:
             for line in verdict.lines():
