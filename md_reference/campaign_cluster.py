@@ -29,6 +29,7 @@ _CLASSES = {
     "local": "LocalCluster",
 }
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
+_NO_PAGES = {"DASK_DISTRIBUTED__WORKER__HTTP__ROUTES": "[]"}
 # So long a scheduler may take to answer.
 _ANSWER_S = 20.0
 _PRELOAD = "md_reference.campaign_worker"
@@ -45,14 +46,20 @@ def open_client(
 ) -> Iterator[Any]:
     """Yield a `distributed.Client` and close what was started for it. An interruption waits until all is started.
 
-    `scheduler` (tcp://host:port) goes before `cluster`, and both before local workers, one thread each (`workers`, as
-    many as there are cores by default). Raises InputError when no scheduler answers or dask-jobqueue is not installed.
+    `scheduler` (tls://host:port, or tcp:// if its owner wants no lock) goes before `cluster`, and both before local
+    workers, one thread each (`workers`, as many as there are cores by default). Who can reach a scheduler runs code as
+    its user, so what is started here talks by TLS with a certificate of its own, which nobody else has, on one network
+    interface, local workers on the loopback, and shows no status page unless `[cluster] dashboard` asks for one.
+    Raises InputError when no scheduler answers or dask-jobqueue is not installed.
     """
     _refuse_both(workers, scheduler)
     import dask
     from distributed import Client
 
-    with _quiet(), dask.config.set({"distributed.scheduler.allowed-failures": retries}), ExitStack() as stack:
+    settings = {"distributed.scheduler.allowed-failures": retries, "distributed.worker.http.routes": []}
+    if cluster is None or not cluster.dashboard:
+        settings["distributed.scheduler.http.routes"] = []
+    with _quiet(), dask.config.set(settings), ExitStack() as stack:
         if scheduler is not None:
             try:
                 client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S, set_as_default=False))
@@ -89,10 +96,13 @@ def _quiet() -> Iterator[None]:
 
 
 def _local(workers: int) -> Any:
-    from distributed import LocalCluster
+    from distributed import LocalCluster, Security
 
     return LocalCluster(
         n_workers=workers,
+        host="127.0.0.1",
+        protocol="tls://",
+        security=Security.temporary(),
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
@@ -113,8 +123,9 @@ def _jobs(spec: ClusterSpec, folder: Path) -> Any:
 def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     """Return dask-jobqueue's cluster for the `[cluster]` table, without any job yet (`job_script()` shows one).
 
-    Each of its jobs holds `cores` worker processes of one thread. Raises InputError where dask-jobqueue is
-    not installed or refuses an entry.
+    Each of its jobs holds `cores` worker processes of one thread. The certificate by which scheduler and workers know
+    each other lies in the folder of the jobs' logs, readable for this user alone, until the cluster is closed. Raises
+    InputError where dask-jobqueue is not installed or refuses an entry.
     """
     on_ctrl_c = signal.getsignal(signal.SIGINT)
     try:
@@ -126,28 +137,40 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
         # Importing dask-jobqueue makes Ctrl-C a silent success of the whole program.
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, on_ctrl_c)
-    one_thread = [f"{name}={value}" for name, value in _ONE_THREAD.items()]
+    from distributed import Security
+    from distributed.utils import get_ip
+
+    one_thread = [f"{name}={value}" for name, value in (_ONE_THREAD | _NO_PAGES).items()]
     python, prologue = spec.python, [*(f"export {entry}" for entry in one_thread), *spec.prologue]
     if spec.kind == "local":
         # Its jobs are started without a shell: the command is all there can be.
         if spec.prologue:
             raise InputError("[cluster] local takes no prologue; what it holds must be done before surromd is started.")
         python, prologue = " ".join(["env", *one_thread, spec.python or sys.executable]), []
+    logs = (folder / JOB_LOGS).resolve()
+    logs.mkdir(parents=True, exist_ok=True)
+    scheduler: dict[str, Any] = {"dashboard": bool(spec.dashboard), "dashboard_address": spec.dashboard or None}
+    if not spec.interface:
+        scheduler["host"] = "127.0.0.1" if spec.kind == "local" else get_ip()
     arguments: dict[str, Any] = {
+        "protocol": "tls://",
+        "security": Security.temporary(),
+        "shared_temp_directory": str(logs),
+        "scheduler_options": scheduler,
         "cores": spec.cores,
         "processes": spec.cores,
         "memory": spec.memory,
         "job_extra_directives": list(spec.directives),
         "job_script_prologue": prologue,
-        "worker_extra_args": ["--preload", _PRELOAD],
-        "log_directory": str((folder / JOB_LOGS).resolve()),
+        "worker_extra_args": ["--preload", _PRELOAD, "--no-dashboard"],
+        "log_directory": str(logs),
     }
     named = ("walltime", "queue", "account", "interface")
     arguments |= {key: value for key in named if (value := getattr(spec, key))}
     if python:
         arguments["python"] = python
     try:
-        return getattr(classes, _CLASSES[spec.kind])(scheduler_options={"dashboard_address": ":0"}, **arguments)
+        return getattr(classes, _CLASSES[spec.kind])(**arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
     except OSError as error:

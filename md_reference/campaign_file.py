@@ -51,7 +51,11 @@ class Run:
 
 @dataclass(frozen=True)
 class ClusterSpec:
-    """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time."""
+    """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
+
+    `interface`: the network interface on which scheduler and workers talk. `dashboard`: where Dask's status page is to
+    be shown (`127.0.0.1:8787`); whoever can reach it sees it. Without it there is none.
+    """
 
     kind: str
     jobs: int = 1
@@ -61,6 +65,7 @@ class ClusterSpec:
     queue: str = ""
     account: str = ""
     interface: str = ""
+    dashboard: str = ""
     python: str = ""
     directives: tuple[str, ...] = ()
     prologue: tuple[str, ...] = ()

@@ -20,13 +20,12 @@ from md_reference.summary import summarise
 from systems.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
+    CheckpointFile,
     checkpoint_path,
     last_supported,
     new_header,
-    write_checkpoint,
     writer_at,
 )
-from systems.checksums import packed
 from systems.claim import claimed_outputs
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
@@ -114,7 +113,7 @@ class _Run:
         self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
         if kept is not None:
             check_same_run(self.header["config"], config, out)
-        self.last_state = packed(*kept) if kept else b""
+        self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
         self.asked_to_stop: Callable[[], bool] = lambda: False
         self.preparing: PreparingFn = lambda _: None
         self.done = int(self.header["files"][0]["n_frames"])
@@ -229,7 +228,7 @@ class _Run:
         return taken
 
     def save(self, engine: Engine, **more: Any) -> None:
-        """Write the checkpoint, which keeps the state before this one, too."""
+        """Write the checkpoint."""
         said = {
             "config": settings_of(self.config),
             "wall_s": self.wall_s,
@@ -237,8 +236,7 @@ class _Run:
             "threads": engine.threads,
         }
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
-        path = checkpoint_path(self.out)
-        self.last_state = write_checkpoint(path, self.header, engine.checkpoint(), before=self.last_state)
+        self.checkpoint.write(self.header, engine.checkpoint())
         self.saved_at = time.monotonic()
 
     def produce(self, engine: Engine, writer: TrajectoryWriter, progress: ProgressFn | None) -> None:

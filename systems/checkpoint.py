@@ -33,14 +33,24 @@ def new_header(n_files: int, *, overwrite: bool) -> dict[str, Any]:
     return {"run_id": uuid.uuid4().hex, "overwrite": overwrite, "files": [{"n_frames": 0, "digest": ""}] * n_files}
 
 
-def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes, *, before: bytes = b"") -> bytes:
-    """Replace the checkpoint as a whole; it is on the medium when this returns. Raises StorageError: the old one stays.
+class CheckpointFile:
+    """The checkpoint of a run: its last state, and the last before its trajectories had the frames that they have now.
 
-    `header`: a `new_header` kept up to date, and more that is JSON. Returns what to give as `before` next time.
+    That one is gone on from when the power fails and the medium turns out to be one append behind.
     """
-    part = packed(header, blob)
-    create_whole(path, _MAGIC + part + before)
-    return part
+
+    def __init__(self, path: Path, kept: Checkpoint | None) -> None:
+        self.path = path
+        self._states = [] if kept is None else [(kept[0]["files"], packed(*kept))]
+
+    def write(self, header: dict[str, Any], blob: bytes) -> None:
+        """Replace the file as a whole; it is on the medium when this returns. Raises StorageError: the old one stays.
+
+        `header`: a `new_header` kept up to date, and more that is JSON.
+        """
+        before = [state for state in self._states if state[0] != header["files"]][:1]
+        self._states = [(header["files"], packed(header, blob)), *before]
+        create_whole(self.path, _MAGIC + b"".join(part for _, part in self._states))
 
 
 def refuse_foreign(path: Path) -> None:

@@ -133,6 +133,10 @@ def create_store(
         for name in checksums:
             add_column(file, f"{CHECKSUMS}/{name}", 0, "<u4")
         lay_out(file)
+    if (
+        path.exists() and journal_path(path).exists()
+    ):  # of the file that is about to be replaced, perhaps by one of the same run
+        AtomicFile(path, writable=True).close()
     create_whole(path, image.getvalue())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.account import Tally
-from systems.checkpoint import Checkpoint, write_checkpoint
+from systems.checkpoint import Checkpoint
 from systems.errors import InputError
 
 Float32Array = npt.NDArray[np.float32]
@@ -46,13 +46,13 @@ class Progress:
     tallies: list[Tally] = field(default_factory=list)
 
 
-def save_progress(path: Path, progress: Progress, header: dict[str, Any], *, before: bytes = b"") -> bytes:
-    """Write a checkpoint whole or not at all; the rest as `systems.checkpoint.write_checkpoint`."""
+def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
+    """Return what a checkpoint keeps of a rollout: JSON for its header, and arrays."""
     arrays: dict[str, Any] = {k: v for k, v in vars(progress).items() if isinstance(v, np.ndarray)}
     plain = {k: v for k, v in asdict(progress).items() if k not in arrays}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
-    return write_checkpoint(path, {**header, "progress": plain}, buffer.getvalue(), before=before)
+    return plain, buffer.getvalue()
 
 
 def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) -> Progress:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.account import Clock, Tally
-from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
+from surrogate.sampling.checkpoint import Progress, packed_progress, progress_of
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.domain import fit_weights
@@ -22,8 +22,15 @@ from surrogate.sampling.interventions import Chunk, Interventions, none_through
 from surrogate.sampling.plan import Plan, settle_plan
 from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
 from surrogate.sampling.settings import GUARDS, RolloutConfig
-from systems.checkpoint import FLUSH_SHARE, checkpoint_path, last_supported, new_header, read_checkpoints, writer_at
-from systems.checksums import packed
+from systems.checkpoint import (
+    FLUSH_SHARE,
+    CheckpointFile,
+    checkpoint_path,
+    last_supported,
+    new_header,
+    read_checkpoints,
+    writer_at,
+)
 from systems.claim import claimed_outputs
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
@@ -102,7 +109,7 @@ def rollout(
         kept = last_supported(state_path, outs) if resume and state_path.exists() else None
         state = _start(plan, sampler, len(outs)) if kept is None else progress_of(state_path, kept, plan.settings)
         header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
-        last_state = packed(*kept) if kept else b""
+        checkpoint = CheckpointFile(state_path, kept)
         if plan.n_frames < header.get("n_frames_wanted", 0):
             raise InputError(
                 f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
@@ -119,8 +126,8 @@ def rollout(
                                plan.n_between)  # fmt: skip
 
         def save() -> None:
-            nonlocal last_state
-            last_state = save_progress(state_path, state, header, before=last_state)
+            header["progress"], arrays = packed_progress(state)
+            checkpoint.write(header, arrays)
 
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.

@@ -17,7 +17,7 @@ import torch
 
 from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
+from surrogate.sampling.checkpoint import Progress, packed_progress, progress_of
 from surrogate.sampling.rollout import RolloutConfig, rollout
 from surrogate.sampling.simulation import Simulation
 from systems.checkpoint import checkpoint_path, read_checkpoints
@@ -108,13 +108,13 @@ def test_stopped_between_its_first_frames_and_their_checkpoint_it_goes_on(
     class Killed(BaseException):
         pass
 
-    def killed_after_frames(path: Path, progress: Progress, header: dict[str, Any], *, before: bytes) -> bytes:
+    def killed_after_frames(progress: Progress) -> tuple[dict[str, Any], bytes]:
         if progress.steps:
             raise Killed
-        return save_progress(path, progress, header, before=before)
+        return packed_progress(progress)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("surrogate.sampling.rollout.save_progress", killed_after_frames)
+        patch.setattr("surrogate.sampling.rollout.packed_progress", killed_after_frames)
         rollout(alanine_dipeptide, small_weights, outs, config, flush_every_s=0.0)
     assert len(frames_of(outs[0])) == small_weights.model.n_new
     rollout(alanine_dipeptide, small_weights, outs, config, resume=True)

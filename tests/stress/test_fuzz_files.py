@@ -14,9 +14,9 @@ import pytest
 
 from surrogate.data.weights import Weights, load_weights
 from surrogate.sampling.account import Tally
-from surrogate.sampling.checkpoint import Progress, progress_of, save_progress
+from surrogate.sampling.checkpoint import Progress, packed_progress, progress_of
 from surrogate.sampling.simulation import Simulation
-from systems.checkpoint import read_checkpoints, write_checkpoint
+from systems.checkpoint import CheckpointFile, read_checkpoints
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
@@ -124,7 +124,8 @@ def make_checkpoint(path: Path) -> None:
     last, velocities = (rng.normal(size=shape).astype(np.float32) for shape in ((2, 1, 22, 3), (2, 22, 3)))
     progress = Progress(last, velocities,
                         chunks=9, steps=63, wall_s=1.5, seconds={"draw": 1.0}, tallies=[tally, Tally()])  # fmt: skip
-    save_progress(path, progress, {"settings": SETTINGS})
+    plain, arrays = packed_progress(progress)
+    CheckpointFile(path, None).write({"settings": SETTINGS, "files": [], "progress": plain}, arrays)
 
 
 def read_progress(path: Path) -> dict[str, Any]:
@@ -163,7 +164,7 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
         make_checkpoint(folder / "a.h5.checkpoint")
         return folder / "a.h5.checkpoint", read_progress
     if kind == "reference checkpoint":
-        write_checkpoint(folder / "b.h5.checkpoint", {"config": {"seed": 1}, "n_frames": 5}, b"state" * 300)
+        CheckpointFile(folder / "b.h5.checkpoint", None).write({"config": {"seed": 1}, "files": []}, b"state" * 300)
         return folder / "b.h5.checkpoint", read_checkpoints
     if kind == "simulation checkpoint":
         simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import signal
 import sys
+import urllib.error
+import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -83,6 +86,41 @@ def test_no_scheduler_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> No
 def test_workers_here_and_a_scheduler_there_exclude_each_other() -> None:
     with pytest.raises(InputError, match="give one of them"), open_client(workers=2, scheduler="tcp://127.0.0.1:9"):
         pass
+
+
+def lets_in(address: str, security: Any) -> bool:
+    from distributed import Client
+
+    try:
+        with Client(address, security=security, timeout=5, set_as_default=False) as client:
+            return len(client.scheduler_info()["workers"]) == 1
+    except Exception:  # which one depends on how far a stranger comes
+        return False
+
+
+def test_a_scheduler_lets_nobody_in_who_has_not_its_certificate() -> None:
+    from distributed import Security
+
+    with open_client(workers=1) as client:
+        address = client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        assert client.submit(lambda: 6 * 7).result(timeout=60) == 42
+        assert lets_in(address, client.security)
+        assert not lets_in(address, Security()) and not lets_in(address, Security.temporary())
+        assert not lets_in(address.replace("tls", "tcp"), Security())
+        port = client.scheduler_info()["services"]["dashboard"]
+        for page in ("status", "info/main/workers.html", "json/counts.json"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=20)
+
+
+def test_jobs_talk_by_tls_and_show_nothing(tmp_path: Path) -> None:
+    with job_cluster(ClusterSpec(kind="local"), tmp_path) as cluster:
+        words = cluster.job_script().split()
+        assert cluster.scheduler_address.startswith("tls://127.0.0.1:")
+        for option in ("--tls-key", "--tls-cert", "--tls-ca-file"):
+            assert Path(words[words.index(option) + 1]).stat().st_mode & 0o077 == 0
+        assert {"--no-dashboard", "DASK_DISTRIBUTED__WORKER__HTTP__ROUTES=[]"} <= set(words)
 
 
 @pytest.mark.slow

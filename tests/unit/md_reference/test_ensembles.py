@@ -20,7 +20,7 @@ from md_reference.engine import GAS_CONSTANT_KJ_MOL_K, Engine
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.platforms import PlatformChoice
 from md_reference.simulate import MDConfig, checkpoint_path, simulate
-from systems.checkpoint import read_checkpoints, write_checkpoint
+from systems.checkpoint import CheckpointFile, read_checkpoints
 from systems.errors import InputError, SimulationError, TrajectoryError, UnknownNameError
 from systems.scene import Scene
 from systems.trajectory import open_trajectory, open_writer
@@ -223,7 +223,7 @@ def test_a_resumed_run_keeps_its_platform(alanine_dipeptide: Scene, tmp_path: Pa
     # Negative control: on another platform the checkpoint is of no use.
     out = stopped(alanine_dipeptide, config, tmp_path / "b.h5", choice=PlatformChoice("CPU", 1, "measured once"))
     header, blob = read_checkpoints(checkpoint_path(out))[0]
-    write_checkpoint(checkpoint_path(out), header | {"platform": "Reference"}, blob)
+    CheckpointFile(checkpoint_path(out), None).write(header | {"platform": "Reference"}, blob)
     with pytest.raises(SimulationError, match="does not fit"):
         simulate(alanine_dipeptide, config, out, resume=True)
 

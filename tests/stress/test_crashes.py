@@ -1,0 +1,232 @@
+"""Runs that are killed at each of their file operations, that lose power there, or whose disk refuses: what is left.
+
+Each trial ends with `resume`, and is one of: exact (the finished file is that of an undisturbed run), refused (one
+line, and nothing changed), lost (anything else). `pytest tests/stress/test_crashes.py --run-slow -s -n 0` prints their
+table.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from disk_model import LOSSES, NO_SPACE, Disk, watched
+from md_reference.forcefield import ForceFieldSpec
+from md_reference.simulate import MDConfig, simulate
+from surrogate.data.weights import Weights
+from surrogate.sampling.rollout import RolloutConfig, rollout
+from systems.errors import StorageError, SurromdError
+from systems.library import load
+from systems.scene import Scene
+from systems.trajectory import open_trajectory
+
+MD = MDConfig(time_ps=3.0, save_every_ps=0.2, timestep_ps=0.02, equilibrate_ps=0.2, seed=3, platform="Reference",
+              force=ForceFieldSpec("auto", "auto"))  # fmt: skip
+Run = Callable[..., Any]
+
+
+@dataclass
+class Kind:
+    """A run to be disturbed: the names of its files, and how it is started or gone on with in a folder."""
+
+    names: tuple[str, ...]
+    run: Run
+    whole: dict[str, Any] = field(default_factory=dict)
+
+    def found(self, folder: Path) -> dict[str, Any]:
+        return {name: everything(folder / name) for name in self.names}
+
+    def left_over(self, folder: Path) -> list[str]:
+        return sorted(p.name for p in folder.iterdir() if p.suffix not in (".new", ".pdb") and ".meta." not in p.name)
+
+
+def everything(path: Path) -> dict[str, Any]:
+    """All that a finished file holds, but for times of day and seconds spent."""
+    with open_trajectory(path) as reader:
+        assert reader.record["completed"] is True
+        optional = [values for values in (reader.flags, reader.chunk_idx) if values is not None]
+        return {
+            "frames": reader.read().tobytes(),
+            "columns": [values.tobytes() for values in (reader.time_ps, *optional)],
+            "scalars": {name: values.tobytes() for name, values in sorted(reader.scalars.items())},
+        }
+
+
+TABLE: dict[str, Counter[str]] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def table() -> Iterator[None]:
+    yield
+    if TABLE:
+        lines = [f"{'kind':44} {'trials':>7} {'exact':>6} {'refused':>8} {'lost':>5}"]
+        for kind, counts in TABLE.items():
+            lines.append(f"{kind:44} {counts.total():7} {counts['exact']:6} {counts['refused']:8} {counts['lost']:5}")
+        print("\n\n" + "\n".join(lines))  # noqa: T201
+
+
+@pytest.fixture(scope="module", params=["reference .h5", "reference .dcd", "rollout .h5 and .dcd"])
+def kind(request: pytest.FixtureRequest, small_weights: Weights, alanine_dipeptide: Scene,
+         tmp_path_factory: pytest.TempPathFactory) -> Kind:  # fmt: skip
+    if request.param.startswith("reference"):
+        name = "a." + request.param.rpartition(".")[2]
+        scene = load("double-well")
+
+        def run(folder: Path, **how: Any) -> None:
+            simulate(scene, MD, folder / name, checkpoint_every_s=0.0, **how)
+
+        found = Kind((name,), run)
+    else:
+        config = RolloutConfig(time_ps=6.0 * small_weights.model.n_new, solver_steps=1, precision="fp32", seed=6)
+
+        def roll(folder: Path, **how: Any) -> None:
+            outs = [folder / "a.h5", folder / "b.dcd"]
+            rollout(alanine_dipeptide, small_weights, outs, config, flush_every_s=0.0, **how)
+
+        found = Kind(("a.h5", "b.dcd"), roll)
+    folder = tmp_path_factory.mktemp("whole")
+    found.run(folder)
+    found.whole = found.found(folder)
+    return found
+
+
+def outcome(kind: Kind, folder: Path) -> str:
+    """Go on with what a folder holds and return 'exact', 'refused' or why frames are lost."""
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    try:
+        kind.run(folder, resume=True)
+    except SurromdError as error:
+        same = {p: p.read_bytes() for p in folder.iterdir()} == before
+        return "refused" if same and "\n" not in str(error) else f"lost: {error}"
+    except Exception as error:
+        return f"lost: {type(error).__name__}: {error}"
+    if kind.found(folder) != kind.whole:
+        return "lost: other frames"
+    return "exact" if kind.left_over(folder) == sorted(kind.names) else f"lost: left over {kind.left_over(folder)}"
+
+
+def count(kind: str, found: dict[Any, str]) -> None:
+    """Add outcomes to the table; AssertionError with those that are lost."""
+    counts = TABLE.setdefault(kind, Counter())
+    counts.update(said if said in ("exact", "refused") else "lost" for said in found.values())
+    bad = [f"{trial}: {said}" for trial, said in found.items() if said != "exact"]
+    assert not bad, f"{kind}: {len(bad)} of {len(found)}\n" + "\n".join(bad[:20])
+
+
+def recorded(kind: Kind, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
+    folder.mkdir()
+    with watched(folder, monkeypatch) as disk:
+        kind.run(folder)
+    assert kind.found(folder) == kind.whole
+    return disk
+
+
+def crashes(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int) -> tuple[int, dict[Any, str]]:
+    disk = recorded(kind, tmp_path / "run", monkeypatch)
+    found = {}
+    for n in range(0, len(disk.operations) + 1, every):
+        disk.put(tmp_path / f"{n}", disk.after(n))
+        found[n, disk.operations[n - 1][:2] if n else ""] = outcome(kind, tmp_path / f"{n}")
+    return len(disk.operations), found
+
+
+def name_of(kind: Kind) -> str:
+    return "rollout" if len(kind.names) > 1 else f"reference {Path(kind.names[0]).suffix}"
+
+
+def power_failures(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int) -> dict[Any, str]:
+    disk = recorded(kind, tmp_path / "run", monkeypatch)
+    found = {}
+    for n in range(0, len(disk.operations) + 1, every):
+        for how, (data, names) in LOSSES.items():
+            folder = tmp_path / f"{n} {how}"
+            disk.put(folder, disk.after(n, data, names, seed=n))
+            found[n, how, disk.operations[n - 1][:2] if n else ""] = outcome(kind, folder)
+    return found
+
+
+def faults(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, every: int) -> dict[Any, str]:
+    """Have each operation fail in turn, once, or from then on all that need space; then go on with the disk mended."""
+    found: dict[Any, str] = {}
+    n, last = 1, 1
+    while n <= last:
+        folder = tmp_path / f"{code} {n}"
+        folder.mkdir()
+        seen: list[str] = []
+
+        def fault(number: int, what: str, n: int = n, seen: list[str] = seen) -> int:
+            seen.append(what)
+            fails = number >= n and what in NO_SPACE[1] if code == errno.ENOSPC else number == n
+            return code if fails else 0
+
+        said = ""
+        with watched(folder, monkeypatch, fault):
+            try:
+                kind.run(folder)
+            except StorageError as error:
+                said = "not one line" if "\n" in str(error) else ""
+            except Exception as error:
+                said = f"lost: {type(error).__name__}: {error}"
+        what = seen[n - 1] if len(seen) >= n else "none"
+        found[n, what] = said or outcome(kind, folder)
+        last = max(last, len(seen))
+        n += every
+    return found
+
+
+def test_killed_at_some_operations(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    n_operations, found = crashes(kind, tmp_path, monkeypatch, every=17)
+    assert n_operations > 60
+    count(f"{name_of(kind)}: killed at an operation", found)
+
+
+def test_power_lost_at_some_operations(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count(f"{name_of(kind)}: power lost at an operation", power_failures(kind, tmp_path, monkeypatch, every=61))
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC])
+def test_some_operations_that_fail(kind: Kind, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count(f"{name_of(kind)}: {errno.errorcode[code]}", faults(kind, tmp_path, monkeypatch, code, every=41))
+
+
+@pytest.mark.slow
+def test_killed_at_every_operation(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, found = crashes(kind, tmp_path, monkeypatch, every=1)
+    count(f"{name_of(kind)}: killed at an operation", found)
+
+
+@pytest.mark.slow
+def test_power_lost_at_every_operation(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count(f"{name_of(kind)}: power lost at an operation", power_failures(kind, tmp_path, monkeypatch, every=1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC])
+def test_every_operation_that_fails(kind: Kind, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count(f"{name_of(kind)}: {errno.errorcode[code]}", faults(kind, tmp_path, monkeypatch, code, every=1))
+
+
+def test_the_model_of_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file that is renamed before it is forced out may be empty after a power failure; a kill does not touch it."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    import os
+
+    with watched(folder, monkeypatch) as disk:
+        descriptor = os.open(folder / "a.new", os.O_WRONLY | os.O_CREAT)
+        os.pwrite(descriptor, b"x" * 2000, 0)
+        os.close(descriptor)
+        os.replace(folder / "a.new", folder / "a")
+    n = len(disk.operations)
+    assert disk.after(n) == {"a": b"x" * 2000}
+    assert disk.after(n, *LOSSES["neither"]) == {}
+    assert disk.after(n, *LOSSES["names alone"]) == {"a": b""}
+    assert disk.after(n, *LOSSES["bytes alone"]) == {}
+    assert np.unique([len(disk.after(n, 0.5, 1.0, seed)["a"]) for seed in range(9)]).size > 1
