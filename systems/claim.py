@@ -90,7 +90,7 @@ def claimed_outputs(
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
     Raises what `Claim` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another file
-    lies in the place of the checkpoint.
+    lies in the place of the checkpoint, StorageError for an OSError of the run's own.
     """
     with ExitStack() as stack:
         for out in outs:
@@ -108,6 +108,8 @@ def claimed_outputs(
                     if not frames_in(out):
                         for member in set(family(out)) - before:
                             member.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise storage_error(outs[0], error, "the frames written before are complete and readable") from error
             raise
 
 

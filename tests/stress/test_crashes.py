@@ -182,13 +182,16 @@ def faults(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: in
 
 
 def test_killed_at_some_operations(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    n_operations, found = crashes(kind, tmp_path, monkeypatch, every=17)
+    n_operations, found = crashes(kind, tmp_path, monkeypatch, every=17 if len(kind.names) == 1 else 71)
     assert n_operations > 60
     count(f"{name_of(kind)}: killed at an operation", found)
 
 
 def test_power_lost_at_some_operations(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    count(f"{name_of(kind)}: power lost at an operation", power_failures(kind, tmp_path, monkeypatch, every=61))
+    count(
+        f"{name_of(kind)}: power lost at an operation",
+        power_failures(kind, tmp_path, monkeypatch, every=61 * len(kind.names)),
+    )
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC])
