@@ -59,7 +59,7 @@ def cap(scene: Scene, residue: int) -> CappedResidue:
     except ValenceError as error:
         raise PreparationError(f"{label} of scene {scene.name!r}, cut out of its chain, fits no valence.") from error
     capped = Scene(
-        name=f"{label} with its neighbours' ends",
+        name=f"{label} of {scene.name} with its neighbours' ends",
         atom_names=tuple(f"{e}{k + 1}" for k, e in enumerate(elements)),
         elements=tuple(elements),
         residue_of_atom=np.zeros(n, dtype=np.int64),

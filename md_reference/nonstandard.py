@@ -60,6 +60,12 @@ def find_chain(scene: Scene) -> Chain | None:
     return Chain(regrouped, order, tuple(sorted(unknown)))
 
 
+def lacking_residues(scene: Scene) -> list[str]:
+    """Return the residues of a molecule for which `build_chain` makes templates, as `AIB 2`; none without a chain."""
+    chain = find_chain(scene)
+    return [] if chain is None else chain.lacking
+
+
 def build_chain(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the `openmm.System`, in vacuum, of a molecule that `find_chain` finds a chain in; particles in its order.
 

@@ -10,11 +10,14 @@ from typing import Any
 from md_reference.engine import Engine
 from md_reference.forcefield import ForceFieldSpec, build_system, resolve
 from md_reference.integrators import check_ensemble, integrator_name
+from md_reference.mixture import molecules_of
+from md_reference.nonstandard import lacking_residues
 from md_reference.platforms import PlatformChoice, choose_platform, measured_platform
 from md_reference.replicas import available_cores
 from md_reference.run_config import MDConfig
 from md_reference.timing import as_records
 from systems.scene import FloatArray, Scene
+from systems.selection import part_of
 from systems.units import format_time_ps
 
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
@@ -344,6 +347,13 @@ def _skips(
 
 def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[str, ...]:
     found = []
+    if spec.force_field.endswith("+gaff2"):
+        lacking = [name for m in molecules_of(scene) for name in lacking_residues(part_of(scene, m))]
+        if lacking:
+            found.append(
+                f"{', '.join(lacking)}: not in {spec.protein}; side chains by GAFF2, charges by AM1-BCC of the residue "
+                "with its neighbours' ends."
+            )
     natural = spec.hydrogen_mass_da is None or spec.hydrogen_mass_da < 1.5
     if timestep_ps > _LONGEST_NATURAL_STEP_PS and natural and "H" in scene.elements:
         found.append(

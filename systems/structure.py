@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.bond_orders import ValenceError, perceive
+from systems.components import component
 from systems.element_data import atomic_weight_da
 from systems.errors import PreparationError
 from systems.pdb_records import AtomRecord, read_structure
@@ -37,8 +38,8 @@ def scene_from_records(
     bonds = bonds[np.lexsort((bonds[:, 1], bonds[:, 0]))]
     positions_nm = np.array([a.position_angstrom for a in atoms], dtype=np.float64).reshape(-1, 3) / 10.0
     try:
-        standard = [i for i, a in enumerate(atoms) if template_for(a.residue_name) is not None]
-        orders, charges = perceive(elements, bonds, positions_nm, trusted=standard)
+        known = [i for i, a in enumerate(atoms) if _is_known(a)]
+        orders, charges = perceive(elements, bonds, positions_nm, trusted=known)
     except ValenceError as error:
         faulty = ", ".join(atom_label(atoms[i]) for i in error.atoms[:4])
         more = f" and {len(error.atoms) - 4} more" if len(error.atoms) > 4 else ""
@@ -62,6 +63,14 @@ def scene_from_records(
         positions_nm=positions_nm,
         provenance=provenance,
     )
+
+
+def _is_known(atom: AtomRecord) -> bool:
+    """Whether an atom is one of a residue that is known by its name, and has therefore its hydrogens."""
+    if template_for(atom.residue_name) is not None:
+        return True
+    found = component(atom.residue_name)
+    return found is not None and atom.name in found.heavy
 
 
 def atom_label(atom: AtomRecord) -> str:

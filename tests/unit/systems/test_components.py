@@ -147,6 +147,48 @@ def test_a_phosphoserine_without_hydrogens_is_charged_and_covered(tmp_path: Path
     assert resolve(prepared, ForceFieldSpec("auto", "auto")).force_field == "ff14SB"
 
 
+LACTAM = "CC(=O)N[C@H]1CCCCNC(=O)CC[C@H](NC(=O)[C@H](C)NC(=O)[C@H](C)NC(=O)[C@H](C)NC1=O)C(=O)NC"
+
+
+def test_a_lactam_between_side_chains_keeps_its_bond_and_gets_no_oxygen(tmp_path: Path) -> None:
+    chain = scene_from_smiles(LACTAM)  # ACE-LYS-ALA-ALA-ALA-GLU-NME, NZ bonded to CD
+    near, symbol = chain.neighbours(), chain.elements
+    rows = backbone_torsions(chain)["psi"][:, :3].tolist()
+    backbone = [row for row in rows if any(symbol[j] == "C" for j in near[row[1]] if j not in row)]
+    named: dict[int, tuple[int, str]] = {}
+    for k, (n, alpha, c) in enumerate(backbone):
+        named |= {n: (k + 1, "N"), alpha: (k + 1, "CA"), c: (k + 1, "C")}
+        named[next(j for j in near[c] if symbol[j] == "O")] = (k + 1, "O")
+        side = ["CB", "CG", "CD", "CE", "NZ"] if k == 0 else ["CB", "CG", "CD"] if k == 4 else ["CB"]
+        at = alpha
+        for name in side:
+            at = next(j for j in near[at] if j not in named and symbol[j] == name[0])
+            named[at] = (k + 1, name)
+        if k == 4:
+            named[next(j for j in near[at] if symbol[j] == "O")] = (5, "OE1")
+    first, last = backbone[0][0], backbone[-1][2]
+    c = next(j for j in near[first] if j not in named and symbol[j] == "C")
+    named |= {c: (0, "C"), next(j for j in near[c] if symbol[j] == "O"): (0, "O")}
+    named[next(j for j in near[c] if symbol[j] == "C")] = (0, "CH3")
+    n = next(j for j in near[last] if j not in named and symbol[j] == "N")
+    named |= {n: (6, "N"), next(j for j in near[n] if j not in named and symbol[j] == "C"): (6, "C")}
+    residues = ["ACE", "LYS", "ALA", "ALA", "ALA", "GLU", "NME"]
+    lines, link = [], {}
+    for serial, i in enumerate(sorted(named, key=lambda i: named[i][0]), start=1):
+        r, name = named[i]
+        link[r, name] = serial
+        position = "".join(f"{v:8.3f}" for v in (chain.positions_nm[i] * 10).tolist())
+        lines.append(
+            f"ATOM  {serial:5d}  {name:<4s}{residues[r]:>3s} A{r + 1:4d}    {position}  1.00  0.00{symbol[i]:>12s}"
+        )
+    lines.append(f"CONECT{link[1, 'NZ']:5d}{link[5, 'CD']:5d}")
+    path = tmp_path / "lactam.pdb"
+    path.write_text("\n".join([*lines, "END", ""]))
+    scene = prepare(str(path))
+    assert scene.molecule_key == chain.molecule_key
+    assert "OE2" not in scene.atom_names
+
+
 def test_a_component_that_lacks_heavy_atoms_is_refused(tmp_path: Path) -> None:
     smiles = "N1[C@@H](C)C(=O)NCC(=O)NC(C)(C)C(=O)N[C@@H](C)C(=O)NCC(=O)N[C@@H](C)C(=O)1"
     path = heavy_pdb(labelled(smiles, "ALA GLY AIB ALA GLY ALA"), tmp_path / "cycle.pdb")
