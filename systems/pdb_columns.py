@@ -57,7 +57,8 @@ def read_pdb(text: str, path: Path) -> StructureFile:
             n_misread += repeats_name(atom.name, atom.residue_name, line[76:78].strip().capitalize())
             if not atom.element:
                 found.unknown[len(found.atoms)] = where
-            segment, before = "" if atom.chain else line[72:76].strip(), segment
+            named = line[72:76].strip()  # CHARMM's segment, where there is no chain; other programs put numbers there
+            segment, before = named if not atom.chain and named[:1].isalpha() else "", segment
             if found.atoms and segment != before:
                 found.chain_ends.add(len(found.atoms) - 1)
             found.atoms.append(atom)

@@ -185,3 +185,15 @@ def test_methanol_without_hydrogens_is_no_carbon_monoxide(tmp_path: Path) -> Non
     with pytest.raises(PreparationError, match=r"lack hydrogens \(a triple bond of 1.41 Å is none\)"):
         read(tmp_path, lines)
     assert read(tmp_path, [lines[0], lines[1].replace("1.410", "1.130")]).n_atoms == 2
+
+
+def test_segments_end_chains_and_numbers_in_their_columns_do_not(tmp_path: Path) -> None:
+    bare = [f"{line[:21]} {line[22:66]:<50s}" for line in ROWS]
+    scene = read(tmp_path, [f"{line}{k:4d}" for k, line in enumerate(bare)])
+    assert said(scene) == ""
+    other = [line[:22] + f"{int(line[22:26]) + 3:4d}" + line[26:] for line in shifted(bare, 30.0)]
+    residues = [line for line in [*bare, *other] if line[17:20] == "ALA"]
+    with pytest.raises(PreparationError, match="the chain breaks"):
+        read(tmp_path, residues)
+    segments = [f"{line}{'PROA' if k < len(residues) // 2 else 'PROB'}" for k, line in enumerate(residues)]
+    assert "ALA 2: added OXT" in said(read(tmp_path, segments))
