@@ -3,15 +3,20 @@ between frames, never inside a write."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 # Pressed again after this long, Ctrl-C means now.
 _PATIENCE_S = 1.0
+# So often it is looked whether an interruption is still on its way out.
+_LOOK_S = 0.5
 # So long what ends is not disturbed by being told to end again.
 _CLEAN_UP_S = 30.0
 
@@ -25,23 +30,48 @@ def interrupted_by_signals() -> Iterator[None]:
     For a program of ours, all of it: Python's own way, to end at once, leaves folders and processes behind. SIGINT
     is heeded also where a shell has started the program in the background and had it ignored; SIGHUP stays ignored
     where it is (nohup). What cleans up after the first signal is not disturbed by another one for half a minute, but
-    by Ctrl-C a second later.
+    by Ctrl-C a second later. An interruption that somebody swallows (a library that catches everything while it is
+    imported) is raised again.
     """
     asked_at: float | None = None
+    raised: KeyboardInterrupt | None = None
+    over = False
 
     def handle(number: int, _: FrameType | None) -> None:
-        nonlocal asked_at
+        nonlocal asked_at, raised
         now = time.monotonic()
         if asked_at is None or now - asked_at > (_PATIENCE_S if number == signal.SIGINT else _CLEAN_UP_S):
-            asked_at = now
-            raise KeyboardInterrupt
+            asked_at, raised = now, KeyboardInterrupt()
+            raise raised
 
+    def insist() -> None:
+        nonlocal asked_at, raised
+        missed = 0
+        while not over:
+            time.sleep(_LOOK_S)
+            missed = 0 if raised is None or _is_under_way(raised, thread) else missed + 1
+            if missed > 1 and not over:
+                asked_at, raised, missed = None, None, 0
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.get_ident()
     previous = {number: signal.signal(number, handle) for number in _numbers()}
+    threading.Thread(target=insist, name="interruption-watch", daemon=True).start()
     try:
         yield
     finally:
+        over = True
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _is_under_way(interrupt: KeyboardInterrupt, thread: int) -> bool:
+    """True while a thread handles this exception, or another one that came of it: what cleans up runs so."""
+    handled: Any = sys._current_exceptions().get(thread)
+    error = handled[1] if isinstance(handled, tuple) else handled  # a tuple before Python 3.12
+    while error is not None and error is not interrupt:
+        error = error.__context__
+    return error is not None
 
 
 def stop_if_asked() -> None:

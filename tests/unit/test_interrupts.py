@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -152,3 +156,39 @@ def test_whoever_waits_within_a_run_hears_of_the_wish_to_stop() -> None:
     with stop_when(lambda: True), pytest.raises(KeyboardInterrupt):
         stop_if_asked()
     stop_if_asked()
+
+
+_SWALLOWS = """
+import os, signal, time
+from systems.interrupts import interrupted_by_signals
+
+def clean_up():
+    try:
+        raise ValueError
+    except ValueError:
+        time.sleep(1.5)
+
+try:
+    with interrupted_by_signals():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except:  # as some libraries do while they are imported
+            print("swallowed", flush=True)
+        try:
+            while True:
+                time.sleep(0.05)
+        finally:
+            clean_up()
+            print("cleaned up", flush=True)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no such signals on this system")
+def test_an_interruption_that_is_swallowed_comes_again_and_cleaning_up_is_not_disturbed() -> None:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    said = subprocess.run(
+        [sys.executable, "-c", _SWALLOWS], env=environment, capture_output=True, text=True, check=True
+    )
+    assert said.stdout.split("\n") == ["swallowed", "cleaned up", "interrupted", ""], said.stderr
