@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from systems.scene import Scene
+from systems.units import format_wall
 
 # Measured by docs/studies/charge_cost.py (AmberTools 26.0, processor seconds on one core of a Xeon, 21 to 72 atoms, no
 # molecule off by more than a factor of 2.3): SECONDS_AT_30_ATOMS (atoms / 30)^POWER.
@@ -30,8 +31,6 @@ def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
     Yields what `programs.run_program` calls while it waits: on a terminal it keeps a line with the seconds so far. The
     lines are warnings of the logger 'surromd.charges': on stderr unless a program that uses this package decides else.
     """
-    from md_reference.plan import format_wall
-
     expected = expected_s(scene.n_atoms)
     if expected < _WORTH_SAYING_S:
         yield None

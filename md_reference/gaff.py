@@ -14,7 +14,7 @@ import numpy as np
 
 from md_reference import parameter_cache
 from md_reference.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
-from md_reference.charge_cost import announced
+from md_reference.charge_cost import announced, expected_s
 from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.programs import scratch_folder
@@ -22,6 +22,7 @@ from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError, StorageError
 from systems.residues import template_for
 from systems.scene import FloatArray, Scene
+from systems.units import format_wall
 
 METHOD = "gaff2-am1bcc"
 ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
@@ -118,7 +119,8 @@ def refuse(scene: Scene) -> None:
         culprits = f", which lacks {', '.join(unknown[:4])}" if unknown and mixed else ""
         raise PreparationError(
             f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field{culprits}; AM1-BCC "
-            f"charges for more than {LARGEST} take hours. Give a smaller molecule, or one of standard residues."
+            f"charges for them take about {format_wall(expected_s(scene.n_atoms))}, and more than {LARGEST} are not "
+            "computed. Give a smaller molecule, or one of standard residues."
         )
 
 

@@ -18,7 +18,7 @@ from md_reference.run_config import MDConfig
 from md_reference.timing import as_records
 from systems.scene import FloatArray, Scene
 from systems.selection import part_of
-from systems.units import format_time_ps
+from systems.units import format_time_ps, format_wall
 
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
 _LONGEST_NATURAL_STEP_PS = 0.0025
@@ -241,14 +241,6 @@ def plan_line(
     if wall_s is not None:
         parts.append(f"about {format_wall(wall_s)}")
     return "; ".join(parts)
-
-
-def format_wall(seconds: float) -> str:
-    """Return a wall time for people: 12 s, 5 min, 3.2 h, 2.1 days."""
-    for unit, size, limit in (("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172_800.0)):
-        if seconds < limit:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 86_400.0:.3g} days"
 
 
 def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:

@@ -369,6 +369,14 @@ def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: n
         residue.missing = [a for a in absent if not _has_left(template, a, links, absent)]
         needed = {a: max(0, n - links.get(a, 0)) for a, n in template.hydrogens.items()}
         found = component(residue.key[2]) if template_for(residue.key[2]) is None else None
+        if (
+            found is not None
+            and found.kind == "nucleotide"
+            and "P" in heavy
+            and "P" not in links
+            and "OP3" not in heavy
+        ):
+            residue.missing.append("OP3")
         if found is not None:
             needed = _least_hydrogens(residue, found, neighbours)
         if template.is_amino_acid and {"N", "C"} <= set(heavy):

@@ -109,7 +109,10 @@ def hydrogens_of(
     for i, j, order in residue.bonds:
         near[i].append((j, order))
         near[j].append((i, order))
-    gone = [sum(residue.heavy[j] not in present for j, _ in around) for around in near]
+    gone = [
+        0 if residue.elements[k] == "P" else sum(residue.heavy[j] not in present for j, _ in around)
+        for k, around in enumerate(near)
+    ]
     counts = [max(0, len(own) + gone[k] - links.get(residue.heavy[k], 0)) for k, own in enumerate(residue.hydrogens)]
     _ionise(residue, near, counts, links, ph)
     taken = {h for own in residue.hydrogens for h in own}

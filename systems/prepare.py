@@ -259,9 +259,10 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
             )
         built = [a for a in residue.missing if a != "OXT"]
         if built and template_for(residue.key[2]) is None:
+            instead = ", or leave its phosphate out" if "OP3" in built else ""
             raise PreparationError(
-                f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}, which only standard "
-                "residues are given; add all its heavy atoms."
+                f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
+                f"standard residues alone: add all its heavy atoms{instead}."
             )
 
 

@@ -91,6 +91,14 @@ def parse_pressure_bar(text: str, what: str = "pressure") -> float:
     return _parse(text, _PRESSURE_BAR, what, "1bar")
 
 
+def format_wall(seconds: float) -> str:
+    """Return a wall time for people: 12 s, 5 min, 3.2 h, 2.1 days."""
+    for unit, size, limit in (("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172_800.0)):
+        if seconds < limit:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 86_400.0:.3g} days"
+
+
 # By what a name ends in; the longest ending first: a friction ends in _ps, too.
 PARSERS: dict[str, Callable[[str, str], float]] = {
     "_per_ps": parse_rate_per_ps,
