@@ -31,7 +31,8 @@ _TOLERANCE = 0.2
 @dataclass(frozen=True)
 class Mol2:
     """The first molecule of a MOL2 file. `orders` holds those that are stated, for pairs i < j; `charge` the sum of the
-    partial charges, None where there are none; `residues` the (number, name) of each atom."""
+    partial charges, None where there are none; `residues` the (number, name) of each atom; `block` the molecule as
+    MOL2, for readers of SYBYL's types."""
 
     names: tuple[str, ...]
     elements: tuple[str, ...]
@@ -91,7 +92,7 @@ def read_mol2(text: str, path: Path, notes: list[str]) -> Mol2:
         orders=orders if any(order > 1 for order in orders.values()) or "ar" in _types(sections) else {},
         charge=sum(partial) if len(partial) == len(atoms) and any(partial) else None,
         residues=tuple((row[6] if len(row) > 6 else "1", row[7] if len(row) > 7 else "MOL") for row in atoms),
-        block="@<TRIPOS>MOLECULE\n" + records[0],
+        block=_rewritten(atoms, sections.get("BOND", []), number_of),
     )
 
 
@@ -217,11 +218,19 @@ def _sections(record: str) -> dict[str, list[list[str]]]:
     out: dict[str, list[list[str]]] = {}
     rows: list[list[str]] = []
     for line in record.replace("\\\n", " ").splitlines():
-        if line.startswith("@<TRIPOS>"):
+        if line.upper().startswith("@<TRIPOS>"):
             rows = out.setdefault(line[9:].strip().upper(), [])
         elif line.strip() and not line.startswith("#"):
             rows.append(line.split())
     return out
+
+
+def _rewritten(atoms: list[list[str]], bonds: list[list[str]], number_of: dict[str, int]) -> str:
+    """The molecule as its shortest file: other readers trust the counts of the header and the numbers of atoms."""
+    head = ["@<TRIPOS>MOLECULE", "MOL", f"{len(atoms)} {len(bonds)} 0 0 0", "SMALL", "NO_CHARGES", ""]
+    rows = [" ".join([str(k + 1), row[1], *row[2:6], "1", "MOL", "0.0"]) for k, row in enumerate(atoms)]
+    joined = [f"{k + 1} {number_of[row[1]] + 1} {number_of[row[2]] + 1} {row[3]}" for k, row in enumerate(bonds)]
+    return "\n".join([*head, "@<TRIPOS>ATOM", *rows, "@<TRIPOS>BOND", *joined, ""])
 
 
 def _types(sections: dict[str, list[list[str]]]) -> set[str]:

@@ -50,15 +50,31 @@ def _by_types(found: Mol2) -> Any | None:
     molecule = Chem.MolFromMol2Block(found.block, sanitize=False, removeHs=False, cleanupSubstructures=True)
     if molecule is None or tuple(a.GetSymbol() for a in molecule.GetAtoms()) != found.elements:
         return None
+    _draw_nitro(molecule)
     for atom in molecule.GetAtoms():
-        atom.SetNoImplicit(False)  # its reader expects all hydrogens, and takes hydroxyls without for anions
-        if atom.GetFormalCharge() < 0 and atom.GetProp("_TriposAtomType") != "O.co2":
+        atom.SetNoImplicit(False)  # its reader expects all hydrogens, and makes anions of hydroxyls and amines without
+        is_anion = atom.GetFormalCharge() < 0 and all(a.GetFormalCharge() <= 0 for a in atom.GetNeighbors())
+        if is_anion and "H" not in found.elements and atom.GetProp("_TriposAtomType") != "O.co2":
             atom.SetFormalCharge(0)
     try:
         sanitise(molecule)
     except PreparationError:
         return None
     return molecule if any(a.GetNumImplicitHs() for a in molecule.GetAtoms()) else None
+
+
+def _draw_nitro(molecule: Any) -> None:
+    """Give nitro groups of two single bonds (antechamber's) one double bond and their charges, in place."""
+    from rdkit import Chem
+
+    for atom in molecule.GetAtoms():
+        ends = [b for b in atom.GetBonds() if b.GetOtherAtom(atom).GetSymbol() == "O"
+                and b.GetOtherAtom(atom).GetDegree() == 1]  # fmt: skip
+        if atom.GetSymbol() != "N" or len(ends) != 2 or any(b.GetBondType() != Chem.BondType.SINGLE for b in ends):
+            continue
+        ends[0].SetBondType(Chem.BondType.DOUBLE)
+        for one, charge in ((atom, 1), (ends[0].GetOtherAtom(atom), 0), (ends[1].GetOtherAtom(atom), -1)):
+            one.SetFormalCharge(charge)
 
 
 def settle_molecule(molecule: Any, notes: list[str]) -> Any:

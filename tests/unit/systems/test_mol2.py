@@ -120,6 +120,27 @@ def test_hydrogens_are_added_where_sybyl_types_imply_them_and_asked_for_elsewher
             _read(tmp_path, _mol2(known, GAFF, without=[hydrogen]))
 
 
+def test_hydrogens_are_added_to_carbons_and_nitro_groups_stay(tmp_path: Path) -> None:
+    known = scene_from_smiles("OC(=O)c1ccc([N+](=O)[O-])cc1")
+    types = {"C": "C.ar", "O": "O.2", "N": "N.pl3"}
+    hydrogens = [i for i, e in enumerate(known.elements) if e == "H"]
+    text = _mol2(known, types, order="", without=hydrogens)
+    nitro = known.elements.index("N") + 1
+    lines = text.splitlines()
+    bonds = lines.index("@<TRIPOS>BOND")
+    lines[bonds:] = [ln[:-1] + "1" if ln.endswith(" 2") and f" {nitro} " in ln[6:] else ln for ln in lines[bonds:]]
+    assert _read(tmp_path, "\n".join(lines)).molecule_key == known.molecule_key
+    polar = [i for i in hydrogens if (known.bonds == i).any() and "O" not in _neighbours(known, i)]
+    assert len(polar) == 4
+    scene = _read(tmp_path, _mol2(known, types, order="", without=polar))
+    assert scene.molecule_key == known.molecule_key
+    assert scene.provenance["repairs"] == ["hydrogens added: 4"]
+
+
+def _neighbours(scene: Scene, i: int) -> set[str]:
+    return {scene.elements[k] for pair in scene.bonds.tolist() if i in pair for k in pair}
+
+
 @pytest.mark.parametrize("smiles", ["[O-]N=O", "FC(F)(F)F", "O=C=O", "[O-][N+](=O)[O-]", "ClC(Cl)(Cl)Cl"])
 def test_molecules_without_hydrogens_are_whole(tmp_path: Path, smiles: str) -> None:
     known = scene_from_smiles(smiles)
