@@ -99,6 +99,7 @@ class TrainingFrameResampling(Baseline):
 
     arch: ClassVar[str] = "resampling"
     fitted: ClassVar[bool] = True
+    leaps: ClassVar[bool] = True
     frames_nm: Tensor
 
     def __init__(self, config: BaselineConfig) -> None:
@@ -164,6 +165,7 @@ class MarkovStateModel(Baseline):
 
     arch: ClassVar[str] = "msm"
     fitted: ClassVar[bool] = True
+    leaps: ClassVar[bool] = True
     centres_nm: Tensor
     cumulative: Tensor
     frames_nm: Tensor

@@ -93,6 +93,8 @@ class Surrogate(nn.Module, ABC):
     bf16_by_default: ClassVar[bool] = True
     # Whether a chunk ends in velocities that the next one starts from.
     carries_velocities: ClassVar[bool] = False
+    # Whether its frames leap by design: a baseline without motion, in which a jump is no fault.
+    leaps: ClassVar[bool] = False
     # The time between the frames that it is asked for, of a model that takes it as an input (`at_lag`).
     lag_ps: float | None = None
     config: Any

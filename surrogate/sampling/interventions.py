@@ -25,7 +25,7 @@ from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import Flags, Guard, caught, finite
 from systems.errors import SimulationError
-from systems.validity import ENERGY, INVALID, STILL, flag_names
+from systems.validity import ENERGY, INVALID, JUMP, STILL, flag_names
 
 FloatArray = npt.NDArray[np.floating[Any]]
 
@@ -53,12 +53,16 @@ class Chunk:
     failure: tuple[int, str] | None = None
 
 
-def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
+def none_through(
+    tallies: Sequence[Tally], n_new: int, *, at_end: bool, may_jump: bool = False
+) -> tuple[int, str] | None:
     """Return the worst replica and what is wrong with a model that has got no chunk of `n_new` frames through.
 
-    None as long as it has, or may yet: `at_end` says that no chunk follows.
+    None as long as it has, or may yet: `at_end` says that no chunk follows. Jumps count unless the model `may_jump`.
     """
     chunks, frames = sum(t.chunks for t in tallies), sum(t.frames_caught for t in tallies)
+    if may_jump:
+        frames -= sum(t.reasons.get(flag_names(JUMP)[0], 0) for t in tallies)
     if any(t.chunks_caught < t.chunks for t in tallies) or frames <= max(1.0, _WRONG_SHARE * chunks * n_new):
         return None
     if not at_end and tallies[0].chunks < _CHUNKS_TO_PROVE:

@@ -157,7 +157,7 @@ def rollout(
             state.wall_s = time.monotonic() - started
             if chunk.failure is None and config.guard == "flag":
                 at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps
-                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end)
+                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end, may_jump=weights.model.leaps)
             if chunk.failure is not None:
                 if config.guard in ("off", "flag"):
                     _buffer(plan, state, chunk, buffers)
