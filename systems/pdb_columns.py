@@ -6,6 +6,7 @@ residue that stand apart, and cuts residue names at three letters (TIP3 becomes 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from systems.element_data import element_symbol, repeats_name
@@ -22,6 +23,8 @@ _RECORDS = frozenset((
     "MTRIX3", "TVECT", "MODEL", "ATOM", "ANISOU", "SIGATM", "SIGUIJ", "TER", "HETATM", "ENDMDL", "CONECT", "MASTER",
     "END", "USER",
 ))  # fmt: skip
+# An atom under a misspelt record, and no table of energies: %8.3f three times, blanks before.
+_WRITTEN = re.compile(r" *-?\d+\.\d{3}", re.ASCII)
 
 
 def read_pdb(text: str, path: Path) -> StructureFile:
@@ -73,7 +76,8 @@ def read_pdb(text: str, path: Path) -> StructureFile:
             and not is_atom
             and not model_ended
             and len(line) > 66
-            and coordinates(_fields(line)) is not None
+            and not line[27:30].strip()
+            and all(_WRITTEN.fullmatch(field) for field in _fields(line))
         ):
             raise InputError(
                 f"{path}, line {number}: {record!r} is no record of the PDB format, but the line looks like an atom; "

@@ -152,8 +152,14 @@ def atoms_of(data: bytes) -> list[tuple[float, float, float]] | None:
             if not ended:  # after END nothing is read, and what is there counts as lost
                 return None
         elif (
-            plain and (len(line) > 66 or line.startswith(("ATOM  ", "HETATM"))) and not line.startswith(_NO_ATOM)
-        ):  # whatever it calls itself
+            line.startswith(("ATOM  ", "HETATM"))
+            or (
+                len(line) > 66  # whatever it calls itself, but for tables of numbers (Rosetta's energies)
+                and not line[27:30].strip()
+                and all(re.fullmatch(r" *-?[0-9]+\.[0-9]{3}", f) for f in fields)
+                and not line.startswith(_NO_ATOM)
+            )
+        ):
             found.append((float(fields[0]), float(fields[1]), float(fields[2])))
     return found
 
