@@ -18,9 +18,9 @@ from md_reference.charge_cost import announced, expected_s
 from md_reference.parameter_cache import Entry
 from md_reference.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.programs import scratch_folder
+from md_reference.templates import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.element_data import covalent_radius_nm
-from systems.errors import PreparationError, StorageError
-from systems.residues import template_for
+from systems.errors import InputError, PreparationError, StorageError
 from systems.scene import FloatArray, Scene
 from systems.units import format_wall
 
@@ -113,15 +113,24 @@ def refuse(scene: Scene) -> None:
             "AM1-BCC are made for closed shells. Check hydrogens and charges, or use --level gfn2-xtb."
         )
     if scene.n_atoms > LARGEST:
-        residues = zip(scene.residue_names, scene.residue_ids, strict=True)
-        unknown = list(dict.fromkeys(f"{name} {number}" for name, number in residues if template_for(name) is None))
-        mixed = any(template_for(name) is not None for name in scene.residue_names)
-        culprits = f", which lacks {', '.join(unknown[:4])}" if unknown and mixed else ""
+        lacking = _without_template(scene)
+        culprits = f", which lacks {', '.join(lacking[:4])}" if lacking else ""
         raise PreparationError(
             f"scene {scene.name!r} has {scene.n_atoms} atoms outside the protein force field{culprits}; AM1-BCC "
             f"charges for them take about {format_wall(expected_s(scene.n_atoms))}, and more than {LARGEST} are not "
             "computed. Give a smaller molecule, or one of standard residues."
         )
+
+
+def _without_template(scene: Scene) -> list[str]:
+    """Return the residues of a scene that no template of ff14SB fits, `PSU 39`; none where no residue has one."""
+    try:
+        found = unmatched_residues(scene, force_field_of(CHAIN_FILES))
+    except InputError:  # residues that are not contiguous
+        return []
+    if len(found) == len(scene.residue_names):
+        return []
+    return [f"{scene.residue_names[r]} {scene.residue_ids[r]}" for r in found]
 
 
 def _parametrise(scene: Scene) -> Entry:

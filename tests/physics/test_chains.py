@@ -319,3 +319,12 @@ def test_a_glycopeptide_without_hydrogens_is_completed_and_covered(tmp_path: Pat
     assert prepared.formula == scene.formula
     assert Counter(glycan_templates(prepared).values()) == Counter(glycan_templates(scene).values())
     assert resolve(prepared, ForceFieldSpec("auto", "auto")).force_field == "ff14SB"
+
+
+@needs_ambertools
+def test_a_nucleic_acid_too_large_for_charges_names_what_no_template_fits(tmp_path: Path) -> None:
+    scene, _ = leap_scene("A5 U G C U G A U G C3", tmp_path, ("RNA.OL3",))
+    at = next(i for i in range(scene.n_atoms) if scene.atom_names[i] == "H5" and scene.residue_of_atom[i] == 4)
+    fluorinated = replace(scene, elements=(*scene.elements[:at], "F", *scene.elements[at + 1 :]))
+    with pytest.raises(PreparationError, match=r"which lacks U 5; AM1-BCC charges for them take about .* h"):
+        build_system(fluorinated, ForceFieldSpec("auto", "auto"))
