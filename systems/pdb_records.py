@@ -72,6 +72,8 @@ def read_structure(path: Path) -> StructureFile:
         from systems.pdb_columns import read_pdb
 
         found = read_pdb(text, path)
+    if not found.atoms and "_atom_site_fract_x" in text.lower():
+        raise InputError(f"{path} is the CIF of a crystal, in fractions of its cell; give one molecule as SDF or PDB.")
     if not found.atoms:
         raise InputError(f"{path} holds no ATOM or HETATM record; give a PDB or mmCIF file with coordinates.")
     for atom in found.atoms:

@@ -179,3 +179,10 @@ def test_a_stated_link_holds_for_the_alternate_that_stays(tmp_path: Path) -> Non
     path.write_text(path.read_text() + link)
     cb = ALA2.atom_names.index("CB")
     assert read_structure(path).conect == [(cb, 22), (cb, 23)]
+
+
+def test_the_cif_of_a_crystal_is_refused_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "x.cif"
+    path.write_text("data_x\nloop_\n_atom_site_label\n_atom_site_fract_x\nC1 0.1\n")
+    with pytest.raises(InputError, match="the CIF of a crystal"):
+        prepare(str(path))
