@@ -61,24 +61,24 @@ def _read_mmcif(text: str, path: Path) -> StructureFile:
         return found
     if len(blocks) > 1:
         found.notes.append(f"{len(blocks)} structures in the file: the first is taken")
-    tags = [tag.split(".", 1)[-1].lower() for tag in blocks[0].find_mmcif_category("_atom_site.").tags]
-    if len(set(tags)) < len(tags):
+    given = [tag.split(".", 1)[-1].lower() for tag in blocks[0].find_mmcif_category("_atom_site.").tags]
+    if len(set(given)) < len(given):
         raise InputError(f"{path}: its _atom_site loop has a column twice; the file is damaged, fetch it again.")
-    missing = [tag for tag in _NEEDED if tag.lower() not in tags]
+    missing = [tag for tag in _NEEDED if tag.lower() not in given]
     if missing:
         raise InputError(f"{path}: its _atom_site loop lacks {', '.join(sorted(t.lower() for t in missing))}.")
     table = blocks[0].find("_atom_site.", [*_NEEDED, *(f"?{tag}" for tag in _OPTIONAL)])
     models: list[str] = []
     strand = ""
+    tags = [*_NEEDED, *_OPTIONAL]
+    column = tags.index("pdbx_PDB_model_num")
     for number, row in enumerate(table, start=1):
-        item = {
-            tag: row.str(k) for k, tag in enumerate((*_NEEDED, *_OPTIONAL)) if row.has(k) and row[k] not in ("?", ".")
-        }
-        model = item.get("pdbx_PDB_model_num", "1")
+        model = row.str(column) if row.has(column) else "1"
         if model not in models:
             models.append(model)
         if model != models[0]:
             continue
+        item = {tag: row.str(k) for k, tag in enumerate(tags) if row.has(k) and row[k] not in ("?", ".")}
         atom, where = _atom(item, number, path)
         if not atom.element:
             found.unknown[len(found.atoms)] = where
