@@ -47,13 +47,15 @@ WORKERS = 2
 
 def campaign_text(time_ps: float) -> str:
     """Return the campaign's file. The Reference platform: its runs are bit-identical wherever they are resumed."""
+    both = 'temperatures = ["300K", "500K"]'
     tables = []
     for name in SCENES:
-        protocol = "".join(f', protocol = "{one}"' for one in library.protocols(name))
-        tables.append(f'{{ scene = "{name}"{protocol} }}')
+        # A scene's own protocol outweighs what the campaign says.
+        own = [f'protocol = "{one}", {both}, save_every = "20fs"' for one in library.protocols(name)]
+        tables.append("{ " + ", ".join([f'scene = "{name}"', *own]) + " }")
     return (
         f"scenes = [{', '.join(tables)}]\n"
-        'temperatures = ["300K", "500K"]\n'
+        f"{both}\n"
         "replicas = 2\n"
         f'time = "{time_ps:g}ps"\n'
         'save_every = "20fs"\n'

@@ -202,6 +202,16 @@ def test_a_campaign_s_protocol_is_outweighed_by_its_settings_and_outweighs_them_
     assert [run.config.temperature_k for run in _read(tmp_path, own_axis + shared).runs] == [300.0, 400.0, 310.0]
 
 
+def test_the_bench_s_molecules_run_as_in_md17_at_both_temperatures(tmp_path: Path) -> None:
+    from surrogate.bench.campaign import campaign_text
+
+    runs = _read(tmp_path, campaign_text(20.0)).runs
+    assert len(runs) == 40
+    aspirin = [run.config for run in runs if run.scene == "aspirin"]
+    assert [config.temperature_k for config in aspirin] == [300.0, 300.0, 500.0, 500.0]
+    assert {(c.friction_per_ps, c.timestep_ps, c.save_every_ps) for c in aspirin} == {(0.1, 0.0005, 0.02)}
+
+
 def test_the_file_in_the_readme_is_one(tmp_path: Path, repository: Path) -> None:
     blocks = re.findall(r"```toml\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
     (tmp_path / "pdb").mkdir()
