@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from systems.bonding import Residue, links_of
+from systems.bonding import Residue
 from systems.components import component, hydrogens_of
 from systems.errors import PreparationError
+from systems.missing_atoms import links_of
 from systems.pdb_records import AtomRecord
 from systems.residues import template_for
 
