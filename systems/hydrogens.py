@@ -1,4 +1,4 @@
-"""Which hydrogens OpenMM's Modeller is asked to put on each residue."""
+"""Which hydrogens OpenMM's Modeller is asked to put on each residue, and an account of what pH decided."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from systems.bonding import Residue
 from systems.components import component, hydrogens_of
 from systems.errors import PreparationError
 from systems.missing_atoms import links_of
+from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
 from systems.residues import template_for
 
+# Hydrogens (in OpenMM's names) whose presence tells the protonation state.
+TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}
+_STATES = {
+    ("ASP", (False,)): "ASP charged", ("ASP", (True,)): "ASP neutral (ASH)", ("GLU", (False,)): "GLU charged",
+    ("GLU", (True,)): "GLU neutral (GLH)", ("LYS", (True, True, True)): "LYS charged",
+    ("LYS", (False, True, True)): "LYS neutral (LYN)", ("LYS", (True, True, False)): "LYS neutral (LYN)",
+    ("HIS", (True, True)): "HIS charged (HIP)", ("HIS", (True, False)): "HIS neutral (HID)",
+    ("HIS", (False, True)): "HIS neutral (HIE)", ("CYS", (True,)): "CYS neutral",
+}  # fmt: skip
 # A variant of Modeller's by name, the hydrogens one by one with their heavy atoms, or None: what pH decides.
 Asked = str | list[tuple[str, str]] | None
 # Hydrogens that Modeller's own rules count rightly: peptide bonds, and sulfurs in disulfides.
@@ -62,3 +72,26 @@ def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequen
     if ends:
         return "ASH" if template.name == "ASP" else "GLH"
     return template.name if not residue.lacks_hydrogens else None
+
+
+def protonation_account(
+    labels: Sequence[str],
+    keys: Sequence[tuple[str, str, str]],
+    given: Sequence[Asked],
+    records: Sequence[AtomRecord],
+    ph: float,
+) -> list[str]:
+    """One line for each kind of protonation that `ph` decided, that is where `given` holds no variant."""
+    hydrogens: dict[tuple[str, str, str], set[str]] = {}
+    for atom in records:
+        if atom.element == "H":
+            hydrogens.setdefault(atom.residue_key, set()).add(atom.name)
+    states: dict[str, list[str]] = {}
+    for label, key, variant in zip(labels, keys, given, strict=True):
+        template = template_for(key[2])
+        if variant is None and template is not None and template.name in TITRATED:
+            marks = tuple(h in hydrogens.get(key, set()) for h in TITRATED[template.name])
+            state = _STATES.get((template.name, marks))
+            if state:
+                states.setdefault(state, []).append(label)
+    return [f"protonation at pH {ph:g}: {state}: {listed(found)}" for state, found in sorted(states.items())]

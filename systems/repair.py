@@ -16,7 +16,7 @@ import numpy.typing as npt
 from systems.bonding import Bonding, Residue
 from systems.element_data import covalent_radius_nm
 from systems.errors import PreparationError
-from systems.hydrogens import Asked, asked_hydrogens
+from systems.hydrogens import TITRATED, asked_hydrogens, protonation_account
 from systems.modified_residues import listed
 from systems.pdb_records import AtomRecord
 from systems.residues import template_for
@@ -24,15 +24,6 @@ from systems.structure import atom_label
 
 _C_OXT_ANGSTROM = 1.25
 _HYDROGEN_ANGSTROM = {"C": 1.09, "N": 1.01, "O": 0.96, "S": 1.34}
-# Hydrogens (in OpenMM's names) whose presence tells the protonation state.
-_TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}
-_STATES = {
-    ("ASP", (False,)): "ASP charged", ("ASP", (True,)): "ASP neutral (ASH)", ("GLU", (False,)): "GLU charged",
-    ("GLU", (True,)): "GLU neutral (GLH)", ("LYS", (True, True, True)): "LYS charged",
-    ("LYS", (False, True, True)): "LYS neutral (LYN)", ("LYS", (True, True, False)): "LYS neutral (LYN)",
-    ("HIS", (True, True)): "HIS charged (HIP)", ("HIS", (True, False)): "HIS neutral (HID)",
-    ("HIS", (False, True)): "HIS neutral (HIE)", ("CYS", (True,)): "CYS neutral",
-}  # fmt: skip
 _UNKNOWN = "XCC"
 _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 
@@ -107,29 +98,6 @@ def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: npt.NDArray[np
             topology.addBond(place[i], place[j])
 
 
-def protonation_account(
-    labels: Sequence[str],
-    keys: Sequence[tuple[str, str, str]],
-    given: Sequence[Asked],
-    records: Sequence[AtomRecord],
-    ph: float,
-) -> list[str]:
-    """One line for each kind of protonation that `ph` decided, that is where `given` holds no variant."""
-    hydrogens: dict[tuple[str, str, str], set[str]] = {}
-    for atom in records:
-        if atom.element == "H":
-            hydrogens.setdefault(atom.residue_key, set()).add(atom.name)
-    states: dict[str, list[str]] = {}
-    for label, key, variant in zip(labels, keys, given, strict=True):
-        template = template_for(key[2])
-        if variant is None and template is not None and template.name in _TITRATED:
-            marks = tuple(h in hydrogens.get(key, set()) for h in _TITRATED[template.name])
-            state = _STATES.get((template.name, marks))
-            if state:
-                states.setdefault(state, []).append(label)
-    return [f"protonation at pH {ph:g}: {state}: {listed(found)}" for state, found in sorted(states.items())]
-
-
 def records_from_openmm(
     topology: Any, positions_nm: npt.NDArray[np.float64], keys: Sequence[tuple[str, str, str]]
 ) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
@@ -178,7 +146,7 @@ def _chains(bonding: Bonding) -> list[list[Residue]]:
 
     def burden(k: int) -> int:
         ends = (bonding.residues[k].template, bonding.residues[before.get(k, k)].template)
-        return sum(t is not None and t.name in _TITRATED for t in ends)
+        return sum(t is not None and t.name in TITRATED for t in ends)
 
     starts = [k for k in range(len(bonding.residues)) if k not in before]
     chains: list[list[Residue]] = []

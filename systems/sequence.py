@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from systems.errors import PreparationError, nearest
 from systems.geometry import signed_volumes, superposition, torsion
+from systems.hydrogens import protonation_account
 from systems.modified_residues import D_RESIDUES
 from systems.pdb_records import read_structure
-from systems.repair import fixed_random_numbers, protonation_account, records_from_openmm
+from systems.repair import fixed_random_numbers, records_from_openmm
 from systems.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.scene import Scene
 from systems.structure import scene_from_records

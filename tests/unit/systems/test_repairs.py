@@ -15,11 +15,12 @@ from systems.geometry import signed_volumes
 from systems.handedness import compare, handedness, say_inverted
 from systems.heterogens import ligand_atoms
 from systems.hybrid36 import decode, encode
+from systems.hydrogens import protonation_account
 from systems.modified_residues import standardise
 from systems.pdb_records import AtomRecord, read_structure
 from systems.pdb_text import pdb_text
 from systems.prepare import prepare
-from systems.repair import _with_usual_lengths, complete, protonation_account
+from systems.repair import _with_usual_lengths, complete
 
 ALA2 = library.load("alanine-dipeptide")
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
