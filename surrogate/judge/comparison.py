@@ -25,6 +25,7 @@ from surrogate.judge.lifetimes import lifetime_rows
 from surrogate.judge.movie import Movie, make_movie
 from surrogate.judge.msm_rows import msm_rows
 from surrogate.judge.peptide_protocol import peptide_charts
+from surrogate.judge.peptide_shape import along_time, secondary_structure
 from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
 from surrogate.judge.shape_rows import shape_rows
 from surrogate.judge.slow_motion import longest_correlation
@@ -61,6 +62,8 @@ ROOMS: tuple[Room, ...] = (
     intervention_rows,
     survival_charts,
     energy_rows,
+    secondary_structure,
+    along_time,
 )
 
 _MIN_FRAMES = 20
@@ -257,10 +260,13 @@ def _judge(
     seams, without_seams = relaxation.boundary_row(trio)
     rooms = [room(trio) for room in ROOMS]
     more = [row for found, _, _ in rooms for row in found]
-    judged = verdict.judge_rows(by_group([*rows, *kinetic, *slowest, *seams, *more]), options, account.imposed)
+    samples = effective_samples(round(trio.compared_ps / trio.reference.features.lag_ps), correlation)
+    every = by_group([*rows, *kinetic, *slowest, *seams, *more])
+    if samples < remarks.LEAST_FOR_TESTS:
+        every = verdict.untested(every)
+    judged = verdict.judge_rows(every, options, account.imposed)
     found = verdict.findings(judged)
     truth = trio.reference
-    samples = effective_samples(round(trio.compared_ps / truth.features.lag_ps), correlation)
     doubts = remarks.doubts(trio, max(correlation, own))
     kind = verdict.status(judged, doubts)
     worth = worths(reference, candidate, replicate, torsions, options)

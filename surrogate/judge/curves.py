@@ -12,6 +12,7 @@ import numpy.typing as npt
 from surrogate.judge import distributions
 from surrogate.judge.charts import Chart, Curve
 from surrogate.judge.charts import Histogram as Histogram
+from surrogate.judge.equal_atoms import evenly
 from surrogate.judge.rows import Trio
 from surrogate.judge.structure import Features
 from systems import validity
@@ -20,6 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 MAX_TIMELINE_BINS = 240
 MAX_DRAWN_BOUNDARIES = 60
+MOST_RESIDUES = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +101,10 @@ class Curves(Curve):
 
 
 def ramachandran_maps(trio: Trio) -> tuple[RamachandranMap, ...]:
-    """Return the joint counts of every residue with both torsions."""
+    """Return the joint counts of every residue with both torsions, of many of some."""
     bins = distributions.RAMACHANDRAN_BINS
     out = []
-    for residue in trio.torsions.residues:
+    for residue in evenly(trio.torsions.residues, MOST_RESIDUES):
         maps = []
         for sample in trio.samples:
             counts = distributions.block_counts_joint(
@@ -131,13 +133,13 @@ def histogram(
 
 
 def torsion_histograms(trio: Trio) -> tuple[Histogram, ...]:
-    """Return the histograms of every phi and psi."""
+    """Return the histograms of every phi and psi, of many of some."""
     bins = distributions.TORSION_BINS
     out = []
-    for k, label in enumerate(trio.torsions.phi_labels):
+    for k, label in evenly(list(enumerate(trio.torsions.phi_labels)), MOST_RESIDUES):
         series = [[x[:, k] for x in s.features.phi] for s in trio.samples]
         out.append(histogram(trio, series, bins, f"φ {label}", "rad"))
-    for k, label in enumerate(trio.torsions.psi_labels):
+    for k, label in evenly(list(enumerate(trio.torsions.psi_labels)), MOST_RESIDUES):
         series = [[x[:, k] for x in s.features.psi] for s in trio.samples]
         out.append(histogram(trio, series, bins, f"ψ {label}", "rad"))
     return tuple(out)

@@ -45,9 +45,9 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
     for k in chosen:
         fine = with_own_blocks(trio, [_breaks_beyond_rate(f, groups[k]) for f in formed])
         sums = [_group_sums(f, groups[k], s.blocks) for f, s in zip(formed, fine.samples, strict=True)]
-        if not sums[1][1].sum():
-            never = "never breaks it" if sums[1][0].sum() else "never forms it"
-            skipped.append((f"Lifetime of the hydrogen bond {labels[k]}", f"the candidate {never}"))
+        if sums[1][1].sum() < _LEAST_BREAKS:
+            often = "never forms it" if not sums[1][0].sum() else f"breaks it {sums[1][1].sum():.0f} times"
+            skipped.append((f"Lifetime of the hydrogen bond {labels[k]}", f"the candidate {often}"))
             continue
         with np.errstate(invalid="ignore", divide="ignore"):
             values = [float(lag_ps * f.sum() / b.sum()) if b.sum() else np.nan for f, b in sums]

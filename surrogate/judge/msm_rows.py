@@ -27,6 +27,7 @@ _CHECKED_LAGS = 5
 _LEAST_SHARE = 0.25
 _DRAWN_LAGS = (0.2, 0.5, 1.0, 2.0, 3.0, 5.0)
 _LANDSCAPE_BINS = 50
+_BAND_DRAWS = 60
 ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
 
@@ -266,6 +267,11 @@ def _check_chart(trio: Trio, model: msm.Model, s: _States, role: Role) -> Chart:
     )
 
 
+def _square(counts: FloatArray) -> FloatArray:
+    n = math.isqrt(len(counts))
+    return counts.reshape(n, n)
+
+
 def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:
     """Implied timescales against the lag they were estimated at: level where the model is Markovian.
 
@@ -277,19 +283,25 @@ def _timescale_chart(trio: Trio, model: msm.Model, states: Sequence[_States], na
     lags = sorted({max(1, round(f * model.lag_frames)) for f in _DRAWN_LAGS})
     lags = [lag for lag in lags if 10 * lag <= longest]
     lines = []
-    caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference."
+    caption = "Of the Markov state model against the lag it is estimated at; states are those of the reference; bands "
+    caption += "hold 95 % of bootstrap draws."
     for s, role in zip(states, ROLES, strict=True):
         missing = _never_held(s)
         if missing.any():
             where = " and ".join(names[i] for i in np.flatnonzero(missing).tolist())
             caption += f" The {role} never stays in {where}, and has so many processes less."
-        times = []
+        times, drawn = [], []
         for lag in lags:
-            counts = msm.block_transitions(s.micro, s.sample.blocks, n_micro, lag).sum(0).reshape(n_micro, n_micro)
-            times.append(timescale(msm.slow_functions(counts, n_slow)[0], lag * lag_ps))
-        table = np.array(times)
+            per_block = msm.block_transitions(s.micro, s.sample.blocks, n_micro, lag)
+            times.append(timescale(msm.slow_functions(_square(per_block.sum(0)), n_slow)[0], lag * lag_ps))
+            of_draws = [msm.slow_functions(_square(w @ per_block), n_slow)[0] for w in s.sample.weights[:_BAND_DRAWS]]
+            drawn.append(np.nanquantile(timescale(np.array(of_draws), lag * lag_ps), [0.025, 0.975], axis=0))
+        table, bands = np.array(times), np.array(drawn)
         n_own = n_slow - int(missing.sum())
-        lines += [Line(f"{role}, process {k + 1}", role, np.array(lags) * lag_ps, table[:, k]) for k in range(n_own)]
+        lines += [
+            Line(f"{role}, process {k + 1}", role, np.array(lags) * lag_ps, table[:, k], bands[:, 0, k], bands[:, 1, k])
+            for k in range(n_own)
+        ]
     return LineChart(
         section="kinetics",
         title="Implied timescales",

@@ -36,12 +36,11 @@ def maps(judgement: Judgement, temperature_k: float) -> list[Album]:
     """Return four maps for each of the first residues: reference, candidate, replicate, difference."""
     out = []
     for data in judgement.curves.ramachandran[:MAX_DRAWN]:
-        row = judgement.row(f"joint_jsd:{data.label}")
-        captions = (
-            (data.reference, "Reference"),
-            (data.candidate, f"Candidate: distance {number(row.candidate)} to the reference"),
-            (data.replicate, f"Replicate: distance {number(row.replicate)}, the floor"),
-        )
+        row = next((r for r in judgement.rows if r.key == f"joint_jsd:{data.label}"), None)
+        captions = [(data.reference, "Reference"), (data.candidate, "Candidate"), (data.replicate, "Replicate")]
+        if row is not None:  # of many residues the mean has one
+            captions[1] = (data.candidate, f"Candidate: distance {number(row.candidate)} to the reference")
+            captions[2] = (data.replicate, f"Replicate: distance {number(row.replicate)}, the floor")
         shown = [Figure(figures.ramachandran(f"{c}, {data.label}", m, temperature_k), c) for m, c in captions]
         change = figures.difference(f"Candidate minus reference, {data.label}", data, temperature_k)
         title = f"φ and ψ of {data.label}"

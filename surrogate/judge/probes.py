@@ -310,11 +310,16 @@ def _contact_pairs(scene: Scene) -> tuple[IntArray, float]:
 
 
 def _ends(scene: Scene) -> tuple[int, int] | None:
-    """The two heavy atoms furthest apart in bonds (the lowest such pair); None below four bonds."""
+    """The two heavy atoms furthest apart in bonds (the lowest such pair), None below four bonds; of chains of three
+    residues and more the first and the last alpha carbon, lest a long side chain pass for the end."""
     import networkx as nx
 
     from systems.chemistry import bonded_graph
 
+    alphas = _alpha_carbons(scene)
+    chains = [scene.chain_of_residue[r] for r in scene.residue_of_atom[alphas].tolist()]
+    if len(alphas) >= 3 and chains.count(chains[0]) >= 3:
+        return int(alphas[0]), int(alphas[len(chains) - 1 - chains[::-1].index(chains[0])])
     graph = bonded_graph(scene).subgraph(scene.heavy_idx.tolist())
     best, longest = None, 3
     for component in nx.connected_components(graph):

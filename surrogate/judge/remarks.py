@@ -14,6 +14,8 @@ from systems import validity
 from systems.units import format_time_ps
 
 LEAST_SAMPLES = 20
+# Fewer, and error bars of what follows the slow motion are themselves not known.
+LEAST_FOR_TESTS = 5
 # What is known of the truth, however short the candidate is.
 LEAST_FOR_WORTH = 10
 _MENTIONED = 3

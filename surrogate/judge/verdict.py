@@ -18,6 +18,10 @@ _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0, "imposed": 0}
 _MENTIONED = 3
+_FAST_KEYS = (
+    "valid:", "copies", "bond_", "angle_", "temperature", "energy_", "phi_given", "torsions_given", "torsion_step",
+    "hydrogen_bond_lifetime", "chunk_step",
+)  # fmt: skip
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
 
@@ -112,6 +116,14 @@ def _share_word(row: Row) -> Word:
     return "differs" if excess <= _FAILS_AT * row.tolerance else "fails"
 
 
+def untested(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of a comparison too short to test what follows the slow motion: those rows without a p-value.
+
+    What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state).
+    """
+    return [r if r.key.startswith(_FAST_KEYS) else replace(r, p_value=math.nan, p_replicate=math.nan) for r in rows]
+
+
 def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
     """Return the word for the whole: that of the worst row; undecided when most statistical rows are, or by `doubts`.
 
@@ -186,7 +198,7 @@ def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, doubts: D
             f"tolerance: {worst}{more}.{tail}"
         )
     if kind == "undecided":
-        why = "; ".join(filter(None, doubts)) or "the error bars are wider than the tolerances"
+        why = "; ".join(filter(None, reversed(doubts))) or "the error bars are wider than the tolerances"
         all_the_same = f" Significant as it stands: {worst}{more}." if found else ""
         return f"Undecided over {compared}: {why}.{all_the_same}{tail}"
     return (

@@ -1,0 +1,56 @@
+"""Secondary structure by three in a row, charts along time, ends of chains, the worth's units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surrogate.judge.charts import LineChart
+from surrogate.judge.comparison import Judgement, compare
+from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.peptide_shape import in_a_row
+from surrogate.judge.probes import _ends
+from surrogate.judge.rows import Options
+from surrogate.judge.worth import Worth
+
+
+def test_three_in_a_row_make_a_helix() -> None:
+    inside = np.array([[1, 1, 1, 0, 1, 1], [1, 1, 0, 1, 1, 1], [1, 1, 1, 1, 1, 1], [1, 0, 1, 0, 1, 0]], dtype=bool)
+    expected = np.array([[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1], [1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0]], dtype=bool)
+    np.testing.assert_array_equal(in_a_row(inside), expected)
+
+
+@pytest.fixture(scope="module")
+def judged(simulate: Callable[..., Ensemble]) -> Judgement:
+    three = [simulate(k, 900) for k in (81, 82, 83)]
+    return compare(three[0], [three[1]], three[2], options=Options(peptide_recipe=False)).judgements[0]
+
+
+def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
+    charts = {c.title: c for c in judged.curves.charts if isinstance(c, LineChart)}
+    for title in ("RMSD along time", "φ of ALA 2 along time", "ψ of ALA 2 along time"):
+        lines = charts[title].lines
+        assert [line.name for line in lines] == ["reference", "candidate", "replicate"]
+        assert all(len(line.x) == len(line.y) == 300 for line in lines), "900 frames, every third"
+    phi = charts["φ of ALA 2 along time"].lines[0].y
+    assert np.nanmax(np.abs(np.diff(phi))) <= 180.0, "no stroke across the picture"
+    assert "fewer than 5 residues" in dict(judged.skipped)["Secondary structure"]
+
+
+def test_ends_are_those_of_the_chain() -> None:
+    from systems.prepare import prepare
+
+    scene = prepare("sequence:ACE-LYS-ALA-ARG-NME")
+    ends = _ends(scene)
+    assert ends is not None and [scene.atom_names[i] for i in ends] == ["CA", "CA"]
+
+
+def test_both_ends_of_an_interval_share_a_unit() -> None:
+    errors = (1.0, 0.1)
+    worth = Worth("x", "distribution", "x", 3400.0, 380.0, None, "", 0.1, (80.0, 1e4), errors, errors, errors)
+    assert worth.in_words() == "3.4 ns [0.38 ns, > 10 ns]"
+    assert replace(worth, high_ps=23_997.0).in_words() == "3.4 ns [0.38 ns, 24 ns]"
+    assert replace(worth, worth_ps=690.0, low_ps=41.0, high_ps=820.0).in_words() == "690 ps [41 ps, 820 ps]"
