@@ -57,6 +57,7 @@ def _exploded(x: Frames) -> Frames:
     return out
 
 
+_MIRROR = np.array([-1, 1, 1], dtype=np.float32)
 FAIR = ("indistinguishable", "undecided")
 WRONG = ("different", "broken")
 CASES = (
@@ -68,7 +69,7 @@ CASES = (
     Case("1 ns, ten times", lambda r, x, y: np.tile(x[:1000], (10, 1, 1)), ("different",), "90 % of frames are copies"),
     Case("one frame all along", lambda r, x, y: np.repeat(x[:1], len(x), axis=0), ("broken",), "does not move"),
     Case("frames in random order", lambda r, x, y: np.random.default_rng(0).permutation(x), ("different",), "too fast"),
-    Case("the mirror image", lambda r, x, y: x * np.array([-1, 1, 1], dtype=np.float32), ("broken",), "inverted stereocentre"),
+    Case("the mirror image", lambda r, x, y: x * _MIRROR, ("broken",), "inverted stereocentre"),
     Case("3 % larger", lambda r, x, y: x * np.float32(1.03), WRONG, "bonds are 3.* long"),
     Case("noise of 3 pm on every atom", lambda r, x, y: _noisy(x, 0.003), WRONG, "vibrate as at"),
     Case("one exploded frame", lambda r, x, y: _exploded(x), ("broken",), "came apart"),

@@ -17,7 +17,8 @@ DEFINITIONS: tuple[Definition, ...] = (
     Definition(
         "Equal terms",
         "All trajectories are compared at the same save interval. Distances are taken over the same number of frames "
-        "(from the start, replicas in the order given); tests use all there is. Segments are never joined: no time correlation crosses from one to the next.",
+        "(from the start, replicas in the order given); tests use all there is. Segments are never joined: no time "
+        "correlation crosses from one to the next.",
         "",
     ),
     Definition(
@@ -29,15 +30,15 @@ DEFINITIONS: tuple[Definition, ...] = (
     Definition(
         "Blocks",
         "Error bars and tests rest on blocks of ten correlation times of the slowest motion found among all torsions, "
-        "rings, size and shape, and TIC 0, in reference and replicate together. What moves fast within a state (φ given "
-        "ψ's basin, steps, lifetimes) has blocks of its own. Fewer than 20 independent samples, or states between which "
-        "hardly any run passes: undecided.",
+        "rings, size and shape, and TIC 0, in reference and replicate together. What moves fast within a state (φ "
+        "given ψ's basin, steps, lifetimes) has blocks of its own. Fewer than 20 independent samples, or states "
+        "between which hardly any run passes: undecided.",
         "Flyvbjerg and Petersen, J. Chem. Phys. 91, 461 (1989)",
     ),
     Definition(
         "Step of all torsions",
-        "Root mean square change of φ, ψ and every rotatable torsion from one frame to the next, as if every trajectory "
-        "were in each quarter of TIC 0 as often as the truth is.",
+        "Root mean square change of φ, ψ and every rotatable torsion from one frame to the next, as if every "
+        "trajectory were in each quarter of TIC 0 as often as the truth is.",
         "",
     ),
     Definition(
