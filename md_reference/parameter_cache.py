@@ -6,14 +6,17 @@ import gzip
 import json
 import os
 import tempfile
+import zlib
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from md_reference.prmtop import Prmtop
+from systems.checksums import sealed, unsealed
 from systems.chemistry import match_atoms
 from systems.errors import InputError, OutOfDomainError, StorageError
+from systems.outside import gunzipped
 from systems.scene import Scene
 
 _FORMAT = 1
@@ -84,7 +87,8 @@ def store(path: Path, entry: Entry) -> Entry:
     """
     template = replace(entry.template, provenance={})
     record = {"format": _FORMAT, "source": entry.source, "scene": template.to_dict(), "prmtop": entry.prmtop}
-    data = gzip.compress(json.dumps(record, sort_keys=True).encode(), mtime=0)
+    text = sealed(json.dumps(record, sort_keys=True))
+    data = gzip.compress(text.encode(), mtime=0)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".new")
@@ -108,12 +112,13 @@ def store(path: Path, entry: Entry) -> Entry:
 def _read(path: Path) -> Entry | None:
     """Return an entry, or None where there is none or it is damaged (it is then made again)."""
     try:
-        record = json.loads(gzip.decompress(path.read_bytes()))
+        text = gunzipped(path.read_bytes()).decode()
+        record = json.loads(unsealed(text) if path.parent != shipped_folder() else text)
         if record["format"] != _FORMAT:
             return None
         entry = Entry(Scene.from_dict(record["scene"]), record["prmtop"], record["source"])
         if Prmtop(entry.prmtop).n_atoms != entry.template.n_atoms:
             return None
         return entry
-    except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, InputError):
+    except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, InputError, zlib.error):
         return None

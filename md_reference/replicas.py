@@ -16,18 +16,21 @@ from md_reference.parent_watch import end_with_parent
 from md_reference.platforms import PlatformChoice, measured_platform
 from md_reference.run_config import MDConfig, check_run
 from md_reference.simulate import PreparingFn, checkpoint_path, simulate
-from systems.errors import SimulationError, SurromdError
+from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 
+_MOST_REPLICAS = 10_000
 # (frames done over all replicas, frames in all) -> None
 ProgressFn = Callable[[int, int], None]
 
 
 def replica_paths(out: Path, n_replicas: int) -> list[Path]:
-    """Return `out` itself for one replica, else NAME_r0.h5, NAME_r1.h5, ..."""
+    """Return `out` itself for one replica, else NAME_r0.h5, NAME_r1.h5, ... Raises InputError for too many."""
     if n_replicas == 1:
         return [out]
+    if n_replicas > _MOST_REPLICAS:
+        raise InputError(f"{n_replicas:.4g} replicas are too many, {_MOST_REPLICAS} at most; use a campaign for more.")
     return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from md_reference.forcefield import ForceFieldSpec, resolve
 from md_reference.integrators import check_ensemble
 from systems.errors import InputError
+from systems.outside import check_disk
 from systems.scene import Scene
 from systems.units import format_time_ps, whole_steps
 
@@ -83,7 +84,8 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
 
     Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
     """
-    _ = config.n_frames, config.steps_per_frame
+    _ = config.steps_per_frame
+    check_disk(out, config.n_frames, scene.n_atoms)
     if config.columns and out.suffix.lower() == ".dcd":
         raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
     return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))

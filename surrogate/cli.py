@@ -47,6 +47,7 @@ from surrogate.cli_reproduce import reproduce
 from surrogate.md_options import MDOptions, Preparation, Replicas
 from systems.errors import SurromdError
 from systems.interrupts import interrupted_by_signals
+from systems.outside import printable
 from systems.units import (
     parse_temperature_k,
     parse_time_ps,
@@ -75,6 +76,8 @@ class _Group(TyperGroup):
         except _usage_errors():
             raise
         except Exception as error:  # a fault of ours: one line for the user, the rest on demand
+            if "null byte" in str(error):
+                _fail("error: a path holds a NUL character, which no file's name can have", 1)
             _fail(f"error: unexpected {type(error).__name__}: {error} (a bug; SURROMD_DEBUG=1 shows where)", 1)
 
 
@@ -85,7 +88,7 @@ def _usage_errors() -> tuple[type[BaseException], ...]:
 
 
 def _fail(message: str, code: int) -> None:
-    typer.echo(" ".join(message.split()), err=True)
+    typer.echo(printable(" ".join(message.split())), err=True)
     raise typer.Exit(code) from None
 
 

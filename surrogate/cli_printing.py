@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from systems.outside import printable
+
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison, Judgement
 
@@ -32,13 +34,13 @@ def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
             for entry in value:
                 typer.echo(f"{margin}  {_one_line(entry)}")
         else:
-            text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else _plain(value)
+            text = ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else _plain(value)
             typer.echo(f"{margin}{key:<{width}}  {text}")
 
 
 def _one_line(entry: Any) -> str:
     if not isinstance(entry, dict):
-        return str(entry)
+        return printable(str(entry))
     if "what" in entry:
         saves = f" ({entry['saves']})" if entry.get("saves") else ""
         return f"{entry['what']}: {entry['why']}{saves}"
@@ -46,7 +48,7 @@ def _one_line(entry: Any) -> str:
 
 
 def _plain(value: Any, digits: int = 6) -> str:
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+    return f"{value:.{digits}g}" if isinstance(value, float) else printable(str(value))
 
 
 def print_library(entries: list[dict[str, Any]]) -> None:

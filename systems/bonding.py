@@ -13,6 +13,7 @@ from systems.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.errors import PreparationError
 from systems.missing_atoms import note_missing
 from systems.modified_residues import listed
+from systems.outside import check_density
 from systems.pdb_records import AtomRecord
 from systems.residues import ResidueTemplate, canonical_heavy_name, template_for
 from systems.structure import atom_label
@@ -89,6 +90,7 @@ def find_bonds(
 
     x = np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0
     tree = cKDTree(x)
+    check_density(tree, 0.35, "the structure")
     near = tree.query_pairs(0.35, output_type="ndarray").reshape(-1, 2)
     length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.element_data import covalent_radius_nm
+from systems.outside import check_density
 from systems.scene import Scene
 
 _TOLERANCE_NM = 0.04
@@ -44,7 +45,9 @@ def bonds_by_distance(elements: Sequence[str], positions_nm: npt.ArrayLike) -> n
 
     x = np.asarray(positions_nm, dtype=np.float64)
     radii = np.array([covalent_radius_nm(e) for e in elements])
-    near = cKDTree(x).query_pairs(2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM, output_type="ndarray")
+    reach, tree = 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM, cKDTree(x)
+    check_density(tree, reach, "the molecule")
+    near = tree.query_pairs(reach, output_type="ndarray")
     length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
     close = length < radii[near[:, 0]] + radii[near[:, 1]] + _TOLERANCE_NM
     best: dict[int, tuple[float, int]] = {}

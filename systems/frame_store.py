@@ -23,6 +23,7 @@ import numpy.typing as npt
 from systems.atomic_file import AtomicFile, journal_path
 from systems.checksums import checksum_rows, frame_checksums, frames_digest, sealed, unsealed
 from systems.errors import InputError, StorageError, TrajectoryError
+from systems.outside import check_hdf5
 from systems.scene import Scene
 from systems.trajectory_types import FrameBlock
 from systems.whole_file import create_whole, refuse_existing, storage_error
@@ -152,7 +153,10 @@ def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
         before = AtomicFile(path, writable=False)
         seen = before if before.is_unfinished else path
     try:
-        return h5py.File(seen, "r" if source is None else "r+")
+        file = h5py.File(seen, "r" if source is None else "r+")
+        with damage_reported(path):
+            check_hdf5(file, path)
+        return file
     except (OSError, RuntimeError, ValueError) as error:
         text = str(error)
         if "truncated" in text:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import math
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from systems.embedding import drop_isotopes, embed, require, sanitise
 from systems.errors import InputError, PreparationError
 from systems.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
+from systems.outside import gunzipped
 from systems.salts import main_molecule
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
@@ -159,10 +160,8 @@ def read_text(path: Path) -> str:
     if path.is_dir():
         raise InputError(f"{path} is a directory; give a structure file.")
     try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-    except (OSError, EOFError, ValueError) as error:
+        data = gunzipped(path.read_bytes())
+    except (OSError, ValueError, zlib.error) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file.") from error
     if not data.strip():
         raise InputError(f"{path} is empty; give a molecule with coordinates.")

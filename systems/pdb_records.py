@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 import re
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from systems.errors import InputError
+from systems.outside import gunzipped
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
@@ -113,9 +113,7 @@ def read_text(path: Path) -> str:
     if _suffix(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
         raise InputError(f"{path} has suffix {path.suffix!r}; structures are read from {known}, also gzipped.")
     try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
+        data = gunzipped(path.read_bytes())
     except (OSError, EOFError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file and its permissions.") from error
     except Exception as error:  # zlib.error has no common base with the others

@@ -65,7 +65,7 @@ def draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(_STYLE | {"text.parse_math": False}):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasSVG(figure)
         paint(figure, figure.add_subplot())

@@ -28,7 +28,7 @@ def to_markdown(comparison: Comparison, *, command: str) -> str:
     parts += _list("Notes", comparison.notes)
     parts.append("## What the numbers mean")
     parts += [f"**{d.term}**: {_text(d.meaning)} {_text(d.source)}".rstrip() for d in DEFINITIONS]
-    parts += ["## How to make this report again", f"```\n{command}\n```"]
+    parts += ["## How to make this report again", "```\n{}\n```".format(command.replace("`", "'"))]
     versions = ", ".join(f"{k} {v}" for k, v in comparison.versions.items())
     parts.append(f"Random draws: seed {comparison.options.seed}. {versions}.")
     return "\n\n".join(parts) + "\n"

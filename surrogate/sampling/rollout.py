@@ -34,6 +34,7 @@ from systems.checkpoint import (
 from systems.claim import claimed_outputs
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
+from systems.outside import check_disk
 from systems.scene import Scene
 from systems.selection import part_of
 from systems.trajectory import open_trajectory
@@ -100,6 +101,7 @@ def rollout(
     )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     checks = Guard(weights.domain)
+    check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
 
     with ExitStack() as stack:
         asked_to_stop = stack.enter_context(deferred_interrupt())

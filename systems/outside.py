@@ -1,0 +1,90 @@
+"""Limits of what comes from outside: how much a small file may stand for, before anything is made of it."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from systems.errors import InputError, PreparationError, TrajectoryError
+
+if TYPE_CHECKING:
+    import h5py
+    from scipy.spatial import cKDTree
+
+_TEXT_BYTES = 512_000_000
+# HDF5's columns that are read whole: more than this, and more than so many times the file, is not believed.
+_COLUMN_BYTES, _PACKED = 64_000_000, 100
+# Atoms have some dozen neighbours; this many times as many stand in each other.
+_PAIRS_PER_ATOM = 500
+
+
+def gunzipped(data: bytes) -> bytes:
+    """Return the content of a gzip file, or the data where they are none. Raises ValueError, zlib.error for too much."""
+    if data[:2] != b"\x1f\x8b":
+        return data
+    parts, size = [], 0
+    while data:
+        engine = zlib.decompressobj(wbits=31)
+        parts.append(engine.decompress(data, _TEXT_BYTES - size + 1))
+        size += len(parts[-1])
+        if size > _TEXT_BYTES:
+            raise ValueError(f"it unpacks to more than {_TEXT_BYTES // 1_000_000} MB")
+        if not engine.eof:
+            raise ValueError("it is cut short")
+        data = engine.unused_data.lstrip(b"\0")
+    return b"".join(parts)
+
+
+def check_hdf5(file: h5py.File, path: Path) -> None:
+    """Raise TrajectoryError for an HDF5 file that leads to other files, or declares far more than it holds."""
+    import h5py
+
+    size = os.stat(path).st_size
+
+    def look(name: str, link: Any) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            raise TrajectoryError(f"{path}: /{name} is a link into another file ({link.filename}); copy the data in.")
+        if not isinstance(link, h5py.HardLink):
+            return
+        found = file.get(name)
+        if not isinstance(found, h5py.Dataset) or not found.size:
+            return
+        if found.external or found.is_virtual:
+            raise TrajectoryError(f"{path}: the data of /{name} lie in another file; copy them in.")
+        declared = found.size * found.dtype.itemsize
+        at_once = math.prod(found.chunks) * found.dtype.itemsize if found.chunks and found.ndim > 1 else declared
+        if at_once > max(_COLUMN_BYTES, _PACKED * size):
+            raise TrajectoryError(
+                f"{path} is damaged: /{name} declares {at_once / 1e9:.3g} GB in a file of {size / 1e6:.3g} MB."
+            )
+        if not found.id.get_storage_size():
+            raise TrajectoryError(f"{path} is damaged: /{name} declares {declared} bytes and holds none.")
+
+    file.visititems_links(look)
+
+
+def check_disk(out: Path, n_frames: int, n_atoms: int) -> None:
+    """Raise InputError for a trajectory that is larger than the whole disk."""
+    needed = 12.0 * n_frames * n_atoms
+    total = shutil.disk_usage(out.parent).total if out.parent.is_dir() else float("inf")
+    if needed > total:
+        raise InputError(
+            f"{out}: {n_frames:.3g} frames of {n_atoms} atoms take {needed / 1e9:.3g} GB, the disk has "
+            f"{total / 1e9:.3g} GB; save more rarely, or simulate for a shorter time."
+        )
+
+
+def check_density(tree: cKDTree, radius: float, what: str) -> None:
+    """Raise PreparationError where so many of a tree's points are nearer than `radius` that atoms must coincide."""
+    n = int(tree.n)
+    if n > 1000 and tree.count_neighbors(tree, radius) > _PAIRS_PER_ATOM * n:
+        raise PreparationError(f"{what}: most of its {n} atoms stand in each other; check the coordinates.")
+
+
+def printable(text: str) -> str:
+    """Return text for a terminal: what would steer it is shown in the way of Python's strings."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
