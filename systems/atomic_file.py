@@ -34,11 +34,12 @@ class AtomicFile:
     which every prefix is readable (superblock, index nodes from the root down, data and object headers, names last).
 
     `key`: where in the file bytes lie that no other file has, and that no transaction changes; by them a journal knows
-    its file. One writer at a time is for the caller to see to. Raises StorageError when the file cannot be opened,
-    InputError where another file lies in the journal's place.
+    its file. One writer at a time is for the caller to see to. `failure`: why the file could not be read. Raises
+    StorageError when it cannot be opened, InputError where another file lies in the journal's place.
     """
 
     key: tuple[int, int] = (0, 0)
+    failure: OSError | None = None
 
     def __init__(self, path: Path, *, writable: bool) -> None:
         self.path = path
@@ -108,7 +109,11 @@ class AtomicFile:
         start = self._position
         stop = self._size if size < 0 else min(start + size, self._size)
         length = max(stop - start, 0)
-        data = bytearray(os.pread(self._fd, length, start))
+        try:
+            data = bytearray(os.pread(self._fd, length, start))
+        except OSError as error:
+            # HDF5 takes no exceptions from here. What it makes of nothing is never committed.
+            self.failure, self._dead, data = error, True, bytearray()
         data.extend(bytes(length - len(data)))
         for offset, block in self._pending:
             low, high = max(offset, start), min(offset + len(block), stop)
@@ -143,7 +148,7 @@ class AtomicFile:
     def commit(self) -> None:
         """Put the collected writes on the medium. On failure raise OSError with the file as it was before."""
         if self._dead:
-            raise OSError(errno.EIO, "an earlier write failed")
+            raise self.failure or OSError(errno.EIO, "an earlier write failed")
         end = self._committed_size
         writes = _latest(self._pending)
         beyond = [(max(offset, end), block[max(end - offset, 0) :]) for offset, block in writes]

@@ -157,7 +157,11 @@ def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
         with damage_reported(path):
             check_hdf5(file, path)
         return file
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, TrajectoryError) as error:
+        if source is not None and source.failure is not None:
+            raise storage_error(path, source.failure, "nothing was changed") from error
+        if isinstance(error, TrajectoryError):
+            raise
         text = str(error)
         if "truncated" in text:
             reason = "it is cut short; restore it from a whole copy"
@@ -239,8 +243,10 @@ class FrameStore:
         try:
             with damage_reported(path):
                 self._read_headers()
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if self._atomic.failure is not None:
+                raise storage_error(path, self._atomic.failure, "nothing was changed") from error
             raise
 
     def _read_headers(self) -> None:
@@ -275,10 +281,23 @@ class FrameStore:
         times: npt.NDArray[np.float64] = self._columns["time"][: min(self.n_frames, 2)]
         return times
 
+    @contextmanager
+    def _as_far_as_it_can_be_read(self) -> Iterator[None]:
+        """Close the store where the file could not be read, whatever HDF5 makes of it. Raises StorageError."""
+        try:
+            yield
+        except BaseException as error:
+            if self._atomic.failure is not None and not isinstance(error, StorageError):
+                raise self.failed(self._atomic.failure) from error
+            raise
+        if self._atomic.failure is not None:
+            raise self.failed(self._atomic.failure)
+
     def series(self) -> tuple[npt.NDArray[np.float64], dict[str, npt.NDArray[np.float64]]]:
         """Return the times `(n_frames,)` ps and all scalars by name."""
-        scalars = {name.rpartition("/")[2]: c[:] for name, c in self._columns.items() if "/scalars/" in name}
-        return self._columns["time"][:], scalars
+        with self._as_far_as_it_can_be_read():
+            scalars = {name.rpartition("/")[2]: c[:] for name, c in self._columns.items() if "/scalars/" in name}
+            return self._columns["time"][:], scalars
 
     def append(
         self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]], stored: Mapping[str, npt.NDArray[Any]]
@@ -287,24 +306,29 @@ class FrameStore:
 
         `stored`: what has a checksum, as it is on disk: positions `(n, n_atoms, 3)` as FRAMES, and more by name.
         """
-        n, start = len(block), self.n_frames
-        self.check_flags(block)
-        self._need_columns(block)
-        values: dict[str, npt.NDArray[Any]] = {"time": block.time_ps, "surromd/chunk_idx": block.chunk_idx, **columns}
-        if block.flags is not None:
-            values["surromd/flags"] = block.flags
-        for name, array in stored.items():
-            more = columns_with_frames(block.time_ps, block.chunk_idx, block.flags, block.scalars)
-            values[f"{CHECKSUMS}/{name}"] = frame_checksums({name: array} | (more if name == FRAMES else {}))
-        for name, column in self._columns.items():
-            column.resize(start + n, axis=0)
-            if name in values:
-                column[start:] = values[name]
-            else:  # a scalar that this append does not give stays NaN
-                column[start:] = block.scalars.get(name.rpartition("/")[2], np.full(n, np.nan))
-        self._commit()
-        self.n_frames += n
-        self._digest.update(checksum_rows({name: values[name] for name in values if name.startswith(CHECKSUMS)}))
+        with self._as_far_as_it_can_be_read():
+            n, start = len(block), self.n_frames
+            self.check_flags(block)
+            self._need_columns(block)
+            values: dict[str, npt.NDArray[Any]] = {
+                "time": block.time_ps,
+                "surromd/chunk_idx": block.chunk_idx,
+                **columns,
+            }
+            if block.flags is not None:
+                values["surromd/flags"] = block.flags
+            for name, array in stored.items():
+                more = columns_with_frames(block.time_ps, block.chunk_idx, block.flags, block.scalars)
+                values[f"{CHECKSUMS}/{name}"] = frame_checksums({name: array} | (more if name == FRAMES else {}))
+            for name, column in self._columns.items():
+                column.resize(start + n, axis=0)
+                if name in values:
+                    column[start:] = values[name]
+                else:  # a scalar that this append does not give stays NaN
+                    column[start:] = block.scalars.get(name.rpartition("/")[2], np.full(n, np.nan))
+            self._commit()
+            self.n_frames += n
+            self._digest.update(checksum_rows({name: values[name] for name in values if name.startswith(CHECKSUMS)}))
 
     def _need_columns(self, block: FrameBlock) -> None:
         """Make the columns that a block brings."""
@@ -325,24 +349,26 @@ class FrameStore:
 
     def truncate(self, n_frames: int) -> None:
         """Cut all columns to `n_frames`. Raises InputError when there are fewer, StorageError."""
-        if not 0 <= n_frames <= self.n_frames:
-            raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
-        if n_frames == self.n_frames:
-            return
-        for column in self._columns.values():
-            column.resize(n_frames, axis=0)
-        if n_frames == 0 and self._columns.pop("surromd/flags", None) is not None:
-            del self.file["surromd/flags"]
-        self._commit()
-        self.n_frames = n_frames
-        self._digest_again()
+        with self._as_far_as_it_can_be_read():
+            if not 0 <= n_frames <= self.n_frames:
+                raise InputError(f"{self.path} holds {self.n_frames} frames and cannot be cut to {n_frames}.")
+            if n_frames == self.n_frames:
+                return
+            for column in self._columns.values():
+                column.resize(n_frames, axis=0)
+            if n_frames == 0 and self._columns.pop("surromd/flags", None) is not None:
+                del self.file["surromd/flags"]
+            self._commit()
+            self.n_frames = n_frames
+            self._digest_again()
 
     def update_record(self, entries: dict[str, Any]) -> None:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
-        merged = {**self.record, **entries}
-        set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
-        self._commit()
-        self.record = merged
+        with self._as_far_as_it_can_be_read():
+            merged = {**self.record, **entries}
+            set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
+            self._commit()
+            self.record = merged
 
     def _commit(self) -> None:
         self.file.flush()

@@ -23,7 +23,7 @@ _PAIRS_PER_ATOM = 500
 
 
 def gunzipped(data: bytes) -> bytes:
-    """Return the content of a gzip file, or the data where they are none. Raises ValueError, zlib.error for too much."""
+    """Return the content of a gzip file, or data that are none. Raises ValueError and zlib.error, also for too much."""
     if data[:2] != b"\x1f\x8b":
         return data
     parts, size = [], 0
@@ -45,14 +45,14 @@ def check_hdf5(file: h5py.File, path: Path) -> None:
 
     size = os.stat(path).st_size
 
-    def look(name: str, link: Any) -> None:
+    links: list[tuple[str, Any]] = []
+    file.visititems_links(lambda name, link: links.append((name, link)))
+    for name, link in links:
         if isinstance(link, h5py.ExternalLink):
             raise TrajectoryError(f"{path}: /{name} is a link into another file ({link.filename}); copy the data in.")
-        if not isinstance(link, h5py.HardLink):
-            return
-        found = file.get(name)
+        found = file.get(name) if isinstance(link, h5py.HardLink) else None
         if not isinstance(found, h5py.Dataset) or not found.size:
-            return
+            continue
         if found.external or found.is_virtual:
             raise TrajectoryError(f"{path}: the data of /{name} lie in another file; copy them in.")
         declared = found.size * found.dtype.itemsize
@@ -63,8 +63,6 @@ def check_hdf5(file: h5py.File, path: Path) -> None:
             )
         if not found.id.get_storage_size():
             raise TrajectoryError(f"{path} is damaged: /{name} declares {declared} bytes and holds none.")
-
-    file.visititems_links(look)
 
 
 def check_disk(out: Path, n_frames: int, n_atoms: int) -> None:

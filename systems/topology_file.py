@@ -58,13 +58,9 @@ def refuse_other_topology(trajectory: Path, scene: Scene, *, overwrite: bool) ->
 def write_topology(trajectory: Path, scene: Scene) -> Path:
     """Write `NAME.pdb` and return its path; nothing of scenes with more atoms than the format holds. Raises
     StorageError."""
-
-    def fill(temporary: Path) -> None:
-        temporary.write_bytes(_bytes(scene))
-
     pdb = topology_path(trajectory)
     if scene.n_atoms <= MOST_ATOMS:
-        create_whole(pdb, fill)
+        create_whole(pdb, _bytes(scene))
     return pdb
 
 
