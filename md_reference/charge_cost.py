@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from systems.scene import Scene
 from systems.units import format_wall
 
-# Measured by docs/studies/charge_cost.py (AmberTools 26.0, processor seconds on one core of a Xeon, 21 to 72 atoms, no
-# molecule off by more than a factor of 2.3): SECONDS_AT_30_ATOMS (atoms / 30)^POWER.
+# SECONDS_AT_30_ATOMS (atoms / 30)^POWER, measured by docs/studies/charge_cost.py: AmberTools 26.0, processor seconds on
+# a core of an AMD EPYC, ten molecules of 21 to 72 atoms, none off by more than a factor of 2.3.
 SECONDS_AT_30_ATOMS = 7.3
 POWER = 3.3
 _WORTH_SAYING_S = 2.0
