@@ -109,8 +109,9 @@ def count_alarms(runs: Sequence[Ensemble], piece_ps: float, most: int | None = N
 def report(found: Alarms) -> str:
     """Return the count in words."""
     low, high = (100 * x for x in found.interval())
+    length = f" of {format_time_ps(found.piece_ps)}" if found.piece_ps else ""
     lines = [
-        f"{found.n} fair comparisons of {format_time_ps(found.piece_ps)}: {found.n_alarms} false alarms "
+        f"{found.n} fair comparisons{length}: {found.n_alarms} false alarms "
         f"({100 * found.n_alarms / found.n:.1f} % [{low:.1f}, {high:.1f}]; 5 % are due, p {found.p_value():.2g})",
         ", ".join(f"{n} {word}" for word, n in sorted(found.status.items())),
         f"replicate said to differ: {found.replicate_off}",

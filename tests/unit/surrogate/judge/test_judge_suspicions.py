@@ -130,3 +130,18 @@ def test_numbers_keep_the_digits_that_say_something() -> None:
     alike = Estimate(9.9, 9.51234, 10.31234, 0.2)
     assert interval(alike) == "[9.51, 10.31]"
     assert number(Estimate(0.0, 0.0, 0.0, 0.01)) == "0.000"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "expected"), [((0, 1, 2), ("1", "2", "3")), ((0, 5, 6), ("0", "5", "6")), ((7, 8, 9), ("7", "8", "9"))]
+)
+def test_residues_that_were_never_numbered_count_from_one(numbers: tuple[int, ...], expected: tuple[str, ...]) -> None:
+    import mdtraj
+
+    from systems.from_mdtraj import scene_from_mdtraj_topology
+
+    topology = mdtraj.Topology()
+    chain = topology.add_chain()
+    for number in numbers:
+        topology.add_atom("O", mdtraj.element.oxygen, topology.add_residue("SER", chain, resSeq=number))
+    assert scene_from_mdtraj_topology(topology, np.zeros((3, 3))).residue_ids == expected
