@@ -132,9 +132,10 @@ def test_numbers_keep_the_digits_that_say_something() -> None:
     assert number(Estimate(0.0, 0.0, 0.0, 0.01)) == "0.000"
 
 
-@pytest.mark.parametrize(
-    ("numbers", "expected"), [((0, 1, 2), ("1", "2", "3")), ((0, 5, 6), ("0", "5", "6")), ((7, 8, 9), ("7", "8", "9"))]
-)
+NUMBERED = [((0, 1, 2), ("1", "2", "3")), ((0, 5, 6), ("0", "5", "6")), ((7, 8, 9), ("7", "8", "9"))]
+
+
+@pytest.mark.parametrize(("numbers", "expected"), NUMBERED)
 def test_residues_that_were_never_numbered_count_from_one(numbers: tuple[int, ...], expected: tuple[str, ...]) -> None:
     import mdtraj
 
