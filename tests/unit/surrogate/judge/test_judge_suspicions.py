@@ -143,6 +143,6 @@ def test_residues_that_were_never_numbered_count_from_one(numbers: tuple[int, ..
 
     topology = mdtraj.Topology()
     chain = topology.add_chain()
-    for number in numbers:
-        topology.add_atom("O", mdtraj.element.oxygen, topology.add_residue("SER", chain, resSeq=number))
+    for n in numbers:
+        topology.add_atom("O", mdtraj.element.oxygen, topology.add_residue("SER", chain, resSeq=n))
     assert scene_from_mdtraj_topology(topology, np.zeros((3, 3))).residue_ids == expected
