@@ -82,8 +82,7 @@ class DcdWriter(TrajectoryWriter):
         for file in (self.path, self._meta):
             refuse_existing(file, overwrite)
         refuse_other_topology(self.path, self.scene, overwrite=overwrite)
-        had_topology = self._pdb.exists()
-        made: list[Path] = []
+        made = [file for file in (self._meta, self._pdb, self.path) if not file.exists()]
         try:
             create_store(
                 self._meta,
@@ -94,14 +93,13 @@ class DcdWriter(TrajectoryWriter):
                 run_id=run_id,
                 checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
             )
-            made.append(self._meta)
             write_topology(self.path, self.scene)
-            made += [] if had_topology else [self._pdb]
             header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
             create_whole(self.path, header + title_bytes(self.scene.n_atoms))
         except SurromdError:
             for file in made:
-                file.unlink(missing_ok=True)
+                with suppress(OSError):
+                    file.unlink(missing_ok=True)
             raise
 
     def _append(self, block: FrameBlock) -> None:

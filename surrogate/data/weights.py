@@ -14,11 +14,16 @@ from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.architectures import architecture
 from surrogate.models.interface import Surrogate
 from surrogate.models.stiff import StiffPlan, StiffTerms
-from systems.errors import InputError, UnknownNameError, WeightsError
+from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.scene import Scene
+from systems.schema import check_types
 from systems.whole_file import create_whole
 
 FORMAT = "surromd-weights-1"
+# Settings that are no sizes (an interval in ps) may be as large as this, however small the model.
+_LEAST_SIZE = 1_000_000
+# What Python and torch raise on values that no model has.
+UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, AssertionError)
 _STIFF = "stiff."
 
 
@@ -60,6 +65,8 @@ class TrainingDomain:
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> TrainingDomain:
+        """Take back what `to_dict` returned. Raises ValueError, KeyError, TypeError, InputError for anything else."""
+        check_types(TrainingDomain, record, "domain.")
         further = tuple(TrainingDomain.from_dict(domain) for domain in record.get("further", ()))
         jumps = tuple((float(lag), float(least), float(most)) for lag, least, most in record.get("jumps", ()))
         return TrainingDomain(
@@ -93,6 +100,29 @@ class Weights:
     stiff: StiffTerms | None = None
 
 
+@dataclass(frozen=True)
+class _Header:
+    """What a weights file's record must hold."""
+
+    arch: str
+    config: dict[str, Any]
+    domain: dict[str, Any]
+    provenance: dict[str, Any]
+
+
+def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
+    """Raise ValueError for more layers than a file has tensors, or a size beyond that of all of them, before any is
+    made."""
+    entries = config.items() if isinstance(config, dict) else enumerate(config)
+    for key, value in entries:
+        if isinstance(value, dict | list):
+            _check_sizes(value, n_tensors, n_values)
+        elif isinstance(value, int | float) and not abs(value) <= (
+            n_tensors if str(key).endswith(("layers", "rounds")) else n_values
+        ):
+            raise ValueError(f"{key} = {value!r} in a file of {n_tensors} tensors with {n_values} numbers")
+
+
 def save_weights(
     path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *,
     stiff: StiffTerms | None = None, half: bool = False,
@@ -122,11 +152,13 @@ def read_header(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     try:
         header = json.loads(_metadata(path)["surromd"])
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, RecursionError) as error:
         raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
-    if not isinstance(header, dict):
-        raise WeightsError(f"{path} is damaged: its record is no JSON object.")
-    return header
+    try:
+        check_types(_Header, dict.fromkeys(_Header.__annotations__) | header if isinstance(header, dict) else 0)
+    except ValueError as error:
+        raise WeightsError(f"{path} is damaged: its record's {error}.") from error
+    return dict(header)
 
 
 def _metadata(path: Path) -> dict[str, str]:
@@ -166,7 +198,11 @@ def load_weights(path: str | Path) -> Weights:
         arch = architecture(header["arch"])
     except UnknownNameError as error:
         raise WeightsError(f"{path} is of another version of surromd: {error}") from error
-    model = arch.model(arch.config(header["config"]))
+    try:
+        _check_sizes(header["config"], len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
+        model, domain = arch.model(arch.config(header["config"])), TrainingDomain.from_dict(header["domain"])
+    except (*UNREADABLE, ArithmeticError, SurromdError) as error:
+        raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
     stiff = _stiff_terms(path, header.get("stiff"), state)
     try:
         model.load_state_dict(state)
@@ -179,7 +215,7 @@ def load_weights(path: str | Path) -> Weights:
         )
     return Weights(
         model=model.eval().requires_grad_(False),
-        domain=TrainingDomain.from_dict(header["domain"]),
+        domain=domain,
         provenance=header["provenance"],
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,

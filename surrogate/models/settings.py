@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from systems.errors import InputError, nearest
+from systems.schema import check_types
 
 T = TypeVar("T")
 
@@ -18,6 +19,10 @@ def build(cls: type[T], record: dict[str, Any], prefix: str) -> T:
     for key in record:
         if key not in known:
             raise InputError(f"unknown setting {prefix}{key}; known: {', '.join(known)}.{nearest(key, known)}")
+    try:
+        check_types(cls, record, prefix)
+    except ValueError as error:
+        raise InputError(f"setting {error}.") from error
     return cls(**record)
 
 

@@ -44,7 +44,14 @@ class Kind:
         return {name: everything(folder / name) for name in self.names}
 
     def left_over(self, folder: Path) -> list[str]:
-        return sorted(p.name for p in folder.iterdir() if p.suffix not in (".new", ".pdb") and ".meta." not in p.name)
+        """Names of what lies beside companions, but for what the disk refused to remove: temporaries, void journals."""
+        return sorted(
+            p.name
+            for p in folder.iterdir()
+            if p.suffix not in (".new", ".pdb")
+            and ".meta." not in p.name
+            and not (p.suffix == ".journal" and not p.stat().st_size)
+        )
 
 
 def everything(path: Path) -> dict[str, Any]:
