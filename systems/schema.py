@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 _LARGEST = 2**63
 
 
-def check_types(cls: type[Any], record: Mapping[str, Any], where: str = "") -> None:
+def check_types(cls: type[Any], record: Any, where: str = "") -> None:
     """Raise ValueError for an entry whose value has not the type that the field of that name has in `cls`.
 
     A list stands for a tuple, a whole number for a float, a table for a dataclass; numbers are finite and of 64 bits.
@@ -27,7 +27,7 @@ def check_types(cls: type[Any], record: Mapping[str, Any], where: str = "") -> N
 
 
 @cache
-def _hints(cls: type[Any]) -> dict[str, Any]:
+def _hints(cls: Any) -> dict[str, Any]:
     return get_type_hints(cls)
 
 
@@ -56,5 +56,5 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is float:
         return _fits(value, int) or (isinstance(value, float) and abs(value) < float("inf"))
     if is_dataclass(hint):
-        return isinstance(value, dict | hint)  # type: ignore[arg-type]
+        return isinstance(value, dict | hint)
     return not isinstance(hint, type) or isinstance(value, hint)
