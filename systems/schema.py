@@ -5,7 +5,6 @@ from __future__ import annotations
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import is_dataclass
-from functools import cache
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 _LARGEST = 2**63
@@ -19,16 +18,11 @@ def check_types(cls: type[Any], record: Any, where: str = "") -> None:
     """
     if not isinstance(record, Mapping):
         raise ValueError(f"{where or cls.__name__} is no table but {_shown(record)}")
-    hints = _hints(cls)
+    hints = get_type_hints(cls)
     for key, value in record.items():
         if key in hints and not _fits(value, hints[key]):
             name = getattr(hints[key], "__name__", str(hints[key])) if not get_args(hints[key]) else str(hints[key])
             raise ValueError(f"{where}{key} is {_shown(value)}, which is no {name}")
-
-
-@cache
-def _hints(cls: Any) -> dict[str, Any]:
-    return get_type_hints(cls)
 
 
 def _shown(value: Any) -> str:
