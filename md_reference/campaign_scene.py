@@ -69,11 +69,8 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
     record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
 
-    def fill(temporary: Path) -> None:
-        temporary.write_text(json.dumps(record), encoding="utf-8")
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    create_whole(path, fill)
+    create_whole(path, json.dumps(record))
     return prepared
 
 

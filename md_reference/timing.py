@@ -189,13 +189,9 @@ def remember(key: str, timings: list[Timing]) -> None:
     text = json.dumps({"format": _FORMAT, "us_per_step": machines}, indent=1)
     try:
         cache_file().parent.mkdir(parents=True, exist_ok=True)
-        create_whole(cache_file(), lambda temporary: _write(temporary, text))
+        create_whole(cache_file(), text)
     except (OSError, SurromdError):
         pass
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text)
 
 
 def _read() -> dict[str, Any]:

@@ -8,6 +8,7 @@ raises a `systems.errors.SurromdError` whose message is one line.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from surrogate.progress import progress_bar
 from surrogate.references import plan, reference
 from surrogate.rollouts import rollout
 from surrogate.scenes import systems, tell
+from systems.claim import Claim
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.units import Quantity, quantity
 
@@ -230,8 +232,9 @@ def train(
     from surrogate.training.devices import choose_device, is_first_process
 
     prepared = prepare_training(replace(request, paths=paths, held=held, device=choose_device(device)))
-    quiet = quiet or not is_first_process()
-    with progress_bar(f"training {prepared.scene}", quiet=quiet) as bar:
+    first = is_first_process()
+    claim = Claim(out) if first else nullcontext()
+    with claim, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar:
 
         def advance(stage: str, share: float) -> None:
             if bar is not None:

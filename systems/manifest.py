@@ -94,11 +94,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     record = {"format": FORMAT, **asdict(manifest)}
     # Lists read better than tables whose keys repeat a name that each entry has.
     record["scenes"], record["runs"] = list(record["scenes"].values()), list(record["runs"].values())
-    create_whole(folder / MANIFEST_NAME, lambda temporary: _write_text(temporary, json.dumps(record, indent=1) + "\n"))
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    create_whole(folder / MANIFEST_NAME, json.dumps(record, indent=1) + "\n")
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -20,8 +20,8 @@ _MD_STYLES = (":", "--", "-")
 def write_cost_error(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write cost_error.json, .md and, where a setting was measured, .svg; return them. Raises StorageError."""
     written = [folder / "cost_error.json", folder / "cost_error.md"]
-    create_whole(written[0], lambda path: _write(path, json.dumps(result, indent=1)))
-    create_whole(written[1], lambda path: _write(path, markdown(result)))
+    create_whole(written[0], json.dumps(result, indent=1))
+    create_whole(written[1], markdown(result))
     if any("jsd" in row for row in result["rows"]):
         written.append(folder / "cost_error.svg")
         create_whole(written[2], lambda path: plot(result, path))
@@ -210,7 +210,3 @@ def _mean(found: list[dict[str, Any]]) -> float:
 
 def _short(value: float | None) -> str:
     return "..." if value is None else f"{value:.2g}"
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

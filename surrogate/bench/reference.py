@@ -305,8 +305,4 @@ def write_json(result: dict[str, Any], path: Path) -> None:
     """Write the result as one JSON file. Raises StorageError."""
     from systems.whole_file import create_whole
 
-    create_whole(path, lambda temporary: _dump(result, temporary))
-
-
-def _dump(result: dict[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(result, indent=1) + "\n")
+    create_whole(path, json.dumps(result, indent=1) + "\n")

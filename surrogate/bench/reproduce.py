@@ -124,12 +124,7 @@ def reproduce(
         if report is not None:
             report(row)
     result = Reproduction(name, tuple(rows), sizes, settings.budget_s, settings.seed)
-    text = json.dumps(result.to_dict(), indent=1)
-
-    def fill(temporary: Path) -> None:
-        temporary.write_text(text)
-
-    create_whole(folder / f"{name}.json", fill)
+    create_whole(folder / f"{name}.json", json.dumps(result.to_dict(), indent=1))
     return result
 
 

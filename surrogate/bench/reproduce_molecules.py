@@ -129,12 +129,7 @@ def reproduce_molecules(
         if report is not None:
             report(accounts[-1])
     result = MoleculeReproduction(tuple(rows), tuple(accounts), time_ps, settings.budget_s, settings.seed)
-    text = json.dumps(result.to_dict(), indent=1)
-
-    def fill(temporary: Path) -> None:
-        temporary.write_text(text)
-
-    create_whole(folder / f"{NAME}.json", fill)
+    create_whole(folder / f"{NAME}.json", json.dumps(result.to_dict(), indent=1))
     return result
 
 

@@ -27,8 +27,8 @@ _DRIFT = {
 def write_stress(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write stress.json, stress.md and, where rollouts were made, stress.svg; return them. Raises StorageError."""
     written = [folder / "stress.json", folder / "stress.md"]
-    create_whole(written[0], lambda path: _write(path, json.dumps(result, indent=1)))
-    create_whole(written[1], lambda path: _write(path, markdown(result)))
+    create_whole(written[0], json.dumps(result, indent=1))
+    create_whole(written[1], markdown(result))
     curves = [row for row in result["sections"].get("length", []) if row.get("survival")]
     if curves:
         written.append(folder / "stress.svg")
@@ -107,7 +107,3 @@ def _plot(rows: list[dict[str, Any]], path: Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(path, format="svg")
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

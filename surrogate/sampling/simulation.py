@@ -125,7 +125,7 @@ class Simulation:
         if isinstance(file, str | Path):
             from systems.whole_file import create_whole
 
-            create_whole(Path(file), lambda temporary: _write(temporary, buffer.getvalue()))
+            create_whole(Path(file), buffer.getvalue())
         else:
             file.write(buffer.getvalue())
 
@@ -299,7 +299,3 @@ def _described(report: Any) -> dict[str, Any]:
         return report
     names = ("positions", "velocities", "forces", "energy")
     return {"steps": report[0], "include": [name for name, asked in zip(names, report[1:5], strict=True) if asked]}
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
