@@ -366,7 +366,9 @@ class FrameStore:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
         with self._as_far_as_it_can_be_read():
             merged = {**self.record, **entries}
-            set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
+            text = json_text(merged, "record")
+            # Files of early versions, which seal nothing, stay readable by those.
+            set_text(self.file["surromd"], "record", sealed(text) if CHECKSUMS in self.file else text)
             self._commit()
             self.record = merged
 
