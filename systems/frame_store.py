@@ -366,9 +366,7 @@ class FrameStore:
         """Merge `entries` into the stored record. Raises InputError, StorageError."""
         with self._as_far_as_it_can_be_read():
             merged = {**self.record, **entries}
-            text = json_text(merged, "record")
-            # Files of early versions, which seal nothing, stay readable by those.
-            set_text(self.file["surromd"], "record", sealed(text) if CHECKSUMS in self.file else text)
+            set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
             self._commit()
             self.record = merged
 
