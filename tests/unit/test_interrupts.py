@@ -18,11 +18,15 @@ from systems.interrupts import deferred_interrupt, interrupted_by_signals, stop_
 
 
 @pytest.fixture(autouse=True)
-def python_handles_ctrl_c() -> Iterator[None]:
-    """A shell starts background jobs with SIGINT ignored, which Python leaves as it is."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def signals_as_at_a_terminal() -> Iterator[None]:
+    """A shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and Python leaves both as they are."""
+    usual = {signal.SIGINT: signal.default_int_handler}
+    if hasattr(signal, "SIGHUP"):
+        usual[signal.SIGHUP] = signal.SIG_DFL
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
