@@ -19,7 +19,7 @@ def _check(case: Case) -> None:
     assert outcome.force_field in ([""] if expected else ["ff14SB"] if case.name == "cyclo-triglycyl" else ["gaff2"])
 
 
-@pytest.mark.parametrize("name", ["aspirin", "TEMPO", "bortezomib", "cisplatin", "diclofenac sodium"])
+@pytest.mark.parametrize("name", ["aspirin", "TEMPO", "bortezomib", "cisplatin", "choline salicylate"])
 def test_shipped_parameters_run_and_what_gaff2_lacks_is_refused(name: str) -> None:
     _check(BY_NAME[name])
 
