@@ -6,25 +6,27 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from glob import glob
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar, cast, get_type_hints
 
 from md_reference.campaign_settings import Settings, read_settings, to_config
 from md_reference.protocol import settle_by_name
 from md_reference.run_config import MDConfig
-from systems.errors import InputError, SurromdError, nearest
+from systems.errors import InputError, SurromdError
+from systems.manifest import file_sha256
+from systems.outside import content
 from systems.protocols import find_protocol
+from systems.schema import built, fitted
 from systems.units import parse_temperature_k, parse_wall_s
 
-SUFFIXES = ("h5", "dcd")
+T = TypeVar("T")
 _SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
-# Batch systems that dask-jobqueue knows; `local` starts the same jobs as processes here, to try a file out.
-CLUSTER_KINDS = ("slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local")
 # Folder of the batch system's logs, inside the campaign's.
 JOB_LOGS = "jobs"
-_LONGEST_NAME = 40
+_LONGEST_NAME, _MOST_RUNS = 40, 100_000
 _SEEDS = 2**31
 
 
@@ -54,12 +56,13 @@ class ClusterSpec:
     """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
 
     `interface`: the network interface on which scheduler and workers talk. `dashboard`: where Dask's status page is to
-    be shown (`127.0.0.1:8787`); whoever can reach it sees it. Without it there is none.
+    be shown (`127.0.0.1:8787`); whoever can reach it sees it. Without it there is none. Of the kinds, which are those
+    that dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
     """
 
-    kind: str
-    jobs: int = 1
-    cores: int = 1
+    kind: Literal["slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local"]
+    jobs: Annotated[int, range(1, 10_000)] = 1
+    cores: Annotated[int, range(1, 10_000)] = 1
     memory: str = "2GB"
     walltime: str = ""
     queue: str = ""
@@ -86,6 +89,28 @@ class Campaign:
     text: str = field(default="", compare=False)
 
 
+@dataclass(frozen=True)
+class _Head:
+    """What a campaign's file says beside what its runs are like."""
+
+    scenes: tuple[str | dict[str, Any], ...]
+    name: str = ""
+    out: str = ""
+    format: Literal["h5", "dcd"] = "h5"
+    seed: Annotated[int, range(2**63)] = 0
+    retries: Annotated[int, range(1000)] = 2
+    checkpoint_every: str = "20s"
+    cluster: ClusterSpec | None = None
+
+
+@dataclass(frozen=True)
+class _SceneHead:
+    """What a scene's table says beside what its runs are like."""
+
+    scene: str
+    name: str = ""
+
+
 def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Campaign:
     """Return the campaign that a TOML file describes; paths in it are relative to the file's folder.
 
@@ -94,102 +119,97 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = content(path).decode()
         table = tomllib.loads(text)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file.") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read as TOML: {error}.") from error
     try:
         return _campaign(table, path, text, None if folder is None else Path(folder))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}.") from error
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
-_CAMPAIGN_KEYS = ("name", "out", "format", "seed", "retries", "checkpoint_every", "scenes", "cluster")
-_SCENE_KEYS = ("scene", "name")
 # What a table says of its runs beside their settings.
-_AXIS_KEYS = ("replicas", "temperatures", "protocol")
+_AXES = {
+    "replicas": Annotated[int, range(1, _MOST_RUNS + 1)],
+    "temperatures": tuple[float | str, ...],
+    "protocol": str,
+}
 
 
 def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
-    shared = _own_settings(table, _CAMPAIGN_KEYS, "")
-    suffix = _text(table, "format", "h5")
-    if suffix not in SUFFIXES:
-        raise InputError(f"format {suffix!r} is not written; known: {', '.join(SUFFIXES)}.")
-    seed = _whole(table, "seed", 0, least=0)
+    if not table.get("scenes"):
+        raise InputError("name the scenes: scenes = ['alanine-dipeptide', ...], or a [[scenes]] table for each.")
+    head, shared = _read(_Head, table, "")
     scenes: list[SceneSpec] = []
     runs: list[Run] = []
-    for number, entry in enumerate(_scene_tables(table, path.parent)):
-        where = f"scenes[{number}] ({entry.get('scene', '?')})"
-        spec = _scene_spec(entry, shared, path.parent, where)
+    for number, entry in enumerate(_scene_tables(head, path.parent)):
+        where = f"scenes[{number}] ({entry['scene']}): "
+        own_head, own = _read(_SceneHead, entry, where)
+        spec = _scene_spec(own_head, {**shared.preparation, **own.preparation}, path.parent, where)
         # Some file systems take A and a for the same.
         if spec.name.lower() in {other.name.lower() for other in scenes}:
             raise InputError(f"two scenes are called {spec.name!r}; give one of them a name of its own (name = ...).")
         scenes.append(spec)
         try:
-            runs += _runs_of(spec, shared, _own_settings(entry, _SCENE_KEYS, where), seed, suffix)
+            runs += _runs_of(spec, shared, own, head)
         except SurromdError as error:
             raise InputError(f"scene {spec.name!r}: {error}") from error
-    name = _text(table, "name", path.stem)
-    out = folder if folder is not None else path.parent / _text(table, "out", path.stem)
+    if len(runs) > _MOST_RUNS:
+        raise InputError(f"{len(runs)} runs are too many, {_MOST_RUNS} at most; write several campaigns.")
     return Campaign(
-        name=name,
-        folder=out,
-        seed=seed,
+        name=head.name or path.stem,
+        folder=folder if folder is not None else path.parent / (head.out or path.stem),
+        seed=head.seed,
         scenes=tuple(scenes),
         runs=tuple(runs),
-        retries=_whole(table, "retries", 2, least=0),
-        checkpoint_every_s=parse_wall_s(_text(table, "checkpoint_every", "20s"), "checkpoint_every"),
-        cluster=_cluster(table),
+        retries=head.retries,
+        checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
+        cluster=head.cluster,
         text=text,
     )
 
 
-def _own_settings(table: dict[str, Any], others: tuple[str, ...], where: str) -> Settings:
-    """Return what a table says of runs: axes, preparation and settings, unknown keys refused."""
-    return read_settings(
-        {key: value for key, value in table.items() if key not in others},
-        axes=_AXIS_KEYS,
-        preparation=_preparation_defaults(),
-        others=others,
-        where=where,
-    )
-
-
-def _preparation_defaults() -> dict[str, Any]:
-    """The switches of `prepare` and `solvate`, with their defaults: a campaign takes what the command line takes."""
+def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings]:
+    """Return what a table says of itself and of its runs: axes, preparation and settings, unknown keys refused."""
     from md_reference.solvation import solvate
     from systems.prepare import prepare
 
-    return keyword_defaults(prepare) | keyword_defaults(solvate)
+    own = {f.name for f in fields(cast(Any, kind))}
+    settings = read_settings(
+        {key: value for key, value in table.items() if key not in own},
+        axes=_AXES,
+        # A campaign takes what the command line takes.
+        preparation=switches_of(prepare) | switches_of(solvate),
+        others=own,
+        where=where,
+    )
+    return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
 
 
-def keyword_defaults(function: Callable[..., Any]) -> dict[str, Any]:
-    """Return the parameters of a function that have defaults, but its seed."""
-    parameters = inspect.signature(function).parameters.values()
-    return {p.name: p.default for p in parameters if p.default is not p.empty and p.name != "seed"}
+def switches_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of a function's parameters that have defaults, but its seed."""
+    parameters, hints = inspect.signature(function).parameters.values(), get_type_hints(function)
+    return {p.name: hints[p.name] for p in parameters if p.default is not p.empty and p.name != "seed"}
 
 
-def _scene_tables(table: dict[str, Any], base: Path) -> list[dict[str, Any]]:
+def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:
     """Return one table per scene; a pattern such as `pdb/*.pdb` stands for its files, in order of name."""
-    listed = table.get("scenes")
-    if not isinstance(listed, list) or not listed:
-        raise InputError("name the scenes: scenes = ['alanine-dipeptide', ...], or a [[scenes]] table for each.")
     found: list[dict[str, Any]] = []
-    for number, entry in enumerate(listed):
-        if isinstance(entry, str):
-            entry = {"scene": entry}
-        if not isinstance(entry, dict) or not isinstance(entry.get("scene"), str) or not entry["scene"].strip():
-            raise InputError(f"scenes[{number}] must be a text or a table with scene = '...'.")
-        text = entry["scene"].strip()
+    for number, listed in enumerate(head.scenes):
+        entry = {"scene": listed} if isinstance(listed, str) else listed
+        text = fitted(entry.get("scene"), str, f"scenes[{number}].scene").strip()
         if "*" in text and not _kind(text):
-            paths = sorted(base.glob(text)) if not Path(text).is_absolute() else sorted(Path("/").glob(text[1:]))
+            paths = sorted(glob(text, root_dir=base, recursive=True))
             if not paths:
                 raise InputError(f"scenes[{number}]: no file matches {text}.")
             if "name" in entry:
                 raise InputError(f"scenes[{number}]: one name cannot serve the {len(paths)} files of {text}.")
-            found += [{**entry, "scene": str(path)} for path in paths]
+            found += [{**entry, "scene": path} for path in paths]
         else:
             found.append({**entry, "scene": text})
     return found
@@ -201,22 +221,20 @@ def _kind(text: str) -> str:
     return kind if colon and kind.lower() in ("sequence", "smiles") else ""
 
 
-def _scene_spec(entry: dict[str, Any], shared: Settings, base: Path, where: str) -> SceneSpec:
-    source, digest = entry["scene"], ""
+def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where: str) -> SceneSpec:
+    source, digest = head.scene, ""
     if not _kind(source) and (Path(source).suffix.lower() in _SCENE_FILES or "/" in source):
         path = (base / source).resolve()
         if not path.is_file():
-            raise InputError(f"{where}: no such file: {path}.")
-        source, digest = str(path), sha256(path.read_bytes()).hexdigest()
+            raise InputError(f"{where}no such file: {path}.")
+        source, digest = str(path), file_sha256(path)
     elif not _kind(source):
         from systems import library
 
         library.describe(source)  # an unknown name is refused now, with the nearest
-    name = entry.get("name", "")
-    if not isinstance(name, str) or (name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", name)):
-        raise InputError(f"{where}: name = {name!r} must be letters, digits and . _ + - (it names files).")
-    own = _own_settings(entry, _SCENE_KEYS, where)
-    return SceneSpec(name or _name_of(source), source, digest, {**shared.preparation, **own.preparation})
+    if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
+        raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
+    return SceneSpec(head.name or _name_of(source), source, digest, preparation)
 
 
 def _name_of(source: str) -> str:
@@ -231,7 +249,7 @@ def _name_of(source: str) -> str:
     return f"{plain or kind or 'scene'}-{sha256(source.encode()).hexdigest()[:6]}"
 
 
-def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix: str) -> list[Run]:
+def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> list[Run]:
     shared, protocol = _by_protocol(shared, own)
     given = {**shared.values, **own.values}
     values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given, protocol)
@@ -241,19 +259,22 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, seed: int, suffix
         axes.pop("temperatures", None)
     elif "temperatures" in axes and "temperature_k" in (own if "temperatures" in own.axes else shared).values:
         raise InputError("give temperature or temperatures, not both.")
-    replicas = _whole(axes, "replicas", 1, least=1)
-    temperatures = _temperatures(axes["temperatures"]) if "temperatures" in axes else [values["temperature_k"]]
+    replicas, temperatures = axes.get("replicas", 1), [values["temperature_k"]]
+    if "temperatures" in axes:
+        temperatures = [parse_temperature_k(str(entry), "temperatures") for entry in axes["temperatures"]]
+    if not 0 < replicas * len(temperatures) <= _MOST_RUNS:
+        raise InputError(f"{replicas} x {len(temperatures)} temperatures: from 1 to {_MOST_RUNS} runs are made.")
     runs = []
     for temperature_k in temperatures:
         asked = {**values, "temperature_k": temperature_k}
         base = to_config(asked, seed=0)
-        first = first_seed(seed, spec.name, base.temperature_k)
+        first = first_seed(head.seed, spec.name, base.temperature_k)
         for replica in range(replicas):
             label = f"{base.temperature_k:g}K"
             name = f"{spec.name}_{label}_r{replica}"
             config = to_config(asked, seed=(first + replica) % _SEEDS)
             _ = config.n_frames, config.steps_per_frame  # intervals that do not divide are refused here
-            runs.append(Run(name, spec.name, replica, config, f"{spec.name}/{label}/{name}.{suffix}"))
+            runs.append(Run(name, spec.name, replica, config, f"{spec.name}/{label}/{name}.{head.format}"))
     if len({run.name for run in runs}) < len(runs):
         raise InputError("a temperature is listed twice.")
     return runs
@@ -263,8 +284,8 @@ def _by_protocol(shared: Settings, own: Settings) -> tuple[Settings, str | None]
     """Return the protocol that a scene's runs go by, and the campaign's settings without what it outweighs: a protocol
     of the scene's own outweighs what the campaign says, that of the campaign does not."""
     if "protocol" not in own.axes:
-        return shared, _text(shared.axes, "protocol", "") or None
-    name = _text(own.axes, "protocol", "")
+        return shared, shared.axes.get("protocol")
+    name = own.axes["protocol"]
     decided = find_protocol(name).settings
     values = {key: value for key, value in shared.values.items() if key not in decided}
     left_out = ("protocol", "temperatures") if "temperature_k" in decided else ("protocol",)
@@ -275,49 +296,3 @@ def first_seed(seed: int, scene: str, temperature_k: float) -> int:
     """Return the seed of replica 0; replica k adds k. It depends on what the run is, never on when it is started."""
     digest = sha256(f"{seed}/{scene}/{temperature_k!r}".encode()).digest()
     return int.from_bytes(digest[:4], "big") % _SEEDS
-
-
-def _temperatures(listed: Any) -> list[float]:
-    if not isinstance(listed, list) or not listed:
-        raise InputError("temperatures must be a list, such as ['300K', '350K'].")
-    return [parse_temperature_k(str(entry), "temperatures") for entry in listed]
-
-
-def _text(table: dict[str, Any], key: str, default: str) -> str:
-    value = table.get(key, default)
-    if not isinstance(value, str) or (key in table and not value):
-        raise InputError(f"{key} = {value!r} must be a text.")
-    return value
-
-
-def _whole(table: dict[str, Any], key: str, default: int, *, least: int) -> int:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise InputError(f"{key} = {value!r} must be a whole number, {least} or more.")
-    return value
-
-
-def _cluster(table: dict[str, Any]) -> ClusterSpec | None:
-    if "cluster" not in table:
-        return None
-    given = table["cluster"]
-    if not isinstance(given, dict) or "kind" not in given:
-        raise InputError("[cluster] needs kind = 'slurm' (or another of dask-jobqueue's).")
-    known = {f.name: f for f in fields(ClusterSpec)}
-    values: dict[str, Any] = {}
-    for key, value in given.items():
-        if key not in known:
-            raise InputError(f"[cluster] has no key {key!r}.{nearest(key, list(known))}")
-        default = known[key].default
-        if default is MISSING or isinstance(default, str):
-            values[key] = _text(given, key, "")
-        elif isinstance(default, int):
-            values[key] = _whole(given, key, 1, least=1)
-        elif not isinstance(value, list) or not all(isinstance(line, str) for line in value):
-            raise InputError(f"[cluster] {key} must be a list of texts.")
-        else:
-            values[key] = tuple(value)
-    if values["kind"] not in CLUSTER_KINDS:
-        meant = nearest(values["kind"], list(CLUSTER_KINDS))
-        raise InputError(f"[cluster] kind {values['kind']!r} is not one of {', '.join(CLUSTER_KINDS)}.{meant}")
-    return ClusterSpec(**values)

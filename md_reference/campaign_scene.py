@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.campaign_file import SceneSpec, keyword_defaults
+from md_reference.campaign_file import SceneSpec, switches_of
 from md_reference.forcefield import ForceFieldSpec, build_system, resolve
 from md_reference.platforms import PlatformChoice, measured_platform
 from md_reference.run_config import MDConfig
 from systems.errors import InputError
+from systems.outside import content
 from systems.scene import Scene
+from systems.schema import built, parsed
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     from systems.prepare import prepare
     from systems.whole_file import create_whole
 
-    switches = keyword_defaults(prepare)
+    switches = switches_of(prepare)
     scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
@@ -77,8 +79,6 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
 def load_prepared(path: Path) -> PreparedScene:
     """Read what `prepare_once` wrote. Raises InputError when it cannot be read."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        platform = PlatformChoice(**{**record["platform"], "timings": ()})
-        return PreparedScene(Scene.from_dict(record["scene"]), ForceFieldSpec(**record["force"]), platform)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return built(PreparedScene, parsed(content(path)))
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from md_reference.forcefield import ForceFieldSpec
 from md_reference.run_config import MDConfig, settings_of
 from systems.errors import InputError, nearest
+from systems.schema import fitted
 from systems.units import parser_of
 
 # Settings whose names end so are written without it, as texts with a unit.
@@ -40,60 +41,39 @@ def key_of(name: str) -> str:
 def read_settings(
     table: dict[str, Any],
     *,
-    axes: Sequence[str],
-    preparation: dict[str, Any],
-    others: Sequence[str] = (),
-    where: str = "",
+    axes: Mapping[str, Any],
+    preparation: Mapping[str, Any],
+    others: Iterable[str],
+    where: str,
 ) -> Settings:
-    """Return a table's settings, in our units. `preparation`: the switches of `prepare` and their defaults.
+    """Return a table's settings, in our units. `axes`, `preparation`: the annotations of what else it may say of runs.
 
-    Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read), and
-    for values of the wrong kind.
+    Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read),
+    ValueError for values of the wrong kind.
     """
-    by_key = {key_of(name): (name, f) for name, f in _known_fields().items()}
-    prefix = f"{where}: " if where else ""
+    hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
+    by_key = {key_of(name): name for name in _known_fields()}
     found = Settings({}, {}, {})
     for key, value in table.items():
         if key in axes:
-            found.axes[key] = value
+            found.axes[key] = fitted(value, axes[key], f"{where}{key}")
         elif key in preparation:
-            found.preparation[key] = _switch(key, value, preparation[key], prefix)
+            found.preparation[key] = fitted(value, preparation[key], f"{where}{key}")
         elif key in by_key:
-            name, known = by_key[key]
-            found.values[name] = _value(key, name, known, value, prefix)
+            name = by_key[key]
+            found.values[name] = _value(name, hints[name], value, f"{where}{key}")
         else:
             meant = nearest(key, [*by_key, *preparation, *axes, *others])
-            raise InputError(f"{prefix}unknown key {key!r}.{meant}")
+            raise InputError(f"{where}unknown key {key!r}.{meant}")
     return found
 
 
-def _switch(key: str, value: Any, default: Any, prefix: str) -> Any:
-    if isinstance(default, bool) != isinstance(value, bool):
-        raise InputError(
-            f"{prefix}{key} = {value!r} must be {'true or false' if isinstance(default, bool) else 'a number'}."
-        )
-    return value
-
-
-def _value(key: str, name: str, known: Field[Any], value: Any, prefix: str) -> Any:
-    has_unit = name.endswith(_ENDINGS)
-    optional = "None" in str(known.type)
-    if optional and value in ("natural", "none"):
+def _value(name: str, hint: Any, value: Any, where: str) -> Any:
+    if type(None) in get_args(hint) and value in ("natural", "none"):
         return None
-    if has_unit:
-        if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-            raise InputError(f"{prefix}{key} = {value!r} must be a quantity with its unit, as a text.")
-        return parser_of(name)(str(value), f"{prefix}{key}")
-    kinds = {"bool": bool, "int": int, "float": float, "str": str}
-    wanted = kinds.get(str(known.type).removesuffix(" | None"))
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if wanted is None or not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        meant = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-        raise InputError(
-            f"{prefix}{key} = {value!r} must be {meant.get(wanted, str(known.type)) if wanted else known.type}."
-        )
-    return value
+    if name.endswith(_ENDINGS):
+        return parser_of(name)(str(fitted(value, float | str, where)), where)
+    return fitted(value, hint, where)
 
 
 def to_config(values: dict[str, Any], *, seed: int) -> MDConfig:

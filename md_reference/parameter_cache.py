@@ -5,8 +5,6 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import tempfile
-import zlib
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -15,9 +13,11 @@ from typing import Any
 from md_reference.prmtop import Prmtop
 from systems.checksums import sealed, unsealed
 from systems.chemistry import match_atoms
-from systems.errors import InputError, OutOfDomainError, StorageError
-from systems.outside import gunzipped
+from systems.errors import InputError, OutOfDomainError
+from systems.outside import content
 from systems.scene import Scene
+from systems.schema import built, parsed
+from systems.whole_file import create_whole, storage_error
 
 _FORMAT = 1
 
@@ -34,6 +34,14 @@ class Entry:
         """Return the prmtop text in the scene's atom order. Raises OutOfDomainError for another molecule."""
         order = match_atoms(scene, self.template)
         return Prmtop(self.prmtop).permuted(order).text()
+
+
+@dataclass(frozen=True)
+class _Record:
+    format: int
+    scene: Scene
+    prmtop: str
+    source: dict[str, Any]
 
 
 def cache_folder() -> Path:
@@ -87,38 +95,25 @@ def store(path: Path, entry: Entry) -> Entry:
     """
     template = replace(entry.template, provenance={})
     record = {"format": _FORMAT, "source": entry.source, "scene": template.to_dict(), "prmtop": entry.prmtop}
-    text = sealed(json.dumps(record, sort_keys=True))
-    data = gzip.compress(text.encode(), mtime=0)
+    data = gzip.compress(sealed(json.dumps(record, sort_keys=True)).encode(), mtime=0)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".new")
-        try:
-            with os.fdopen(descriptor, "wb") as handle:
-                handle.write(data)
-                handle.flush()
-                os.fsync(handle.fileno())
-            os.chmod(temporary, 0o644)
-            existing = _read(path)
-            if existing is not None and fits(existing, entry.template):
-                return existing
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
     except OSError as error:
-        raise StorageError(f"cannot write parameters to {path}: {error.strerror}.") from error
+        raise storage_error(path, error, "nothing was changed") from error
+    existing = _read(path)
+    if existing is not None and fits(existing, entry.template):
+        return existing
+    create_whole(path, data)
     return entry
 
 
 def _read(path: Path) -> Entry | None:
     """Return an entry, or None where there is none or it is damaged (it is then made again)."""
     try:
-        text = gunzipped(path.read_bytes()).decode()
-        record = json.loads(unsealed(text) if path.parent != shipped_folder() else text)
-        if record["format"] != _FORMAT:
+        text = content(path).decode()
+        found = built(_Record, parsed(unsealed(text) if path.parent != shipped_folder() else text))
+        if found.format != _FORMAT or Prmtop(found.prmtop).n_atoms != found.scene.n_atoms:
             return None
-        entry = Entry(Scene.from_dict(record["scene"]), record["prmtop"], record["source"])
-        if Prmtop(entry.prmtop).n_atoms != entry.template.n_atoms:
-            return None
-        return entry
-    except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, InputError, zlib.error):
+        return Entry(found.scene, found.prmtop, found.source)
+    except (OSError, ValueError, LookupError, TypeError, InputError):
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from md_reference.timing import Timing, measuring_allowed, platforms, recall, remember, size_class
 from systems.errors import UnknownNameError, nearest
@@ -36,7 +36,7 @@ class PlatformChoice:
     """An OpenMM platform, the threads it runs on, the reason in words, and the timings it rests on."""
 
     name: str
-    threads: int
+    threads: Annotated[int, range(1, 1025)]
     reason: str
     timings: tuple[Timing, ...] = ()
 

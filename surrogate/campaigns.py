@@ -100,7 +100,7 @@ def describe_campaign(folder: Path) -> dict[str, Any]:
     manifest = read_manifest(campaign_folder(folder) or folder)
     runs = list(manifest.runs.values())
     complete = [run for run in runs if run.status == COMPLETE]
-    simulated_ps = sum(run.n_frames * float(run.settings["save_every_ps"]) for run in complete)
+    simulated_ps = sum(run.simulated_ps for run in complete)
     counts = manifest.counts()
     temperatures = sorted({run.temperature_k for run in runs})
     from systems.units import format_time_ps

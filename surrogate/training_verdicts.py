@@ -207,7 +207,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
 def _nearer_weights(weights: Weights) -> list[str]:
     """Name shipped weights that know this molecule, or molecules like it, under the same conditions."""
     from surrogate.data.shipped import shipped_weights
-    from surrogate.data.weights import TrainingDomain, read_header
+    from surrogate.data.weights import read_header
     from surrogate.sampling.domain import find_deviations
 
     if "from" in weights.provenance:
@@ -215,9 +215,9 @@ def _nearer_weights(weights: Weights) -> list[str]:
     own = weights.domain
     for name, path in shipped_weights().items():
         header = read_header(path)
-        domain = TrainingDomain.from_dict(header["domain"])
+        domain = header.domain
         same = all(domain.conditions.get(key) == own.conditions.get(key) for key in ("force_field", "solvent"))
-        if header["arch"] != weights.model.arch or not same or domain.lag_ps != own.lag_ps:
+        if header.arch != weights.model.arch or not same or domain.lag_ps != own.lag_ps:
             continue
         if not any(find_deviations(member.scene, domain) for member in own.members):
             return [f"to go on from weights that know such molecules (--from {name}), or to roll those"]

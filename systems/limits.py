@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from systems.errors import InputError
 from systems.frame_columns import column_blocks, cross, signed_volume, squared_distance
 from systems.scene import Scene
+from systems.schema import built
 from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -45,12 +46,12 @@ class Limits:
     atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift.
     """
 
-    angle_idx: IntArray
+    angle_idx: Annotated[IntArray, (-1, 3)]
     angle_min_rad: FloatArray
     angle_max_rad: FloatArray
-    flat_idx: IntArray
+    flat_idx: Annotated[IntArray, (-1, 4)]
     flat_max_nm: FloatArray
-    jump_idx: IntArray
+    jump_idx: Annotated[IntArray, (-1, 2)]
     jump_max_nm: float
     jump_min_nm: float = 0.0
 
@@ -69,20 +70,9 @@ class Limits:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Limits:
         """Rebuild limits. Raises InputError when an entry is missing, unknown or malformed."""
-        names = [f.name for f in fields(Limits)]
-        if set(record) | {"jump_min_nm"} != set(names):
-            raise InputError(f"Limits record has entries {sorted(record)}, not {sorted(names)}.")
         try:
-            values: dict[str, Any] = {}
-            for name in names[:-2]:
-                if name.endswith("_idx"):
-                    width = {"angle_idx": 3, "flat_idx": 4, "jump_idx": 2}[name]
-                    values[name] = np.array(record[name], dtype=np.int64).reshape(-1, width)
-                else:
-                    values[name] = np.array(record[name], dtype=np.float64)
-            least = float(record.get("jump_min_nm", 0.0))
-            return Limits(**values, jump_max_nm=float(record["jump_max_nm"]), jump_min_nm=least)
-        except (TypeError, ValueError) as error:
+            return built(Limits, record)
+        except ValueError as error:
             raise InputError(f"Limits record is malformed: {error}.") from error
 
 

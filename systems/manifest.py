@@ -6,16 +6,22 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from systems.errors import InputError, TrajectoryError
+from systems.outside import content
+from systems.schema import built, parsed
 
 MANIFEST_NAME = "manifest.json"
 FORMAT = 1
 
-WAITING, RUNNING, COMPLETE, FAILED = "waiting", "running", "complete", "failed"
+Status = Literal["waiting", "running", "complete", "failed"]
+WAITING: Final = "waiting"
+RUNNING: Final = "running"
+COMPLETE: Final = "complete"
+FAILED: Final = "failed"
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,7 @@ class SceneEntry:
     source: str
     source_sha256: str = ""
     preparation: dict[str, Any] = field(default_factory=dict)
-    status: str = WAITING
+    status: Status = WAITING
     reason: str = ""
     n_atoms: int | None = None
     formula: str | None = None
@@ -51,9 +57,9 @@ class RunEntry:
     replica: int
     seed: int
     file: str
-    settings: dict[str, Any]
+    settings: dict[str, float | bool | str | None]
     n_frames_wanted: int
-    status: str = WAITING
+    status: Status = WAITING
     reason: str = ""
     attempts: int = 0
     n_frames: int = 0
@@ -64,6 +70,17 @@ class RunEntry:
     programs: dict[str, str] = field(default_factory=dict)
     host: str = ""
     wall_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in (self.file, *self.sha256):
+            if Path(name).is_absolute() or ".." in Path(name).parts:
+                raise InputError(f"run {self.name}: {name} lies outside the campaign's folder.")
+
+    @property
+    def simulated_ps(self) -> float:
+        """What of its time is simulated."""
+        every_ps = self.settings.get("save_every_ps")
+        return self.n_frames * every_ps if isinstance(every_ps, float) else 0.0
 
 
 @dataclass(frozen=True)
@@ -101,15 +118,15 @@ def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a campaign's folder. Raises InputError when there is none or it cannot be read."""
     path = folder / MANIFEST_NAME
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        if record.pop("format") != FORMAT:
+        record = dict(parsed(content(path)))
+        if record.pop("format", None) != FORMAT:
             raise InputError(f"{path} was written by another version of surromd (its format is not {FORMAT}).")
-        scenes = [SceneEntry(**{**entry, "repairs": tuple(entry["repairs"])}) for entry in record.pop("scenes")]
-        runs = [RunEntry(**entry) for entry in record.pop("runs")]
-        return Manifest(scenes={s.name: s for s in scenes}, runs={r.name: r for r in runs}, **record)
+        for key in ("scenes", "runs"):
+            record[key] = {entry["name"]: entry for entry in record[key]}
+        return built(Manifest, record)
     except FileNotFoundError:
         raise InputError(f"{folder} holds no {MANIFEST_NAME}: it is no campaign's folder.") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path} cannot be read as a campaign's manifest ({error}).") from error
 
 

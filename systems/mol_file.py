@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from systems.embedding import drop_isotopes, embed, require, sanitise
 from systems.errors import InputError, PreparationError
 from systems.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
-from systems.outside import gunzipped
+from systems.outside import content
 from systems.salts import main_molecule
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
@@ -160,8 +159,8 @@ def read_text(path: Path) -> str:
     if path.is_dir():
         raise InputError(f"{path} is a directory; give a structure file.")
     try:
-        data = gunzipped(path.read_bytes())
-    except (OSError, ValueError, zlib.error) as error:
+        data = content(path)
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file.") from error
     if not data.strip():
         raise InputError(f"{path} is empty; give a molecule with coordinates.")

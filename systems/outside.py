@@ -22,14 +22,20 @@ _COLUMN_BYTES, _PACKED = 64_000_000, 100
 _PAIRS_PER_ATOM = 500
 
 
-def gunzipped(data: bytes) -> bytes:
-    """Return the content of a gzip file, or data that are none. Raises ValueError and zlib.error, also for too much."""
+def content(path: Path) -> bytes:
+    """Return what a file holds, unpacked where it is a gzip file. Raises OSError, ValueError, also for too much."""
+    if path.stat().st_size > _TEXT_BYTES:
+        raise ValueError(f"it holds more than {_TEXT_BYTES // 1_000_000} MB")
+    data = path.read_bytes()
     if data[:2] != b"\x1f\x8b":
         return data
     parts, size = [], 0
     while data:
         engine = zlib.decompressobj(wbits=31)
-        parts.append(engine.decompress(data, _TEXT_BYTES - size + 1))
+        try:
+            parts.append(engine.decompress(data, _TEXT_BYTES - size + 1))
+        except zlib.error as error:
+            raise ValueError(f"a damaged gzip file, {error}") from error
         size += len(parts[-1])
         if size > _TEXT_BYTES:
             raise ValueError(f"it unpacks to more than {_TEXT_BYTES // 1_000_000} MB")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from systems.errors import InputError
-from systems.outside import gunzipped
+from systems.outside import content
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
@@ -113,11 +113,9 @@ def read_text(path: Path) -> str:
     if _suffix(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
         raise InputError(f"{path} has suffix {path.suffix!r}; structures are read from {known}, also gzipped.")
     try:
-        data = gunzipped(path.read_bytes())
-    except (OSError, EOFError, ValueError) as error:
+        data = content(path)
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read ({error}); check the file and its permissions.") from error
-    except Exception as error:  # zlib.error has no common base with the others
-        raise InputError(f"{path} is a damaged gzip file ({error}); fetch it again.") from error
     if not data.strip():
         raise InputError(f"{path} is empty; give a PDB or mmCIF file with coordinates.")
     if b"\0" in data:

@@ -6,13 +6,14 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from systems.elements import PARTICLE
 from systems.errors import InputError
+from systems.schema import built
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -38,7 +39,7 @@ class Scene:
     residue_names: tuple[str, ...]
     residue_ids: tuple[str, ...]
     chain_of_residue: tuple[str, ...]
-    bonds: IntArray
+    bonds: Annotated[IntArray, (-1, 2)]
     bond_orders: FloatArray
     formal_charges: IntArray
     masses_da: FloatArray
@@ -55,6 +56,11 @@ class Scene:
             raise InputError(f"Scene {self.name!r}: per-atom arrays differ in length from its {n} elements.")
         if self.positions_nm.shape != (n, 3):
             raise InputError(f"Scene {self.name!r}: positions have shape {self.positions_nm.shape}, not ({n}, 3).")
+        n_residues = len(self.residue_names)
+        if {len(self.residue_ids), len(self.chain_of_residue)} != {n_residues} or (
+            n and not 0 <= self.residue_of_atom.min() <= self.residue_of_atom.max() < n_residues
+        ):
+            raise InputError(f"Scene {self.name!r}: residues differ in number, or an atom is in none of them.")
         if len(self.bonds) != len(self.bond_orders):
             raise InputError(f"Scene {self.name!r}: {len(self.bonds)} bonds but {len(self.bond_orders)} bond orders.")
         if len(self.bonds) and (self.bonds.min() < 0 or self.bonds.max() >= n):
@@ -129,22 +135,8 @@ class Scene:
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Scene:
-        """Rebuild a scene from `to_dict`. Raises InputError when a key is missing or unknown."""
-        try:
-            fields = dict(record)
-            for key in ("atom_names", "elements", "residue_names", "residue_ids", "chain_of_residue"):
-                fields[key] = tuple(fields[key])
-            for key in ("residue_of_atom", "bonds", "formal_charges"):
-                fields[key] = np.array(fields[key], dtype=np.int64)
-            for key in ("bond_orders", "masses_da", "positions_nm"):
-                fields[key] = np.array(fields[key], dtype=np.float64)
-            fields["bonds"] = fields["bonds"].reshape(-1, 2)
-            for key in ("cell_nm", "velocities_nm_ps"):
-                if fields.get(key) is not None:
-                    fields[key] = np.array(fields[key], dtype=np.float64)
-            return Scene(**fields)
-        except (KeyError, TypeError) as error:
-            raise InputError(f"Scene record is incomplete or has unknown entries: {error}.") from error
+        """Rebuild a scene from `to_dict`. Raises ValueError for what is none (systems.schema)."""
+        return built(Scene, record)
 
     # ---- other libraries' objects, each made here and nowhere else -------------------------------------------------
 

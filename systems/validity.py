@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ from systems.errors import InputError
 from systems.frame_columns import column_blocks, signed_volume, squared_distance, torsion_cosine
 from systems.geometry_rules import HALF_ANGSTROM_NM, MAX_PAIRS, RING_BENT_COSINE, find_rules, measured_rules, n_pairs
 from systems.scene import Scene
+from systems.schema import built
 
 FloatArray = npt.NDArray[np.floating[Any]]
 IntArray = npt.NDArray[np.int64]
@@ -48,7 +49,6 @@ _NAMES = {
     ENERGY: "energy above the reference",
     STILL: "hardly a change from the frame before",
 }
-_FLOAT_FIELDS = ("bond_mean_nm", "bond_std_nm", "clash_min_nm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +64,16 @@ class Geometry:
     """
 
     hydrogen: IntArray
-    bond_idx: IntArray
+    bond_idx: Annotated[IntArray, (-1, 2)]
     bond_mean_nm: FloatArray
     bond_std_nm: FloatArray
-    near_idx: IntArray
+    near_idx: Annotated[IntArray, (-1, 2)]
     clash_min_nm: FloatArray
-    stereo_idx: IntArray
+    stereo_idx: Annotated[IntArray, (-1, 4)]
     stereo_sign: IntArray
-    omega_idx: IntArray
+    omega_idx: Annotated[IntArray, (-1, 4)]
     omega_sign: IntArray
-    ring_idx: IntArray
+    ring_idx: Annotated[IntArray, (-1, 4)]
     excluded: tuple[str, ...] = ()
 
     @property
@@ -111,17 +111,9 @@ class Geometry:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Geometry:
         """Rebuild a geometry. Raises InputError when an entry is missing, unknown or malformed."""
-        names = [f.name for f in fields(Geometry)]
-        if set(record) != set(names):
-            raise InputError(f"Geometry record has entries {sorted(record)}, not {sorted(names)}.")
         try:
-            arrays: dict[str, Any] = {}
-            for name in names[:-1]:
-                array = np.array(record[name], dtype=np.float64 if name in _FLOAT_FIELDS else np.int64)
-                width = {"bond_idx": 2, "near_idx": 2}.get(name, 4)
-                arrays[name] = array.reshape(-1, width) if name.endswith("_idx") else array
-            return Geometry(**arrays, excluded=tuple(str(x) for x in record["excluded"]))
-        except (TypeError, ValueError) as error:
+            return built(Geometry, record)
+        except ValueError as error:
             raise InputError(f"Geometry record is malformed: {error}.") from error
 
 

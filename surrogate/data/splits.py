@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError
+from systems.schema import built
 
 # Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
 RUN = 4
@@ -47,7 +48,8 @@ class Split:
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Split:
-        return Split(record["share"], tuple(record["held"]))
+        """Rebuild a split. Raises ValueError for what is none."""
+        return built(Split, record)
 
 
 def refuse_leaks(coordinates: npt.NDArray[Any], starts: npt.NDArray[Any], split: Split,

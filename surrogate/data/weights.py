@@ -16,7 +16,7 @@ from surrogate.models.interface import Surrogate
 from surrogate.models.stiff import StiffPlan, StiffTerms
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.scene import Scene
-from systems.schema import check_types
+from systems.schema import built, parsed
 from systems.whole_file import create_whole
 
 FORMAT = "surromd-weights-1"
@@ -58,20 +58,11 @@ class TrainingDomain:
         return self.jumps[-1][0] if self.jumps else self.lag_ps
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a weights file keeps; what a single molecule and lag leave empty is left out."""
+        """Return what a weights file keeps (`systems.schema.built` takes it back); what a single molecule and lag leave
+        empty is left out."""
         out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
         out["further"] = [domain.to_dict() for domain in self.further]
         return {key: value for key, value in out.items() if value or key not in ("jumps", "further", "transferable")}
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> TrainingDomain:
-        """Take back what `to_dict` returned. Raises ValueError, KeyError, TypeError, InputError for anything else."""
-        check_types(TrainingDomain, record, "domain.")
-        further = tuple(TrainingDomain.from_dict(domain) for domain in record.get("further", ()))
-        jumps = tuple((float(lag), float(least), float(most)) for lag, least, most in record.get("jumps", ()))
-        return TrainingDomain(
-            **{**record, "scene": Scene.from_dict(record["scene"]), "further": further, "jumps": jumps}
-        )
 
     def describe(self) -> str:
         """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
@@ -101,13 +92,14 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class _Header:
-    """What a weights file's record must hold."""
+class Header:
+    """A weights file's record: everything but its numbers."""
 
     arch: str
     config: dict[str, Any]
-    domain: dict[str, Any]
+    domain: TrainingDomain
     provenance: dict[str, Any]
+    stiff: StiffPlan | None = None
 
 
 def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
@@ -147,18 +139,17 @@ def save_weights(
     create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
-def read_header(path: str | Path) -> dict[str, Any]:
+def read_header(path: str | Path) -> Header:
     """Return a weights file's record without loading it. Raises InputError (no such file) or WeightsError."""
     path = Path(path)
+    return _header(path, _metadata(path))
+
+
+def _header(path: Path, metadata: dict[str, str]) -> Header:
     try:
-        header = json.loads(_metadata(path)["surromd"])
-    except (ValueError, KeyError, RecursionError) as error:
-        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
-    try:
-        check_types(_Header, dict.fromkeys(_Header.__annotations__) | header if isinstance(header, dict) else 0)
+        return built(Header, parsed(metadata.get("surromd", "")))
     except ValueError as error:
-        raise WeightsError(f"{path} is damaged: its record's {error}.") from error
-    return dict(header)
+        raise WeightsError(f"{path} is damaged or of a later version: its record is none ({error}).") from error
 
 
 def _metadata(path: Path) -> dict[str, str]:
@@ -185,7 +176,8 @@ def load_weights(path: str | Path) -> Weights:
     from safetensors.torch import load
 
     path = Path(path)
-    metadata, header = _metadata(path), read_header(path)
+    metadata = _metadata(path)
+    header = _header(path, metadata)
     data = path.read_bytes()
     try:
         state = load(data)
@@ -195,15 +187,15 @@ def load_weights(path: str | Path) -> Weights:
     if "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
         raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
     try:
-        arch = architecture(header["arch"])
+        arch = architecture(header.arch)
     except UnknownNameError as error:
         raise WeightsError(f"{path} is of another version of surromd: {error}") from error
     try:
-        _check_sizes(header["config"], len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
-        model, domain = arch.model(arch.config(header["config"])), TrainingDomain.from_dict(header["domain"])
+        _check_sizes(header.config, len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
+        model = arch.model(arch.config(header.config))
     except (*UNREADABLE, ArithmeticError, SurromdError) as error:
         raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
-    stiff = _stiff_terms(path, header.get("stiff"), state)
+    stiff = _stiff_terms(path, header.stiff, state)
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
@@ -215,20 +207,19 @@ def load_weights(path: str | Path) -> Weights:
         )
     return Weights(
         model=model.eval().requires_grad_(False),
-        domain=domain,
-        provenance=header["provenance"],
+        domain=header.domain,
+        provenance=header.provenance,
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,
         stiff=stiff,
     )
 
 
-def _stiff_terms(path: Path, record: dict[str, Any] | None, state: dict[str, torch.Tensor]) -> StiffTerms | None:
+def _stiff_terms(path: Path, plan: StiffPlan | None, state: dict[str, torch.Tensor]) -> StiffTerms | None:
     """Take the tensors of stiff terms out of a file's. Raises WeightsError where they are not those of its record."""
     numbers = {name: state.pop(_STIFF + name).double() for name in StiffTerms.NAMES if _STIFF + name in state}
-    if record is None:
+    if plan is None:
         return None
-    plan = StiffPlan.of(record)
     expected = StiffTerms.NAMES if plan.rows else StiffTerms.NAMES[:1]
     if sorted(numbers) != sorted(expected) or not all(torch.isfinite(values).all() for values in numbers.values()):
         raise WeightsError(f"{path} is damaged: its stiff terms are not whole; restore it from a whole copy.")

@@ -34,7 +34,7 @@ class BaselineConfig:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> BaselineConfig:
         """Raises InputError for an unknown key, naming the nearest."""
-        return build(BaselineConfig, record, "")
+        return build(BaselineConfig, record)
 
 
 class Baseline(Surrogate):

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,13 +61,6 @@ class ChainScale:
     deviation: dict[str, float]
     slots: dict[str, int]
     n_slots: int
-
-    @staticmethod
-    def of(record: ChainScale | dict[str, Any]) -> ChainScale:
-        """Rebuild it from a weights file's record."""
-        if isinstance(record, ChainScale):
-            return record
-        return ChainScale(**record)
 
 
 class ChainCode(nn.Module):

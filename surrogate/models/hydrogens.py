@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -44,14 +43,6 @@ class Site:
     def n_states(self) -> int:
         return self.hands * (N_PHASES if self.turns else 1)
 
-    @staticmethod
-    def of(record: Site | dict[str, Any]) -> Site:
-        """Rebuild a site from a weights file's record."""
-        if isinstance(record, Site):
-            return record
-        return Site(record["parent"], tuple(record["hydrogens"]), tuple(record["around"]), record["turns"],
-                    record["hands"])  # fmt: skip
-
 
 @dataclass(frozen=True)
 class HydrogenPlan:
@@ -65,13 +56,6 @@ class HydrogenPlan:
         """The heavy atoms, ascending: those that the model works on, in its order."""
         hydrogens = {h for site in self.sites for h in site.hydrogens}
         return tuple(i for i in range(self.n_atoms) if i not in hydrogens)
-
-    @staticmethod
-    def of(record: HydrogenPlan | dict[str, Any] | None) -> HydrogenPlan | None:
-        """Rebuild a plan from a weights file's record."""
-        if record is None or isinstance(record, HydrogenPlan):
-            return record
-        return HydrogenPlan(record["n_atoms"], tuple(Site.of(site) for site in record["sites"]))
 
 
 class SiteGroup(nn.Module):

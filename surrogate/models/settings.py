@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from systems.errors import InputError, nearest
-from systems.schema import check_types
+from systems.errors import InputError
+from systems.schema import built
 
 T = TypeVar("T")
 
 
-def build(cls: type[T], record: dict[str, Any], prefix: str) -> T:
-    """Return cls(**record), refusing (InputError) unknown keys with the nearest known one."""
-    known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
-    for key in record:
-        if key not in known:
-            raise InputError(f"unknown setting {prefix}{key}; known: {', '.join(known)}.{nearest(key, known)}")
+def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
+    """Return the settings `cls` of a record. Raises InputError as `systems.schema.built` does."""
     try:
-        check_types(cls, record, prefix)
+        return built(cls, record, prefix)
     except ValueError as error:
-        raise InputError(f"setting {error}.") from error
-    return cls(**record)
+        raise InputError(f"settings: {error}.") from error
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

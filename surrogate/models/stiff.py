@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,12 +38,6 @@ class StiffPlan:
     rigid: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int, int, int], ...] = ()
     soft: tuple[int, ...] = ()
-
-    @staticmethod
-    def of(record: dict[str, Any]) -> StiffPlan:
-        """Rebuild a plan from a weights file's record."""
-        rigid, rows = ([tuple(row) for row in record[key]] for key in ("rigid", "rows"))
-        return StiffPlan(tuple(rigid), tuple(rows), tuple(record["soft"]))
 
 
 @dataclass(frozen=True, eq=False)

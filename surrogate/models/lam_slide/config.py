@@ -157,17 +157,4 @@ class LamSlideConfig:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> LamSlideConfig:
         """Raises InputError for an unknown key, naming the nearest."""
-        record = dict(record)
-        approximator = dict(record.pop("approximator", {}))
-        approximator["rare_kinds"] = tuple(Kind.of(k) for k in approximator.pop("rare_kinds", ()))
-        if approximator.get("lag_range_ps") is not None:
-            low, high = approximator["lag_range_ps"]
-            approximator["lag_range_ps"] = (float(low), float(high))
-        sub = {
-            "atoms": build(GraphConfig, record.pop("atoms", {}), "atoms."),
-            "autoencoder": build(AutoencoderConfig, record.pop("autoencoder", {}), "autoencoder."),
-            "approximator": build(ApproximatorConfig, approximator, "approximator."),
-            "hydrogen_plan": HydrogenPlan.of(record.pop("hydrogen_plan", None)),
-            "residues": ResidueLayout.of(record.pop("residues", None)),
-        }
-        return build(LamSlideConfig, {**record, **sub}, "")
+        return build(LamSlideConfig, record)

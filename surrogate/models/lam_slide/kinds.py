@@ -29,14 +29,6 @@ class Kind:
     rare: tuple[int, ...]
     visited: int | None = None
 
-    @staticmethod
-    def of(record: Kind | dict[str, Any]) -> Kind:
-        """Rebuild a kind from a weights file's record."""
-        if isinstance(record, Kind):
-            return record
-        a, b, c, d = record["quad"]
-        return Kind((a, b, c, d), tuple(record["rare"]), record["visited"])
-
 
 def torsion_bins(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> BinArray:
     """Return the bin `(n_quads, n_frames)`, of N_BINS, of each torsion in frames `(n_frames, n_atoms, 3)`."""

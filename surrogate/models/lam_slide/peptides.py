@@ -65,12 +65,7 @@ class PeptideConfig:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> PeptideConfig:
         """Raises InputError for an unknown key, naming the nearest."""
-        record = dict(record)
-        scale = record.pop("scale", None)
-        types = tuple(record.pop("types", ()))
-        return build(
-            PeptideConfig, {**record, "types": types, "scale": None if scale is None else ChainScale.of(scale)}, ""
-        )
+        return build(PeptideConfig, record)
 
     @property
     def lags_ps(self) -> Tensor:

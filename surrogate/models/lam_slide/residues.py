@@ -8,7 +8,6 @@ its supplement). Atoms are taken from their places before any loss is formed, so
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -36,14 +35,6 @@ class ResidueLayout:
     slots: tuple[tuple[int, ...], ...]
     frames: tuple[tuple[int, ...], ...]
     torsions: tuple[tuple[int, ...], ...]
-
-    @staticmethod
-    def of(record: ResidueLayout | dict[str, Any] | None) -> ResidueLayout | None:
-        """Rebuild a layout from a weights file's record."""
-        if record is None or isinstance(record, ResidueLayout):
-            return record
-        rows = {key: tuple(tuple(row) for row in record[key]) for key in ("slots", "frames", "torsions")}
-        return ResidueLayout(record["n_atoms"], tuple(record["types"]), **rows)
 
 
 class ResidueAtoms(nn.Module):

@@ -79,4 +79,4 @@ class PainetConfig:
     @staticmethod
     def from_dict(record: dict[str, Any]) -> PainetConfig:
         """Raises InputError for an unknown key, naming the nearest."""
-        return build(PainetConfig, record, "")
+        return build(PainetConfig, record)

@@ -18,6 +18,7 @@ from systems.errors import InputError
 from systems.geometry import signed_volumes, torsion
 from systems.library import load
 from systems.scene import Scene
+from systems.schema import built
 
 Array = npt.NDArray[np.float64]
 
@@ -323,8 +324,7 @@ def test_a_plan_survives_a_weights_file() -> None:
     from json import dumps, loads
 
     plan = hydrogen_sites(load("ACE-SER-NME"))
-    assert HydrogenPlan.of(loads(dumps(asdict(plan)))) == plan
-    assert HydrogenPlan.of(None) is None
+    assert built(HydrogenPlan, loads(dumps(asdict(plan)))) == plan
 
 
 def test_frames_of_heavy_atoms_are_a_view() -> None:

@@ -196,7 +196,7 @@ def test_training_goes_on_with_another_molecule(weights: Weights, write: Write, 
     sets = collect_sets([write(smiles("CCO"), "ethanol")])
     out = train_lam_slide(sets, tmp_path / "t.safetensors", weights.model.config, QUICK, start=weights)
     assert load_weights(out).domain.scene.formula == "C2H6O"
-    assert read_header(out)["provenance"]["from"]["hash"] == weights.hash
+    assert read_header(out).provenance["from"]["hash"] == weights.hash
 
 
 def test_a_held_out_system_that_is_trained_on_in_another_order_is_refused(write: Write) -> None:

@@ -29,6 +29,7 @@ from systems.errors import InputError
 from systems.geometry import torsion
 from systems.library import load
 from systems.scene import Scene
+from systems.schema import built
 from systems.selection import part_of
 
 
@@ -64,7 +65,7 @@ def test_capped_residues_are_laid_out_by_their_names() -> None:
     # Peptide bonds are trans, and are found so.
     omega = [k for k, row in enumerate(named(layout.torsions)) if row[0] in ("CH3", "CA") and row[2] == "N"]
     assert (np.abs(torsion(scene.positions_nm, [layout.torsions[k] for k in omega])) > 2.6).all()
-    assert ResidueLayout.of(json.loads(json.dumps(asdict(layout)))) == layout
+    assert built(ResidueLayout, json.loads(json.dumps(asdict(layout)))) == layout
 
 
 def test_every_library_peptide_has_a_layout() -> None:

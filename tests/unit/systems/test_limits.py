@@ -121,7 +121,7 @@ def test_limits_survive_json_exactly(limits: Limits, alanine_dipeptide: Scene) -
     flags = check(frames, limits)
     assert flags.any()
     assert np.array_equal(check(frames, again), flags)
-    with pytest.raises(InputError, match="entries"):
+    with pytest.raises(InputError, match="angle_idx is missing"):
         Limits.from_dict({"jump_max_nm": 1.0})
     with pytest.raises(InputError, match="malformed"):
         Limits.from_dict({**limits.to_dict(), "jump_idx": "x"})
