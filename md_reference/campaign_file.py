@@ -19,7 +19,7 @@ from systems.errors import InputError, SurromdError
 from systems.manifest import file_sha256
 from systems.outside import content
 from systems.protocols import find_protocol
-from systems.schema import built, fitted
+from systems.schema import built, fitted, parsed
 from systems.units import parse_temperature_k, parse_wall_s
 
 T = TypeVar("T")
@@ -120,10 +120,10 @@ def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Camp
     path = Path(path)
     try:
         text = content(path).decode()
-        table = tomllib.loads(text)
+        table = parsed(text, tomllib.loads)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file.") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as TOML: {error}.") from error
     try:
         return _campaign(table, path, text, None if folder is None else Path(folder))

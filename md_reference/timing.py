@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from systems.errors import SurromdError
+from systems.outside import content
+from systems.schema import parsed
 from systems.whole_file import create_whole
 
 _FORMAT = 1
@@ -197,7 +199,7 @@ def remember(key: str, timings: list[Timing]) -> None:
 def _read() -> dict[str, Any]:
     """Return µs a step by machine, scene class and platform."""
     try:
-        stored = json.loads(cache_file().read_text())
+        stored = parsed(content(cache_file()))
         return dict(stored["us_per_step"]) if stored["format"] == _FORMAT else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

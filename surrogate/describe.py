@@ -21,6 +21,8 @@ def describe_file(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".safetensors":
         return _weights(path)
+    from surrogate.data.frames import is_windows
+
     if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path):
         return _windows(path)
     return _trajectory(path)
@@ -107,16 +109,6 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
             *(f"bias: {why}" for why in account["bias"]),
         ]
     return lines
-
-
-def is_windows(path: Path) -> bool:
-    """True for a windows file; a damaged file is none, so that opening it as a trajectory says what is wrong."""
-    from surrogate.data.frames import is_windows_file
-
-    try:
-        return is_windows_file(path)
-    except OSError:
-        return False
 
 
 def _windows(path: Path) -> dict[str, Any]:

@@ -199,8 +199,7 @@ def _fitted(request: TrainingRequest) -> Prepared:
 
 def read_frames(request: TrainingRequest, *, canonical: bool, velocities: bool = False) -> TrainingFrames:
     """Return the frames of one windows file or of trajectories, as the architecture wants them."""
-    from surrogate.data.frames import collect_frames, load_frames
-    from surrogate.describe import is_windows
+    from surrogate.data.frames import collect_frames, is_windows, load_frames
 
     if not any(is_windows(path) for path in request.paths):
         frames = collect_frames(

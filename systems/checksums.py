@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import TrajectoryError
+from systems.schema import parsed
 
 Checksums = npt.NDArray[np.uint32]
 _Words = npt.NDArray[np.uint64]
@@ -90,7 +91,7 @@ def unpacked(data: bytes) -> tuple[dict[str, Any], bytes, bytes]:
     blob = rest[: int(size)] if size.isdigit() else b""
     if hashlib.sha256(text + blob).hexdigest().encode() != digest:
         raise ValueError("its checksum is wrong")
-    return json.loads(text), blob, rest[len(blob) :]
+    return parsed(text), blob, rest[len(blob) :]
 
 
 def _digest(text: str) -> str:

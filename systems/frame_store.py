@@ -22,9 +22,10 @@ import numpy.typing as npt
 
 from systems.atomic_file import AtomicFile, journal_path
 from systems.checksums import checksum_rows, frame_checksums, frames_digest, sealed, unsealed
-from systems.errors import InputError, StorageError, TrajectoryError
-from systems.outside import check_hdf5
+from systems.errors import InputError, StorageError, TrajectoryError, first_line
+from systems.outside import UNREADABLE, open_checked
 from systems.scene import Scene
+from systems.schema import parsed
 from systems.trajectory_types import FrameBlock
 from systems.whole_file import create_whole, refuse_existing, storage_error
 
@@ -93,15 +94,14 @@ def damage_reported(path: Path) -> Iterator[None]:
     """Turn whatever HDF5 and NumPy raise on a damaged file into a TrajectoryError of one line."""
     try:
         yield
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise TrajectoryError(f"{path} is damaged ({reason}); restore it from a whole copy.") from error
+    except UNREADABLE as error:
+        raise TrajectoryError(f"{path} is damaged ({first_line(error)}); restore it from a whole copy.") from error
 
 
 def get_json(file: h5py.File, name: str) -> Any:
     """Return the JSON value of a text dataset. Raises KeyError or ValueError when it is missing or damaged."""
     text = file[name][()].decode("ascii")
-    return json.loads(unsealed(text) if CHECKSUMS in file else text)
+    return parsed(unsealed(text) if CHECKSUMS in file else text)
 
 
 def create_store(
@@ -153,11 +153,8 @@ def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
         before = AtomicFile(path, writable=False)
         seen = before if before.is_unfinished else path
     try:
-        file = h5py.File(seen, "r" if source is None else "r+")
-        with damage_reported(path):
-            check_hdf5(file, path)
-        return file
-    except (OSError, RuntimeError, ValueError, TrajectoryError) as error:
+        return open_checked(path, "r" if source is None else "r+", seen)
+    except (*UNREADABLE, TrajectoryError) as error:
         if source is not None and source.failure is not None:
             raise storage_error(path, source.failure, "nothing was changed") from error
         if isinstance(error, TrajectoryError):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from systems.element_data import atomic_weight_da
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.pdb_records import read_structure
 from systems.scene import Scene
+from systems.schema import parsed
 
 
 def scene_from_mdtraj_topology(
@@ -73,7 +73,7 @@ def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, pat
     from mdtraj.core.topology import bond_name_to_type
 
     try:
-        record = json.loads(text)
+        record = parsed(text)
         topology = mdtraj.Topology()
         for chain_record in sorted(record["chains"], key=lambda c: c["index"]):
             chain = topology.add_chain(chain_record.get("chain_id"))

@@ -204,9 +204,9 @@ class Hdf5Reader(TrajectoryReader):
 def is_plain_h5md(path: Path) -> bool:
     """Whether this is another program's H5MD, without MDTraj's names beside it."""
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             return "h5md" in file and "coordinates" not in file and "surromd" not in file
-    except (OSError, RuntimeError, KeyError):  # damaged: its own reader says how
+    except TrajectoryError:  # its own reader says how it is damaged
         return False
 
 

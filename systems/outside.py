@@ -5,19 +5,25 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import struct
+import zipfile
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from systems.errors import InputError, PreparationError, TrajectoryError
 
 if TYPE_CHECKING:
     import h5py
+    import numpy.typing as npt
     from scipy.spatial import cKDTree
 
 _TEXT_BYTES = 512_000_000
 # HDF5's columns that are read whole: more than this, and more than so many times the file, is not believed.
 _COLUMN_BYTES, _PACKED = 64_000_000, 100
+# What zipfile and NumPy raise on files that are damaged, or made to harm.
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+              OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 # Atoms have some dozen neighbours; this many times as many stand in each other.
 _PAIRS_PER_ATOM = 500
 
@@ -45,12 +51,39 @@ def content(path: Path) -> bytes:
     return b"".join(parts)
 
 
-def check_hdf5(file: h5py.File, path: Path) -> None:
-    """Raise TrajectoryError for an HDF5 file that leads to other files, or declares far more than it holds."""
+def open_checked(path: Path, mode: str = "r", source: Any = None) -> h5py.File:
+    """Open an HDF5 file, through the file object `source` where there is one. Raises what h5py raises, and
+    TrajectoryError for a file that leads to other files, or declares far more than it holds."""
+    import h5py
+
+    file = h5py.File(source or path, mode)
+    try:
+        _check(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def arrays_in(source: str | Path | BinaryIO) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz file, in which nothing is run. Raises much that is no error of ours (`UNREADABLE`),
+    also for arrays that declare far more than the file holds."""
+    import numpy as np
+
+    with zipfile.ZipFile(source) as file:
+        packed, declared = (sum(getattr(i, n) for i in file.infolist()) for n in ("compress_size", "file_size"))
+        if declared > max(_COLUMN_BYTES, _PACKED * packed):
+            raise ValueError(f"it declares {declared / 1e9:.3g} GB in {packed / 1e6:.3g} MB")
+    if not isinstance(source, str | Path):
+        source.seek(0)
+    with np.load(source, allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
+
+
+def _check(file: h5py.File, path: Path) -> None:
     import h5py
 
     size = os.stat(path).st_size
-
     links: list[tuple[str, Any]] = []
     file.visititems_links(lambda name, link: links.append((name, link)))
     for name, link in links:

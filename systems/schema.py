@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -47,10 +47,10 @@ def built(cls: type[T], record: Any, where: str = "") -> T:
         raise ValueError(str(error).rstrip(".")) from error
 
 
-def parsed(text: str | bytes) -> Any:
-    """Return the value of JSON text. Raises ValueError."""
+def parsed(text: Any, read: Callable[[Any], Any] = json.loads) -> Any:
+    """Return the value of JSON text, or what else `read` takes. Raises ValueError."""
     try:
-        return json.loads(text)
+        return read(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 
@@ -113,11 +113,12 @@ def _is_whole(value: Any) -> bool:
 
 def _array(value: Any, kind: type[Any], where: str) -> Any:
     """Return nested lists as an array of float64 (or of a kind of integers)."""
-    whole = issubclass(get_origin(kind) or kind, np.integer)
+    kind = get_origin(kind) or kind
+    whole = issubclass(kind, np.integer)
     try:
         found = np.asarray(value)
         if found.dtype.kind in ("iu" if whole else "iuf") or not found.size:
-            found = np.array(found, dtype=kind if whole else np.float64)
+            found = np.array(found, dtype=np.float64 if kind is np.floating else kind)
             if np.isfinite(found).all():
                 return found
     except (ValueError, TypeError, OverflowError):
@@ -133,7 +134,7 @@ def _refuse(value: Any, hint: Any, where: str) -> Any:
         name, meant = f"one of {', '.join(args)}", nearest(str(value), list(args))
     elif not name:
         name = str(hint) if args else getattr(hint, "__name__", str(hint))
-    raise ValueError(f"{where} = {_shown(value)} must be {name}{meant and f" ({meant.strip()})"}")
+    raise ValueError(f"{where} = {_shown(value)} must be {name}" + (f" ({meant.strip()})" if meant else ""))
 
 
 def _shown(value: Any) -> str:

@@ -13,6 +13,7 @@ from surrogate.data.molecule_windows import MoleculeWindows, pair_kinds, split_w
 from systems import library
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
+from systems.outside import arrays_in
 from systems.scene import Scene
 
 if TYPE_CHECKING:
@@ -75,8 +76,8 @@ def read_md17_ethanol(path: Path, span: int) -> MoleculeWindows:
     """Read MD17's own ethanol (DFT; `R` in Å, `z`; frames 0.5 fs apart): every tenth frame, from each of the ten first
     frames on, all of it for test. Raises InputError for another molecule or another order of atoms."""
     scene = library.load("ethanol")
-    with np.load(path) as handle:
-        numbers, frames = handle["z"], handle["R"].astype(np.float64) / 10.0
+    stored = arrays_in(path)
+    numbers, frames = stored["z"], stored["R"].astype(np.float64) / 10.0
     structure = _structure(scene)
     if numbers.tolist() != structure["elements"].tolist():
         raise InputError(f"{path} holds atoms {numbers.tolist()}, ethanol is {structure['elements'].tolist()}.")

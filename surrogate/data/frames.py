@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.data.splits import Split, refuse_leaks
-from systems.errors import InputError
+from systems.errors import InputError, TrajectoryError, first_line
+from systems.frame_store import open_hdf5
 from systems.geometry import superpose
 from systems.scene import Scene
+from systems.schema import built, parsed
 from systems.whole_file import create_whole
 
 if TYPE_CHECKING:
@@ -35,6 +37,19 @@ MEMORY_BYTES = 2_000_000_000
 # What frames are written into: an array or a data set of HDF5.
 Target = Any
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a windows file says of its frames."""
+
+    scene: Scene
+    lag_ps: float
+    canonical: bool
+    conditions: dict[str, float | bool | str | None]
+    sources: tuple[dict[str, Any], ...]
+    quantum_nm: float
+    split: Split = field(default_factory=Split)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,41 +156,39 @@ def load_frames(path: str | Path) -> TrainingFrames:
 
     Raises InputError for any other file.
     """
-    import h5py
-
+    path = Path(path)
     try:
-        with h5py.File(path, "r") as handle:
-            header = json.loads(handle.attrs["surromd_windows"])
-            return TrainingFrames(
-                scene=Scene.from_dict(header["scene"]),
-                coordinates=_mapped(path, handle["coordinates"]),
-                starts=handle["starts"][:],
-                lag_ps=header["lag_ps"],
-                canonical=header["canonical"],
-                conditions=header["conditions"],
-                sources=tuple(header["sources"]),
-                velocities=_mapped(path, handle["velocities"]) if "velocities" in handle else None,
-                split=Split.from_dict(header["split"]) if "split" in header else Split(),
-            )
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is not a windows file of `surromd windows` ({error}).") from error
+        with open_hdf5(path) as handle:
+            header, starts = built(_Header, parsed(handle.attrs["surromd_windows"])), handle["starts"][:]
+            columns = [_mapped(path, handle[name]) for name in ("coordinates", "velocities") if name in handle]
+    except (OSError, LookupError, ValueError, RuntimeError, TypeError, TrajectoryError) as error:
+        raise InputError(f"{path} is not a windows file of `surromd windows` ({first_line(error)}).") from error
+    shape = (int(starts[-1]) if starts.ndim == 1 and len(starts) > 1 else -1, header.scene.n_atoms, 3)
+    kinds = [(column.shape, column.dtype.str) for column in columns]
+    if kinds != [(shape, kind) for kind in ("<i2", "<f4")][: len(kinds)] or (np.diff(starts, prepend=0) < 0).any():
+        raise InputError(f"{path} is damaged: its frames are not those that it says it holds.")
+    return TrainingFrames(
+        **{f.name: getattr(header, f.name) for f in fields(_Header) if f.name != "quantum_nm"},
+        coordinates=columns[0],
+        starts=starts,
+        velocities=columns[1] if len(columns) > 1 else None,
+    )
 
 
-def _mapped(path: str | Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
+def _mapped(path: Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
     offset = dataset.id.get_offset() if dataset.chunks is None else None
     if offset is None:
         return dataset[:]
     return np.memmap(path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape)
 
 
-def is_windows_file(path: str | Path) -> bool:
-    """True for a file written by `TrainingFrames.save`."""
-    import h5py
-
-    if not h5py.is_hdf5(path):
+def is_windows(path: Path) -> bool:
+    """True for a windows file; a damaged file is none, so that opening it as a trajectory says what is wrong."""
+    try:
+        with open_hdf5(path) as handle:
+            return "surromd_windows" in handle.attrs
+    except TrajectoryError:
         return False
-    with h5py.File(path, "r") as handle:
-        return "surromd_windows" in handle.attrs
 
 
 def collect_frames(

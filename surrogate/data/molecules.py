@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surrogate.data.frames import TrainingFrames, collect_frames, is_windows_file, load_frames
+from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames
 from surrogate.data.poses import in_standard_pose, standard_turn
 from surrogate.data.splits import Split
 from systems.errors import InputError
@@ -68,7 +68,7 @@ def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
 
     found: dict[str, list[Path]] = {}
     for path in paths:
-        if is_windows_file(path):
+        if is_windows(path):
             found[f"windows {path}"] = [path]
             continue
         with open_trajectory(path) as reader:
@@ -79,7 +79,7 @@ def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
 
 
 def _read(paths: list[Path], held: list[Path], spool: Path | None) -> TrainingFrames:
-    if is_windows_file(paths[0]):
+    if is_windows(paths[0]):
         frames = load_frames(paths[0])
         if not frames.canonical:
             raise InputError(f"{paths[0]} holds frames in their own pose; make it without --velocities.")

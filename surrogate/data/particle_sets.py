@@ -12,7 +12,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.errors import InputError
+from systems.errors import InputError, TrajectoryError
+from systems.outside import open_checked
+from systems.schema import parsed
 
 SPLITS = ("train", "validation", "test")
 _FORMAT = "surromd-particle-sets-1"
@@ -97,7 +99,7 @@ def read_set(path: Path, split: str, n: int | None = None) -> ParticleSet:
         if n > complete or n < 1:
             raise InputError(f"{path} holds {complete} {split} trajectories, not {n}.")
         arrays = {name: handle[split][name][:n] for name in _ARRAYS}
-        lag_ps = float(json.loads(handle.attrs["record"])["lag_ps"])
+        lag_ps = float(parsed(handle.attrs["record"])["lag_ps"])
     return ParticleSet(**arrays, lag_ps=lag_ps)
 
 
@@ -112,8 +114,8 @@ def check_disjoint(sets: Sequence[ParticleSet]) -> None:
 
 def _open(path: Path, mode: str = "r") -> h5py.File:
     try:
-        handle = h5py.File(path, mode)
-    except OSError as error:
+        handle = open_checked(path, mode)
+    except (OSError, TrajectoryError) as error:
         raise InputError(f"{path} cannot be read ({error}); delete it and run again.") from error
     if handle.attrs.get("format") != _FORMAT:
         handle.close()
@@ -123,5 +125,5 @@ def _open(path: Path, mode: str = "r") -> h5py.File:
 
 def _read_record(path: Path) -> dict[str, Any]:
     with _open(path) as handle:
-        record: dict[str, Any] = json.loads(handle.attrs["record"])
+        record: dict[str, Any] = parsed(handle.attrs["record"])
     return record

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from systems.errors import InputError
-from systems.schema import built
+from systems.outside import content
+from systems.schema import built, parsed
 
 T = TypeVar("T")
 
@@ -23,9 +24,8 @@ def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return a TOML file's record. Raises InputError when it is missing or malformed."""
     try:
-        with open(path, "rb") as handle:
-            return tomllib.load(handle)
+        return dict(parsed(content(Path(path)).decode(), tomllib.loads))
     except FileNotFoundError:
         raise InputError(f"configuration {path} does not exist.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"configuration {path} is not valid TOML: {error}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"configuration {path} is not valid TOML: {error}.") from error

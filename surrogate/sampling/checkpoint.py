@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import io
-import struct
-import zipfile
-import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +12,11 @@ import numpy.typing as npt
 
 from surrogate.sampling.account import Tally
 from systems.checkpoint import Checkpoint
-from systems.errors import InputError
+from systems.errors import InputError, first_line
+from systems.outside import UNREADABLE, arrays_in
+from systems.schema import built
 
 Float32Array = npt.NDArray[np.float32]
-
-# What zipfile and NumPy raise on files that are damaged, or made to harm; nothing in them is ever run.
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-               OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
 
 @dataclass
@@ -62,14 +57,12 @@ def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) 
     """
     header, blob = state
     try:
-        with np.load(io.BytesIO(blob), allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-        known, plain = header["settings"], dict(header["progress"])
-        tallies = [Tally(**tally) for tally in plain.pop("tallies")]
-        progress = Progress(**arrays, **plain, tallies=tallies)
+        arrays = arrays_in(io.BytesIO(blob))
+        known, progress = dict(header["settings"]), built(Progress, {**header["progress"], **arrays}, "progress.")
     except UNREADABLE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"checkpoint {path} cannot be read ({reason}); start again with --overwrite.") from error
+        raise InputError(
+            f"checkpoint {path} cannot be read ({first_line(error)}); start again with --overwrite."
+        ) from error
     wanted = known if settings is None else settings
     for key in {**known, **wanted}:
         was, now = known.get(key), wanted.get(key)

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.sampling.checkpoint import UNREADABLE
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.openmm_state import SurrogateState
 from systems.errors import InputError, SimulationError
+from systems.outside import UNREADABLE, arrays_in
 from systems.scene import Scene
+from systems.schema import parsed
 from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
@@ -136,9 +137,8 @@ class Simulation:
         """
         name = str(file) if isinstance(file, str | Path) else "the checkpoint"
         try:
-            with np.load(file, allow_pickle=False) as stored:
-                arrays = {key: stored[key] for key in stored.files}
-            header = json.loads(str(arrays.pop("header")))
+            arrays = arrays_in(file)
+            header = parsed(str(arrays.pop("header")))
             settings, counts = header["settings"], [int(header[k]) for k in ("current_step", "chunks", "frames")]
             last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
         except UNREADABLE as error:

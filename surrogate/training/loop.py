@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
+from systems.schema import built, parsed
 from systems.whole_file import create_whole
 
 if TYPE_CHECKING:
@@ -238,6 +239,17 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     create_whole(path, fill)
 
 
+@dataclass(frozen=True)
+class StateHeader:
+    """What a training state says of itself."""
+
+    step: int
+    spent_s: float
+    stage: str
+    seed: int
+    batch: int
+
+
 def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generators: Tensor,
                step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state (safetensors, JSON in its metadata) whole or not at all."""
@@ -248,8 +260,7 @@ def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
     tensors["generator"] = generators.contiguous()
-    header = {"step": step, "spent_s": spent_s, "stage": config.name, "seed": config.seed, "batch": config.batch}
-    text = json.dumps(header)
+    text = json.dumps(asdict(StateHeader(step, spent_s, config.name, config.seed, config.batch)))
     metadata = {"surromd_training": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
@@ -265,7 +276,7 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
     try:
         with safe_open(path, framework="pt") as handle:
             metadata = handle.metadata()
-            header = json.loads(metadata["surromd_training"])
+            header = built(StateHeader, parsed(metadata["surromd_training"]))
             tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"training state {path} cannot be read ({error}); train again without --resume.") from error
@@ -278,8 +289,8 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
             "or train again without --resume."
         )
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch)):
-        if header[key] != expected:
-            raise InputError(f"training state {path} has {key} {header[key]!r}, this run {expected!r}.")
+        if getattr(header, key) != expected:
+            raise InputError(f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}.")
     sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     try:
         module.load_state_dict(sub("model."))
@@ -297,4 +308,4 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
     if len(states) != process[1]:
         raise InputError(f"training state {path} is of {len(states)} processes, this run has {process[1]}.")
     generator.set_state(states[process[0]])
-    return int(header["step"]), float(header["spent_s"])
+    return header.step, header.spent_s

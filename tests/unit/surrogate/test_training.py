@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.frames import TrainingFrames, collect_frames, is_windows_file, load_frames, quantise
+from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
 from surrogate.data.weights import Weights, load_weights, read_header, save_weights
 from surrogate.models.lam_slide.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
@@ -146,7 +146,7 @@ def test_frames_file_round_trip_and_refusals(tmp_path: Path, harmonic_frames: Tr
     path = tmp_path / "w.h5"
     harmonic_frames.save(path)
     again = load_frames(path)
-    assert is_windows_file(path)
+    assert is_windows(path)
     assert np.array_equal(again.coordinates, harmonic_frames.coordinates)
     assert again.scene.topology_hash == harmonic_frames.scene.topology_hash
     assert (again.lag_ps, again.canonical, again.conditions) == (1.0, True, harmonic_frames.conditions)
