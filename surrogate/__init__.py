@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from surrogate.api import campaign, compare, demo, info, plan, reference, rollout, systems, train, windows
-    from surrogate.sampling.simulation import Simulation
-    from systems.converted import to_mdanalysis, to_mdtraj
+    from surrogate.sampling.openmm.simulation import Simulation
+    from systems.trajectory.converted import to_mdanalysis, to_mdtraj
 
 __version__ = "0.1.0"
 
 _VERBS = ("campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows")
 _ELSEWHERE = {
-    "Simulation": "surrogate.sampling.simulation",
-    "to_mdanalysis": "systems.converted",
-    "to_mdtraj": "systems.converted",
+    "Simulation": "surrogate.sampling.openmm.simulation",
+    "to_mdanalysis": "systems.trajectory.converted",
+    "to_mdtraj": "systems.trajectory.converted",
 }
 
 __all__ = [

@@ -13,15 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.comparisons import compare
 from surrogate.data.shipped import weights_path
-from surrogate.outputs import PathLike, Trajectories, check_outputs, find_trajectories
 from surrogate.progress import progress_bar
-from surrogate.references import plan, reference
-from surrogate.rollouts import rollout
-from surrogate.scenes import systems, tell
-from systems.claim import Claim
+from surrogate.verbs.compare import compare
+from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from surrogate.verbs.reference import plan, reference
+from surrogate.verbs.rollout import rollout
+from surrogate.verbs.scene_listing import systems, tell
 from systems.errors import InputError, UnknownNameError, nearest
+from systems.trajectory.claim import Claim
 from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
@@ -87,8 +87,8 @@ def campaign(
     return what would be run, and start nothing. `out` replaces the folder that the file names.
     Raises InputError for a file that cannot be meant, and for the folder of another campaign.
     """
-    from md_reference.campaign_file import read_campaign
-    from surrogate.campaigns import list_runs, run_campaign
+    from md_reference.campaign.campaign_file import read_campaign
+    from surrogate.verbs.campaign import list_runs, run_campaign
 
     asked = read_campaign(file, folder=out)
     if dry_run:
@@ -103,12 +103,12 @@ def info(path: PathLike) -> dict[str, Any]:
     Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
     """
     from surrogate.data.shipped import shipped_weights
-    from surrogate.describe import describe_file
+    from surrogate.verbs.info import describe_file
 
     if not Path(path).exists():
         return describe_file(shipped_weights().get(str(path), Path(path)))
     if Path(path).is_dir():
-        from surrogate.campaigns import describe_campaign
+        from surrogate.verbs.campaign import describe_campaign
 
         return describe_campaign(Path(path))
     return describe_file(Path(path))
@@ -188,11 +188,11 @@ def train(
     frames from that of the references to this one, and takes it as an input. Beside `out`, a
     CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
     drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are usable and, where they
-    are not, what would help (NAME.verdict.json, surrogate.training_verdicts). `device`: 'auto', 'cpu' or 'cuda';
+    are not, what would help (NAME.verdict.json, surrogate.verbs.train_verdict). `device`: 'auto', 'cpu' or 'cuda';
     several devices by torchrun (surrogate.training.devices).
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
-    from surrogate.trainings import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
+    from surrogate.verbs.train import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
 
     architectures = [*GENERATIVE, *FORECASTERS, *FITTED]
     if arch not in architectures:
@@ -249,11 +249,11 @@ def train(
             raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
     curves = out.with_suffix(".csv")
     if curves.exists() and is_first_process():
-        from surrogate.training.curves import plot_curves
+        from surrogate.training.loss_curves import plot_curves
 
         plot_curves(curves)
     if arch not in FITTED and is_first_process():
-        from surrogate.training_verdicts import judge_training, write_verdict
+        from surrogate.verbs.train_verdict import judge_training, write_verdict
 
         try:
             verdict = judge_training(written)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from systems.elements import PARTICLE
 from systems.errors import InputError
-from systems.schema import built
+from systems.files.schema import built
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -105,7 +105,7 @@ class Scene:
     @property
     def molecule_key(self) -> str:
         """Canonical hash, free of atom order, names and positions (elements, bond graph, charge, stereo)."""
-        from systems.chemistry import molecule_key
+        from systems.chemistry.graph import molecule_key
 
         return molecule_key(self)
 
@@ -135,7 +135,7 @@ class Scene:
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Scene:
-        """Rebuild a scene from `to_dict`. Raises ValueError for what is none (systems.schema)."""
+        """Rebuild a scene from `to_dict`. Raises ValueError for what is none (systems.files.schema)."""
         return built(Scene, record)
 
     # ---- other libraries' objects, each made here and nowhere else -------------------------------------------------
@@ -169,6 +169,6 @@ class Scene:
 
     def write_pdb(self, path: str | Path) -> None:
         """Write a PDB file (positions in Å, CONECT for every bond, atoms in this scene's order)."""
-        from systems.pdb_text import pdb_text
+        from systems.trajectory.pdb_text import pdb_text
 
         Path(path).write_text(pdb_text(self))

@@ -64,7 +64,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def alanine_dipeptide() -> Scene:
     """The library's alanine dipeptide (ACE-ALA-NME, 22 atoms)."""
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     return load("alanine-dipeptide")
 
@@ -103,7 +103,7 @@ def small_weights_file(tmp_path_factory, harmonic_frames, small_model_config) ->
     from dataclasses import replace
 
     from surrogate.data.weights import load_weights, save_weights
-    from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+    from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 
     out = tmp_path_factory.mktemp("weights") / "small.safetensors"
     config = TrainingConfig(stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False)

@@ -29,14 +29,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.bench.reproduce_errors import Estimate, block_means, ratio
+from surrogate.bench.reproduce.forecast_errors import Estimate, block_means, ratio
 from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames, collect_frames
 from surrogate.data.weights import load_weights
 from surrogate.models.conformance import branched_chain, random_state
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet
-from surrogate.training.painet import PainetTraining, StateWindows, for_frames, train_painet
+from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, train_painet
 from systems.errors import InputError
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10_000)

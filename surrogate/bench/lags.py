@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.units import parse_wall_s
-from systems.validity import INVALID, Geometry, check_frames
 
 if TYPE_CHECKING:
     from surrogate.data.frames import TrainingFrames
@@ -56,7 +56,7 @@ def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budge
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
-    from surrogate.training.lam_slide import TrainingConfig, is_trained, train_lam_slide
+    from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
 
     if is_trained(out):
         return
@@ -67,8 +67,8 @@ def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budge
 
 def torsions(scene: Scene, frames_nm: FloatArray) -> FloatArray:
     """Return the first phi and psi `(..., 2)` of frames `(..., n_atoms, 3)`."""
-    from systems.chemistry import backbone_torsions
-    from systems.geometry import torsion
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
 
     of = backbone_torsions(scene)
     flat = frames_nm.reshape(-1, *frames_nm.shape[-2:])
@@ -118,7 +118,7 @@ def _correlation(x: FloatArray, y: FloatArray) -> float:
 
 def joint_distance(x: FloatArray, y: FloatArray) -> float:
     """Return the Jensen-Shannon distance of two sets of (phi, psi), each `(n, 2)` rad."""
-    from surrogate.judge.distributions import distance
+    from surrogate.judge.measure.distributions import distance
 
     edges = np.linspace(-np.pi, np.pi, _BINS + 1)
     counts = [np.histogram2d(a[:, 0], a[:, 1], bins=(edges, edges))[0].ravel() for a in (x, y)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surrogate.data.chains import chain_features
+from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.poses import fitted_atoms
 from surrogate.models.atom_features import AtomFeatures, features_of_graph
 from surrogate.models.interface import Molecule, Surrogate
@@ -26,8 +26,8 @@ def describe(model: Surrogate, scene: Scene) -> Molecule:
 
 def features_of_scene(scene: Scene) -> AtomFeatures:
     """Return the features of a scene's covalent graph, and of its positions about the middle of the fitted atoms."""
-    from systems.chemistry import ring_bonds
-    from systems.symmetry import local_handedness
+    from systems.chemistry.graph import ring_bonds
+    from systems.chemistry.symmetry import local_handedness
 
     handedness = np.zeros(scene.n_atoms)
     for centre, sign in local_handedness(scene).items():

@@ -17,17 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.data.splits import Split, refuse_leaks
+from systems.chemistry.geometry import superpose
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.frame_store import open_hdf5
-from systems.geometry import superpose
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
 from systems.scene import Scene
-from systems.schema import built, parsed
-from systems.whole_file import create_whole
+from systems.trajectory.frame_store import open_hdf5
 
 if TYPE_CHECKING:
     import h5py
 
-    from systems.trajectory_types import TrajectoryReader
+    from systems.trajectory.base import TrajectoryReader
 
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
@@ -240,7 +240,7 @@ def write_windows(
 
 def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> TrainingFrames:
     """Return what the files say of themselves, no frame read yet."""
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     if not paths:
         raise InputError("no trajectory given to train on.")
@@ -279,7 +279,7 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
 
 def _fill(found: TrainingFrames, paths: list[Path], coordinates: Target, moving: Target | None) -> TrainingFrames:
     """Read all frames into `coordinates` and `moving` (arrays or data sets); return `found` with its sources."""
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     scene, sources = found.scene, []
     for path, begin in zip(paths, found.starts[:-1].tolist(), strict=True):

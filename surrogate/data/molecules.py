@@ -64,7 +64,7 @@ def refuse_mixtures(sets: FrameSets) -> None:
 
 
 def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     found: dict[str, list[Path]] = {}
     for path in paths:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
-from systems.outside import open_checked
-from systems.schema import parsed
+from systems.files.outside import open_checked
+from systems.files.schema import parsed
 
 SPLITS = ("train", "validation", "test")
 _FORMAT = "surromd-particle-sets-1"

@@ -137,7 +137,7 @@ def _counter(quads: Sequence[Quad], bins: npt.NDArray[np.int8], starts: IntArray
 
 def _bins(frames: TrainingFrames) -> tuple[list[Quad], npt.NDArray[np.int8]]:
     """Return the rotatable torsions and the bin `(n_torsions, n_frames)` of each."""
-    from systems.chemistry import rotatable_torsions
+    from systems.chemistry.graph import rotatable_torsions
 
     quads = rotatable_torsions(frames.scene)
     bins = np.empty((len(quads), frames.n_frames), dtype=np.int8)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError
-from systems.schema import built
+from systems.files.schema import built
 
 # Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
 RUN = 4

@@ -11,13 +11,13 @@ from typing import Any
 import torch
 
 from surrogate.data.tensor_checksums import tensor_checksum
-from surrogate.models.architectures import architecture
 from surrogate.models.interface import Surrogate
+from surrogate.models.registry import architecture
 from surrogate.models.stiff import StiffPlan, StiffTerms
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
 from systems.scene import Scene
-from systems.schema import built, parsed
-from systems.whole_file import create_whole
 
 FORMAT = "surromd-weights-1"
 # Settings that are no sizes (an interval in ps) may be as large as this, however small the model.
@@ -31,8 +31,8 @@ _STIFF = "stiff."
 class TrainingDomain:
     """What the weights were trained for. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
-    `geometry` is what its frames say of valid ones (systems.validity.Geometry as a dictionary), `limits` how far they
-    go beyond that (systems.limits.Limits; None in files of older versions).
+    `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
+    far they go beyond that (systems.chemistry.limits.Limits; None in files of older versions).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
@@ -58,8 +58,8 @@ class TrainingDomain:
         return self.jumps[-1][0] if self.jumps else self.lag_ps
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a weights file keeps (`systems.schema.built` takes it back); what a single molecule and lag leave
-        empty is left out."""
+        """Return what a weights file keeps (`systems.files.schema.built` takes it back); what a single molecule and lag
+        leave empty is left out."""
         out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
         out["further"] = [domain.to_dict() for domain in self.further]
         return {key: value for key, value in out.items() if value or key not in ("jumps", "further", "transferable")}

@@ -9,40 +9,49 @@ from typing import Any
 
 import numpy as np
 
-from surrogate.judge import curves, metrics, relaxation, remarks, verdict
-from surrogate.judge.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
-from surrogate.judge.bond_rows import bond_rows
-from surrogate.judge.charts import Chart
-from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
-from surrogate.judge.couplings import coupling_rows
-from surrogate.judge.curves import Curves
-from surrogate.judge.energy_rows import EnergyFn, energy_rows, measure_energies
-from surrogate.judge.ensemble import Ensemble, equal_lags, on_common_atoms
-from surrogate.judge.forecast import forecast_charts
-from surrogate.judge.imposed_rows import imposed_notes
-from surrogate.judge.interventions import intervention_rows
-from surrogate.judge.lifetimes import lifetime_rows
-from surrogate.judge.movie import Movie, make_movie
-from surrogate.judge.msm_rows import msm_rows
-from surrogate.judge.peptide_protocol import peptide_charts
-from surrogate.judge.peptide_shape import along_time, secondary_structure
-from surrogate.judge.rows import Options, Row, Trio, by_group, make_sample
-from surrogate.judge.shape_rows import shape_rows
-from surrogate.judge.slow_motion import longest_correlation
-from surrogate.judge.statistics import block_length, effective_samples, make_blocks
-from surrogate.judge.structure import Backbone, Features, backbone, measure, reference_geometry, reference_probes
-from surrogate.judge.survival import survival_charts
-from surrogate.judge.suspicions import bonds_that_are_none, copied_from, copy_rows, jumps, refuse_wrong_topology
-from surrogate.judge.temperature_row import temperature_rows
-from surrogate.judge.torsion_rows import other_torsion_rows
-from surrogate.judge.wasserstein_rows import wasserstein_rows
-from surrogate.judge.within_rows import within_rows
+from surrogate.judge import remarks, verdict
+from surrogate.judge.measure.movie import Movie, make_movie
+from surrogate.judge.measure.slow_motion import longest_correlation
+from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
+from surrogate.judge.measure.structure import (
+    Backbone,
+    Features,
+    backbone,
+    measure,
+    reference_geometry,
+    reference_probes,
+)
+from surrogate.judge.read.ensemble import Ensemble, equal_lags, on_common_atoms
+from surrogate.judge.rows import curves, metrics
+from surrogate.judge.rows.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
+from surrogate.judge.rows.charts import Chart
+from surrogate.judge.rows.curves import Curves
+from surrogate.judge.rows.imposed_rows import imposed_notes
+from surrogate.judge.rows.intervention_rows import intervention_rows
+from surrogate.judge.rows.motion import relaxation_rows
+from surrogate.judge.rows.motion.forecast import forecast_charts
+from surrogate.judge.rows.motion.lifetimes import lifetime_rows
+from surrogate.judge.rows.motion.msm_rows import msm_rows
+from surrogate.judge.rows.motion.peptide_protocol import peptide_charts
+from surrogate.judge.rows.motion.survival import survival_charts
+from surrogate.judge.rows.motion.within_rows import within_rows
+from surrogate.judge.rows.rows import Options, Row, Trio, by_group, make_sample
+from surrogate.judge.rows.shape.bond_rows import bond_rows
+from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
+from surrogate.judge.rows.shape.couplings import coupling_rows
+from surrogate.judge.rows.shape.energy_rows import EnergyFn, energy_rows, measure_energies
+from surrogate.judge.rows.shape.peptide_shape import along_time, secondary_structure
+from surrogate.judge.rows.shape.shape_rows import shape_rows
+from surrogate.judge.rows.shape.temperature_row import temperature_rows
+from surrogate.judge.rows.shape.torsion_rows import other_torsion_rows
+from surrogate.judge.rows.shape.wasserstein_rows import wasserstein_rows
+from surrogate.judge.rows.suspicions import bonds_that_are_none, copied_from, copy_rows, jumps, refuse_wrong_topology
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
+from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import format_time_ps
-from systems.validity import Geometry
 
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
@@ -255,9 +264,9 @@ def _judge(
     rows = metrics.validity_rows(trio)
     lengths, bonds = bond_rows(trio)
     rows += lengths + metrics.population_rows(trio) + metrics.torsion_rows(trio)
-    kinetic, correlations, skipped = relaxation.correlation_rows(trio)
-    slowest, projected, without_tica = relaxation.tica_rows(trio)
-    seams, without_seams = relaxation.boundary_row(trio)
+    kinetic, correlations, skipped = relaxation_rows.correlation_rows(trio)
+    slowest, projected, without_tica = relaxation_rows.tica_rows(trio)
+    seams, without_seams = relaxation_rows.boundary_row(trio)
     rooms = [room(trio) for room in ROOMS]
     more = [row for found, _, _ in rooms for row in found]
     samples = effective_samples(round(trio.compared_ps / trio.reference.features.lag_ps), correlation)

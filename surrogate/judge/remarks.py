@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from surrogate.judge import metrics, verdict
-from surrogate.judge.rows import Options, Row, Trio
-from surrogate.judge.slow_motion import rarely_crossed
-from surrogate.judge.statistics import effective_samples
-from surrogate.judge.structure import Features
-from surrogate.judge.suspicions import copied_from
-from systems import validity
+from surrogate.judge import verdict
+from surrogate.judge.measure.slow_motion import rarely_crossed
+from surrogate.judge.measure.statistics import effective_samples
+from surrogate.judge.measure.structure import Features
+from surrogate.judge.rows import metrics
+from surrogate.judge.rows.rows import Options, Row, Trio
+from surrogate.judge.rows.suspicions import copied_from
+from systems.chemistry import validity
 from systems.units import format_time_ps
 
 LEAST_SAMPLES = 20

@@ -7,10 +7,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
-from surrogate.judge.imposed_rows import is_imposed
-from surrogate.judge.rows import Options, Row, Word
-from surrogate.judge.statistics import holm
-from systems import validity
+from surrogate.judge.measure.statistics import holm
+from surrogate.judge.rows.imposed_rows import is_imposed
+from surrogate.judge.rows.rows import Options, Row, Word
+from systems.chemistry import validity
 
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
 

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.charts import Line, LineChart
-from surrogate.judge.statistics import Estimate, bootstrap_weights, estimate
+from surrogate.judge.measure.statistics import Estimate, bootstrap_weights, estimate
+from surrogate.judge.rows.charts import Line, LineChart
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge import distributions, kinetics
-from surrogate.judge.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
-from surrogate.judge.equal_atoms import MOST_HISTOGRAMS, evenly
-from surrogate.judge.metrics import MOST_MAPS
-from surrogate.judge.relaxation import turning
-from surrogate.judge.rows import Options
-from surrogate.judge.slow_motion import SLOW_KINDS, longest_correlation, tica_features
-from surrogate.judge.statistics import Blocks, Piece, block_length, make_blocks
-from surrogate.judge.structure import Backbone, Features
+from surrogate.judge.measure import distributions, kinetics
+from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
+from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, evenly
+from surrogate.judge.measure.slow_motion import SLOW_KINDS, longest_correlation, tica_features
+from surrogate.judge.measure.statistics import Blocks, Piece, block_length, make_blocks
+from surrogate.judge.measure.structure import Backbone, Features
+from surrogate.judge.rows.metrics import MOST_MAPS
+from surrogate.judge.rows.motion.relaxation_rows import turning
+from surrogate.judge.rows.rows import Options
 from surrogate.judge.worth import Measure, Worth, worth_by
 
 FloatArray = npt.NDArray[np.float64]

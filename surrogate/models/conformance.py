@@ -15,8 +15,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from surrogate.models.architectures import architecture
 from surrogate.models.interface import Chunk, Molecule, Surrogate, draw_noise
+from surrogate.models.registry import architecture
 
 # Positions in nm: what float32 arithmetic on coordinates of this size may differ by.
 ROUNDING_NM = 2e-6

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.models.atom_features import AtomFeatures
-from surrogate.models.chains import ChainFeatures
+from surrogate.models.peptides.chains import ChainFeatures
 from systems.elements import ATOMIC_NUMBERS, PARTICLE
 from systems.errors import InputError
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from systems.errors import InputError
-from systems.outside import content
-from systems.schema import built, parsed
+from systems.files.outside import content
+from systems.files.schema import built, parsed
 
 T = TypeVar("T")
 
 
 def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
-    """Return the settings `cls` of a record. Raises InputError as `systems.schema.built` does."""
+    """Return the settings `cls` of a record. Raises InputError as `systems.files.schema.built` does."""
     try:
         return built(cls, record, prefix)
     except ValueError as error:

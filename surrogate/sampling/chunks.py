@@ -16,8 +16,8 @@ from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.models.precision import choose_precision
+from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
-from systems.geometry import superposition
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surrogate.data.poses import in_standard_pose, order_along_axis
-from systems.chemistry import ring_bonds, rotatable_torsions
+from systems.chemistry.graph import ring_bonds, rotatable_torsions
+from systems.chemistry.matching import match_atoms
+from systems.chemistry.symmetry import local_handedness
+from systems.chemistry.validity import Geometry, geometry_from_scene
 from systems.errors import OutOfDomainError
-from systems.matching import match_atoms
 from systems.scene import Scene
 from systems.selection import reordered
-from systems.symmetry import local_handedness
-from systems.validity import Geometry, geometry_from_scene
 
 if TYPE_CHECKING:
     # Sampling and training know nothing of each other at run time: the api hands the weights over.

@@ -11,11 +11,11 @@ import numpy.typing as npt
 from surrogate.data.poses import order_along_axis
 from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, cover, torsion_environments
 from surrogate.sampling.lags import at_lag, choose_lag
-from systems.chemistry import bonded_graph
+from systems.chemistry.graph import bonded_graph
+from systems.chemistry.matching import match_atoms
+from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names
 from systems.errors import OutOfDomainError
-from systems.matching import match_atoms
 from systems.scene import Scene
-from systems.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names
 
 if TYPE_CHECKING:
     # Sampling and training know nothing of each other at run time: the api hands the weights over.

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.limits import Limits, check_limits
-from systems.validity import (
+from systems.chemistry.limits import Limits, check_limits
+from systems.chemistry.validity import (
     ANGLE,
     DRIFT,
     ENERGY,
@@ -32,7 +32,8 @@ CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY | STILL
 
 
 class Guard:
-    """The checks of one training domain, with thresholds that its reference set (`systems.validity`, `.limits`)."""
+    """The checks of one training domain, with thresholds that its reference set (`systems.chemistry.validity`,
+    `.limits`)."""
 
     def __init__(self, domain: TrainingDomain) -> None:
         self._geometry = Geometry.from_dict(domain.geometry)

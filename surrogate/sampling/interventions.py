@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.sampling.account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Clock, Tally
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import Flags, Guard, caught, finite
+from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Clock, Tally
+from systems.chemistry.validity import ENERGY, INVALID, JUMP, STILL, flag_names
 from systems.errors import SimulationError
-from systems.validity import ENERGY, INVALID, JUMP, STILL, flag_names
 
 FloatArray = npt.NDArray[np.floating[Any]]
 

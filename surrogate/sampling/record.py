@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 
-from surrogate.sampling.account import Tally
-from surrogate.sampling.checkpoint import Progress
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk
-from surrogate.sampling.plan import Plan
+from surrogate.sampling.rollout_account import Tally
+from surrogate.sampling.rollout_checkpoint import Progress
+from surrogate.sampling.rollout_plan import Plan
 from systems.imposed import KEY
-from systems.trajectory_types import TrajectoryWriter
+from systems.trajectory.base import TrajectoryWriter
 from systems.units import format_time_ps
 
 

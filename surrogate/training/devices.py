@@ -1,6 +1,6 @@
 """Where a training runs: one CPU or GPU, or several started by torchrun, by Lightning Fabric.
 
-    torchrun --nproc-per-node 4 -m surrogate.cli train REF... -o model.safetensors --budget 30min
+    torchrun --nproc-per-node 4 -m surrogate.cli.main train REF... -o model.safetensors --budget 30min
 
 Every process draws its own batch; gradients are averaged, so that the whole batch is the setting's times their number.
 The first process alone validates and writes.

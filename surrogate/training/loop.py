@@ -21,8 +21,8 @@ from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
-from systems.schema import built, parsed
-from systems.whole_file import create_whole
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

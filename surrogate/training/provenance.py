@@ -12,8 +12,8 @@ import torch
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import TrainingDomain, Weights
-from systems.limits import limits_from_frames
-from systems.validity import geometry_from_frames
+from systems.chemistry.limits import limits_from_frames
+from systems.chemistry.validity import geometry_from_frames
 
 
 def training_domain(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from command_line import run
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 TINY = "n_new = 4\nwidth = 16\nn_heads = 2\nhead_dim = 8\nn_decoder_layers = 1\n"
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from command_line import run
-from systems.manifest import (
+from md_reference.campaign.manifest import (
     COMPLETE,
     FAILED,
     MANIFEST_NAME,
@@ -28,9 +28,9 @@ from systems.manifest import (
     write_manifest,
 )
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
-SURROMD = [sys.executable, "-m", "surrogate.cli"]
+SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
 LONG = """
 scenes = ["alanine-dipeptide"]
 replicas = 3

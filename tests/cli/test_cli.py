@@ -20,7 +20,7 @@ from surrogate import api
 from systems.errors import SurromdError
 
 COMMANDS = ["demo", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
-SURROMD = [sys.executable, "-m", "surrogate.cli"]
+SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
 HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib", "lightning_fabric"]
 
 
@@ -66,7 +66,7 @@ def test_help_takes_less_than_half_a_second_of_processor_time() -> None:
 
 
 def test_starting_loads_no_heavy_library() -> None:
-    code = f"import sys, surrogate.cli, surrogate; print([m for m in {HEAVY} if m in sys.modules])"
+    code = f"import sys, surrogate.cli.main, surrogate; print([m for m in {HEAVY} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -248,7 +248,7 @@ def test_replicas_are_numbered_and_differ(here: Path) -> None:
 
 
 def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     made = tmp_path_factory.mktemp("compare")
     assert (
@@ -308,7 +308,7 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
 
     import numpy as np
 
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     with open_trajectory("x.h5") as reader:
         np.testing.assert_allclose(reader.time_ps, 0.1 * np.arange(1, 2001), rtol=1e-9)
@@ -409,7 +409,7 @@ def test_a_model_that_is_wrong_is_stopped_in_one_line(here: Path, tiny_weights: 
 
 
 def test_rollout_is_the_same_under_one_seed_and_differs_under_another(here: Path, tiny_weights: Path) -> None:
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     frames = []
     for name, seed in (("a.h5", "1"), ("b.h5", "1"), ("c.h5", "2")):

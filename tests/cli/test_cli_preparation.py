@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from surrogate.cli import app
-from systems import library
-from systems.pdb_text import pdb_text
+from surrogate.cli.main import app
+from systems.library import named_scenes
+from systems.trajectory.pdb_text import pdb_text
 
 RUNNER = CliRunner()
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
@@ -18,7 +18,7 @@ CHLORIDE = "HETATM  920 CL    CL A 301      30.000  30.000  20.000  1.00  0.00  
 
 @pytest.fixture
 def wet(tmp_path: Path) -> str:
-    text = pdb_text(library.load("alanine-dipeptide"))
+    text = pdb_text(named_scenes.load("alanine-dipeptide"))
     atoms = [line for line in text.splitlines(keepends=True) if line.startswith("ATOM")]
     path = tmp_path / "wet.pdb"
     path.write_text("".join(atoms) + CHLORIDE + WATER + "END\n")
@@ -33,7 +33,7 @@ def test_bound_ions_wait_for_a_word_in_every_verb(tmp_path: Path, wet: str, verb
         "rollout": ["--weights", "alanine-dipeptide", "--time", "1ns", "-o", str(tmp_path / "x.h5")],
     }[verb]
     path = Path(wet)
-    oxygen = library.load("alanine-dipeptide").positions_nm[5] * 10  # of the cap's carbonyl
+    oxygen = named_scenes.load("alanine-dipeptide").positions_nm[5] * 10  # of the cap's carbonyl
     place = "".join(f"{x:8.3f}" for x in oxygen + (0.0, 0.0, 2.9))
     path.write_text(path.read_text().replace("  30.000  30.000  20.000", place))
     refused = RUNNER.invoke(app, [verb, wet, *extra])

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from surrogate import api
-from surrogate.cli import app
-from surrogate.comparisons import compare
+from surrogate.cli.main import app
+from surrogate.verbs.compare import compare
 from systems.errors import InputError, SurromdError
 
 RUNNER = CliRunner()

@@ -12,7 +12,7 @@ import pytest
 
 from process_table import needs_process_table, processes_with, runs, wait_until
 
-SURROMD = [sys.executable, "-m", "surrogate.cli"]
+SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_nothing_is_left_of_charges_being_computed(
 @needs_process_table
 @pytest.mark.slow
 def test_verbs_ended_at_three_moments_leave_nothing(repository: Path) -> None:
-    """A part of the table that docs/studies/endings.py prints for all verbs at ten moments."""
+    """A part of the table that docs/studies/reference/endings.py prints for all verbs at ten moments."""
     study = [sys.executable, str(repository / "docs" / "studies" / "endings.py"), "--moments", "3", "--longest", "15"]
     verbs = ["plan", "reference x 2", "campaign", "train", "rollout", "compare"]
     table = subprocess.run(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from command_line import SMALL_LAM_SLIDE, run
-from systems.library import load
-from systems.trajectory import open_trajectory, open_writer
+from systems.library.named_scenes import load
+from systems.trajectory.codec import open_trajectory, open_writer
 
 
 @pytest.fixture(scope="module")

@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 
 from command_line import run
-from systems import library
-from systems.trajectory import open_trajectory
+from systems.library import named_scenes
+from systems.trajectory.codec import open_trajectory
 
 
 def test_systems_lists_every_scene_in_its_group() -> None:
     printed = run("systems").stdout
     lines = printed.splitlines()
-    for group, names in library.groups().items():
+    for group, names in named_scenes.groups().items():
         start = lines.index(group) + 1
         assert [line.split()[0] for line in lines[start : start + len(names)]] == names
     assert "ACE-ALA-GLY-NME" in printed  # what can be had besides
     listed = json.loads(run("systems", "--json").stdout)
-    assert [entry["name"] for entry in listed] == [name for names in library.groups().values() for name in names]
+    assert [entry["name"] for entry in listed] == [name for names in named_scenes.groups().values() for name in names]
 
 
 @pytest.mark.parametrize(
@@ -36,8 +36,8 @@ def test_systems_shows_a_scene_with_its_protocols_or_its_own_settings(name: str,
     for word in words:
         assert word in printed
     described = json.loads(run("systems", name, "--json").stdout)[0]
-    assert list(described["protocols"]) == list(library.protocols(name))
-    assert described.get("settings", {}) == library.own_settings(name)
+    assert list(described["protocols"]) == list(named_scenes.protocols(name))
+    assert described.get("settings", {}) == named_scenes.own_settings(name)
 
 
 def test_plan_takes_the_protocol_and_says_so() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from command_line import run
-from systems import library
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.source import prepare
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 # The order and the names of the Protein Data Bank: heavy atoms of a residue first.
 ORDER = [4, 5, 1, 0, 2, 3, 6, 8, 14, 15, 10, 7, 9, 11, 12, 13, 16, 18, 17, 19, 20, 21]
 NAMES = ["C", "O", "CH3", "H1", "H2", "H3", "N", "CA", "C", "O", "CB", "H", "HA", "HB1", "HB2", "HB3",

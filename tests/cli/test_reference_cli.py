@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from command_line import run
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 FAST = ("--time", "0.4ps", "--save-every", "0.02ps", "--timestep", "1fs", "--hydrogen-mass", "natural", "--solvent",
         "vacuum")  # fmt: skip
@@ -18,10 +18,10 @@ FAST = ("--time", "0.4ps", "--save-every", "0.02ps", "--timestep", "1fs", "--hyd
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     # The library's protocol equilibrates for longer than a test may take.
-    from md_reference import protocol
+    from md_reference.run import defaults
 
-    shortened = protocol.defaults() | {"equilibrate_ps": 0.2}
-    monkeypatch.setattr(protocol, "defaults", lambda: shortened)
+    shortened = defaults.defaults() | {"equilibrate_ps": 0.2}
+    monkeypatch.setattr(defaults, "defaults", lambda: shortened)
     return tmp_path
 
 
@@ -80,8 +80,8 @@ def test_the_benchmark_compares_equal_models(here: Path) -> None:
 
 def test_unequal_models_are_seen() -> None:
     """Negative control of the comparison: another force field, and another solvent."""
-    from surrogate.bench import reference_setups as setups
-    from surrogate.bench.reference import _compare
+    from surrogate.bench import md_setups as setups
+    from surrogate.bench.md_speed import _compare
 
     ala = next(c for c in setups.CASES if c.scene == "alanine-dipeptide" and c.solvent == "obc2")
     scene = ala.prepared()

@@ -10,7 +10,7 @@ import torch
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import load_weights
-from surrogate.models.baselines import (
+from surrogate.models.baselines.model import (
     BaselineConfig,
     ConstantVelocity,
     FrozenFrame,
@@ -18,13 +18,13 @@ from surrogate.models.baselines import (
     NormalModes,
     TrainingFrameResampling,
 )
+from surrogate.models.baselines.trainer import autoregression, fit_baseline
 from surrogate.models.conformance import SurrogateContract
 from surrogate.models.interface import Molecule, Surrogate
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.baselines import autoregression, fit_baseline
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 
 def normal(*shape: int) -> torch.Tensor:
@@ -148,7 +148,7 @@ def test_resampled_and_markov_frames_are_training_frames(tmp_path: Path, harmoni
 def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(alanine_dipeptide: Scene) -> None:
     """Two structures, hopping with probability 0.05 and 0.15 per frame: three quarters of the time in the first."""
     from surrogate.data.frames import canonicalise, quantise
-    from surrogate.training.baselines import fit_markov_state_model
+    from surrogate.models.baselines.trainer import fit_markov_state_model
 
     rng = np.random.default_rng(3)
     state = np.zeros(6000, dtype=int)

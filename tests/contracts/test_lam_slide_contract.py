@@ -13,9 +13,9 @@ from surrogate.models.conformance import SurrogateContract, branched_chain, rand
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 
 def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: str = "linear",

@@ -12,7 +12,7 @@ from torch import Tensor
 from surrogate.models.atom_features import features_of_graph
 from surrogate.models.conformance import SurrogateContract, branched_chain
 from surrogate.models.interface import Molecule, Surrogate
-from surrogate.models.lam_slide.atoms import MAX_HOPS, bonds_between, hold_hydrogens
+from surrogate.models.lam_slide.codes.atom_tags import MAX_HOPS, bonds_between, hold_hydrogens
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, GraphConfig, LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from systems.errors import InputError

@@ -10,9 +10,9 @@ import torch
 from surrogate.models.conformance import SurrogateContract
 from surrogate.models.hydrogens import HydrogenPlan, Site
 from surrogate.models.interface import Molecule, Surrogate, draw_noise
+from surrogate.models.lam_slide.codes.residue_code import N_SLOTS, RESIDUE_TYPES, ResidueLayout
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
-from surrogate.models.lam_slide.heavy import HeavyLamSlide
-from surrogate.models.lam_slide.residues import N_SLOTS, RESIDUE_TYPES, ResidueLayout
+from surrogate.models.lam_slide.heavy_atoms import HeavyLamSlide
 from systems.errors import InputError
 
 CONFIG = LamSlideConfig(

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from surrogate.data.chains import chain_layout, chain_scale
 from surrogate.data.descriptions import describe
+from surrogate.data.features.peptide_chains import chain_layout, chain_scale
 from surrogate.models.conformance import SurrogateContract
 from surrogate.models.interface import Molecule, Surrogate
-from surrogate.models.lam_slide.peptides import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from systems.errors import InputError
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.sequence import build_peptide
 
 SEQUENCES = {22: "ACE-ALA-NME", 33: "ACE-ALA-SER-NME"}
 

@@ -21,6 +21,6 @@ auxiliary_frames = 2
 
 def run(*arguments: str) -> Result:
     """Return what `surromd ARGUMENTS` printed and its exit status."""
-    from surrogate.cli import app
+    from surrogate.cli.main import app
 
     return CliRunner().invoke(app, list(arguments))

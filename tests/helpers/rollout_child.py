@@ -66,7 +66,7 @@ class Child:
 def start(work: Callable[..., None], *arguments: Any) -> Child:
     """Run `work(line, *arguments)`, a function of this module, and return once it heeds signals."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["rollout_child", "surrogate.sampling.rollout", "systems.library"])
+    context.set_forkserver_preload(["rollout_child", "surrogate.sampling.runner", "systems.library.named_scenes"])
     ours, theirs = context.Pipe()
     process = context.Process(target=_guarded, args=(work, theirs, *arguments), daemon=True)
     process.start()
@@ -114,7 +114,7 @@ def within_file_size(line: Connection, weights: Path, outs: list[Path], config: 
 
 def _roll(weights: Path, outs: list[Path], config: Any, **more: Any) -> None:
     from surrogate.data.weights import load_weights
-    from surrogate.sampling.rollout import rollout
-    from systems.library import load
+    from surrogate.sampling.runner import rollout
+    from systems.library.named_scenes import load
 
     rollout(load("alanine-dipeptide"), load_weights(weights), outs, config, resume=True, flush_every_s=0.0, **more)

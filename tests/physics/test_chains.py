@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference import nonstandard
-from md_reference.ambertools import find_ambertools, run
-from md_reference.capped_residues import cap
-from md_reference.charge_cost import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
-from md_reference.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.glycans import glycan_templates
-from md_reference.regrouping import regroup
-from md_reference.residue_templates import make_template
-from systems.bond_orders import perceive
-from systems.chemistry import backbone_torsions
+from md_reference.forces import nonstandard
+from md_reference.forces.capped_residues import cap
+from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.glycans import glycan_templates
+from md_reference.forces.regrouping import regroup
+from md_reference.forces.residue_templates import make_template
+from md_reference.forces.small_molecules.ambertools import find_ambertools, run
+from md_reference.forces.small_molecules.charge_cost import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
+from systems.chemistry.bond_orders import perceive
+from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
-from systems.library import load
-from systems.molecule import scene_from_smiles
-from systems.prepare import prepare
+from systems.library.named_scenes import load
+from systems.prepare.molecule import scene_from_smiles
+from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
@@ -168,7 +168,7 @@ def test_backbone_torsions_of_such_a_residue_are_those_of_alanine(aib_chain: Any
 
 
 def test_such_a_chain_stays_whole_at_300_k(aib_chain: Any) -> None:
-    from md_reference.engine import Engine
+    from md_reference.run.engine import Engine
 
     scene, _, _ = aib_chain
     spec = resolve(scene, ForceFieldSpec("auto", "auto"))
@@ -187,7 +187,7 @@ def test_such_a_chain_stays_whole_at_300_k(aib_chain: Any) -> None:
 def test_a_missing_term_is_refused(aib_chain: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     import re
 
-    from md_reference import nonstandard as module
+    from md_reference.forces import nonstandard as module
 
     def with_a_hole(capped: Any, name: str) -> Any:
         made = make_template(capped, name)

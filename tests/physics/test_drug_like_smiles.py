@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-
-from surrogate.bench.smiles import Case, cases, run_case
+from drug_like_smiles import Case, cases, run_case
 
 BY_NAME = {c.name: c for c in cases()}
 NOT_GAFF2 = {"radical": "unpaired electron", "element": "GAFF2 has no parameters for"}
@@ -27,7 +26,7 @@ def test_shipped_parameters_run_and_what_gaff2_lacks_is_refused(name: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("case", cases(), ids=lambda c: c.name)
 def test_each_runs_or_says_why_not(case: Case) -> None:
-    from md_reference.ambertools import find_ambertools
+    from md_reference.forces.small_molecules.ambertools import find_ambertools
 
     if find_ambertools() is None:
         pytest.skip("needs AmberTools")

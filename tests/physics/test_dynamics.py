@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.replicas import simulate_replicas
-from md_reference.simulate import MDConfig, simulate
-from surrogate.judge.kinetics import zero_crossing
-from surrogate.judge.statistics import effective_samples
-from systems.library import load
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.engine import Engine
+from md_reference.run.replicas import simulate_replicas
+from md_reference.run.simulate import MDConfig, simulate
+from surrogate.judge.measure.kinetics import zero_crossing
+from surrogate.judge.measure.statistics import effective_samples
+from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 BATH_K = 300.0
 N_SAMPLES = 1500

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine, State
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig, simulate
-from md_reference.summary import correlation_frames, drift, mean_and_error
-from systems.library import load
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.engine import Engine, State
+from md_reference.run.run_summary import correlation_frames, drift, mean_and_error
+from md_reference.run.simulate import MDConfig, simulate
+from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 FLEXIBLE = ForceFieldSpec(solvent="vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)
 N_SAMPLES, SAMPLE_PS = 500, 0.04
@@ -132,8 +132,8 @@ def test_two_seeds_agree_on_the_mean_energy(baths: dict[str, tuple[Any, Any]]) -
 
 def alpha_population(path: Path, scene: Scene) -> dict[str, float | None]:
     """Share of frames with psi between -120 and 30 degrees, with its standard error."""
-    from systems.chemistry import backbone_torsions
-    from systems.geometry import torsion
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
 
     with open_trajectory(path) as reader:
         psi = np.degrees(torsion(reader.read(), backbone_torsions(scene)["psi"]))[:, 0]

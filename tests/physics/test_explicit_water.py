@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.mixture import is_water, molecules_of
-from md_reference.solvation import solvate, solvate_if_asked
+from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.mixture import is_water, molecules_of
+from md_reference.forces.solvation import solvate, solvate_if_asked
+from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError
-from systems.library import load
-from systems.molecule import scene_from_smiles
+from systems.library.named_scenes import load
+from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
 from systems.selection import part_of
 

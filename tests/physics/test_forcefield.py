@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.run.engine import Engine
 from systems.errors import PreparationError, UnknownNameError
-from systems.prepare import prepare
+from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
 
 ENERGY_TOLERANCE_KJ_MOL = 1e-3

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference import gaff, parameter_cache
-from md_reference.ambertools import find_ambertools
-from md_reference.forcefield import ForceFieldSpec, build_system
-from md_reference.prmtop import Prmtop, load_openmm
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.small_molecules import gaff, parameter_cache
+from md_reference.forces.small_molecules.ambertools import find_ambertools
+from md_reference.forces.small_molecules.prmtop import Prmtop, load_openmm
 from systems.errors import PreparationError
-from systems.molecule import scene_from_smiles
+from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
@@ -202,7 +202,7 @@ def test_a_damaged_cache_file_is_made_again(cache_home: Path, monkeypatch: pytes
 
 def test_the_first_of_two_writers_stays(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     # Any prmtop of as many atoms does for the store; this one is shipped.
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     scene = load("ethanol")
     found = parameter_cache.find_shipped(scene, gaff.METHOD)
@@ -215,10 +215,10 @@ def test_the_first_of_two_writers_stays(tmp_path: Path, alanine_dipeptide: Scene
 
 
 def test_shipped_parameters_need_no_ambertools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
-    monkeypatch.setattr("md_reference.ambertools.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.small_molecules.ambertools.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
     scene = load("aspirin")
     assert Prmtop(gaff.parameters(scene)).n_atoms == scene.n_atoms
@@ -227,7 +227,7 @@ def test_shipped_parameters_need_no_ambertools(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_permuted_prmtop_keeps_every_term() -> None:
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     scene = load("uracil")
     text = gaff.parameters(scene)
@@ -275,7 +275,7 @@ def test_terms_that_nobody_knows_are_refused(cache_home: Path, tmp_path: Path) -
 
 @needs_ambertools
 def test_parmchk2_says_the_same_each_time(cache_home: Path, tmp_path: Path) -> None:
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     # Types of aspirin's ring as antechamber gives them; parmchk2 alone has two answers for its impropers.
     text = gaff.parameters(load("aspirin"))

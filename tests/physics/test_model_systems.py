@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.model_systems import build_model_system, build_nve_integrator, generate_n_body
-from systems.model_systems import (
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.model_forces import build_model_system, build_nve_integrator, generate_n_body
+from md_reference.run.engine import Engine
+from systems.library.particles import (
     N_BODY,
     double_well,
     double_well_left_population,

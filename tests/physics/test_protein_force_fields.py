@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.ambertools import find_ambertools, run
-from md_reference.forcefield import ForceFieldSpec, build_system
-from systems.library import load
-from systems.prepare import prepare
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.small_molecules.ambertools import find_ambertools, run
+from systems.library.named_scenes import load
+from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
 
 pytestmark = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, at_level, resolve
-from md_reference.protocol import settle
-from md_reference.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
+from md_reference.forces.forcefield import ForceFieldSpec, at_level, resolve
+from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
+from md_reference.run.defaults import settle
+from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError, UnknownNameError
-from systems.library import load
-from systems.molecule import scene_from_smiles
+from systems.library.named_scenes import load
+from systems.prepare.molecule import scene_from_smiles
 
 pytest.importorskip("tblite")
 SPEC = ForceFieldSpec("gfn2-xtb", "vacuum")

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system
-from md_reference.relaxation import Relaxer
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.run.engine import Engine
+from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import SimulationError
 from systems.scene import Scene
 
@@ -65,7 +65,7 @@ def test_the_energy_is_that_of_the_force_field_alone(engine: Engine, relaxer: Re
 
 def test_relaxing_keeps_the_conformation(engine: Engine, relaxer: Relaxer) -> None:
     """Torsions stay within 15 degrees; a minimisation without springs turns at least one of some frames farther."""
-    from systems.geometry import torsion
+    from systems.chemistry.geometry import torsion
 
     quads = np.array([[4, 6, 8, 14], [6, 8, 14, 16]])
     moved, free = [], []

@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 
 from disk_model import LOSSES, NO_SPACE, Disk, watched
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig, simulate
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.simulate import MDConfig, simulate
 from surrogate.data.weights import Weights
-from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import StorageError, SurromdError
-from systems.library import load
+from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 MD = MDConfig(time_ps=3.0, save_every_ps=0.2, timestep_ps=0.02, equilibrate_ps=0.2, seed=3, platform="Reference",
               force=ForceFieldSpec("auto", "auto"))  # fmt: skip

@@ -17,13 +17,13 @@ import torch
 
 from rollout_child import CHUNKS_UNTIL_STOPPED, FAILED, INTERRUPTED, start, until_stopped, within_file_size
 from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling.checkpoint import Progress, packed_progress, progress_of
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.sampling.simulation import Simulation
-from systems.checkpoint import checkpoint_path, read_checkpoints
+from surrogate.sampling.openmm.simulation import Simulation
+from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError, WeightsError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.checkpoint import checkpoint_path, read_checkpoints
+from systems.trajectory.codec import open_trajectory, open_writer
 
 N_CHUNKS = 180
 
@@ -114,7 +114,7 @@ def test_stopped_between_its_first_frames_and_their_checkpoint_it_goes_on(
         return packed_progress(progress)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("surrogate.sampling.rollout.packed_progress", killed_after_frames)
+        patch.setattr("surrogate.sampling.runner.packed_progress", killed_after_frames)
         rollout(alanine_dipeptide, small_weights, outs, config, flush_every_s=0.0)
     assert len(frames_of(outs[0])) == small_weights.model.n_new
     rollout(alanine_dipeptide, small_weights, outs, config, resume=True)

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling.account import Tally
-from surrogate.sampling.checkpoint import Progress, packed_progress, progress_of
-from surrogate.sampling.simulation import Simulation
-from systems.checkpoint import CheckpointFile, read_checkpoints
+from surrogate.sampling.openmm.simulation import Simulation
+from surrogate.sampling.rollout_account import Tally
+from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
 from systems.errors import SurromdError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.checkpoint import CheckpointFile, read_checkpoints
+from systems.trajectory.codec import open_trajectory, open_writer
 from time_limits import time_limit
 
 SECONDS_A_FILE = 20

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from systems.errors import SurromdError
-from systems.prepare import prepare
+from systems.prepare.source import prepare
 from systems.scene import Scene
 from time_limits import time_limit
 

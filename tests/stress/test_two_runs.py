@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from systems.claim import Claim
 from systems.errors import TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.claim import Claim
+from systems.trajectory.codec import open_trajectory, open_writer
 
 COMMAND = [sys.executable, "-c", "from surrogate.cli import main; main()", "reference", "double-well", "--time", "4ps",
            "--save-every", "200fs", "--timestep", "20fs", "--equilibrate", "1ps", "--platform", "Reference",

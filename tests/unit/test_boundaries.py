@@ -20,7 +20,7 @@ for name in {blocked}:
 import numpy as np
 from surrogate.data.frames import TrainingFrames, load_frames
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 frames = load_frames({windows!r})
 config = LamSlideConfig.from_dict({config!r})
 settings = TrainingConfig(stage_one_steps=2, stage_two_steps=2, stage_two_batch=2, bf16=False)
@@ -39,7 +39,7 @@ def test_training_on_windows_needs_no_chemistry(tmp_path: Path, harmonic_frames,
 
 
 def test_the_block_would_be_noticed() -> None:
-    code = "import sys; sys.modules['openmm'] = None\nfrom systems.library import load\n"
+    code = "import sys; sys.modules['openmm'] = None\nfrom systems.library.named_scenes import load\n"
     code += "load('alanine-dipeptide').to_openmm_topology()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode != 0

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.lags import Row, evenly_started, hold_against, joint_distance, table, torsions
-from systems.validity import Geometry
+from systems.chemistry.validity import Geometry
 
 if TYPE_CHECKING:
     from surrogate.data.frames import TrainingFrames
@@ -37,9 +37,9 @@ _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
 def train(references: Sequence[Path], out: Path, *, steps: int, innovation: bool) -> None:
     """Train on one peptide's references; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.peptides import PeptideConfig
-    from surrogate.training.lam_slide import is_trained
-    from surrogate.training.peptides import PeptideTraining, train_peptides
+    from surrogate.models.lam_slide.trainer import is_trained
+    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
 
     if is_trained(out):
         return

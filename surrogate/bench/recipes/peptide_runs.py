@@ -23,20 +23,20 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.integrators import integrator_name
-from md_reference.parent_watch import end_with_parent
-from md_reference.platforms import PlatformChoice, measured_platform
-from md_reference.replicas import available_cores
-from md_reference.run_config import MDConfig, settings_of
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.config import MDConfig, settings_of
+from md_reference.run.engine import Engine
+from md_reference.run.integrators import integrator_name
+from md_reference.run.parent_watch import end_with_parent
+from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.replicas import available_cores
 from surrogate.bench.recipes.peptide_list import Peptide, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.sequence import build_peptide
-from systems.topology_file import topology_path
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.topology_file import topology_path
 from systems.units import parse_wall_s
 
 DISCARD_PS = 20.0

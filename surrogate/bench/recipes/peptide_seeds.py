@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.engine import Engine, platform_properties
-from md_reference.forcefield import ForceFieldSpec, build_system
-from systems.chemistry import backbone_torsions, rotatable_torsions
-from systems.geometry import torsion
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.run.engine import Engine, platform_properties
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions, rotatable_torsions
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -224,7 +224,7 @@ def _turned(scene: Scene, positions_nm: FloatArray, quad: Quad) -> FloatArray:
     """Return positions with everything on the first side of the middle bond turned by half a circle about it."""
     import networkx as nx
 
-    from systems.chemistry import bonded_graph
+    from systems.chemistry.graph import bonded_graph
 
     graph = bonded_graph(scene)
     graph.remove_edge(quad[1], quad[2])

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from surrogate.models.hydrogens import HydrogenPlan
+from surrogate.models.lam_slide.codes.residue_code import ResidueLayout
 from surrogate.models.lam_slide.kinds import Kind
-from surrogate.models.lam_slide.residues import ResidueLayout
 from surrogate.models.settings import build
 from systems.errors import InputError
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.geometry import torsion
+from systems.chemistry.geometry import torsion
 
 # Around the circle.
 N_BINS = 12

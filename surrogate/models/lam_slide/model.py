@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.approximator import Approximator
-from surrogate.models.lam_slide.atoms import AtomEncoder, Atoms, Told, bonds_between, hold_hydrogens
 from surrogate.models.lam_slide.autoencoder import AtomCode, Autoencoder
+from surrogate.models.lam_slide.codes.atom_tags import AtomEncoder, Atoms, Told, bonds_between, hold_hydrogens
+from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.further_noise import REDRAWS, generators
 from surrogate.models.lam_slide.kinds import kinds_of_windows
-from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
+from surrogate.models.lam_slide.transformer import Approximator
 from systems.errors import InputError
 from systems.imposed import RIGID_BONDS
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from md_reference import ambertools
+from md_reference.forces.small_molecules import ambertools
 from process_table import needs_process_table, runs, wait_until
 from systems.errors import PreparationError
 

@@ -11,12 +11,19 @@ from typing import Any
 
 import pytest
 
-from md_reference.campaign import CampaignProgress, open_campaign, run_campaign
-from md_reference.campaign_cluster import open_client
-from md_reference.campaign_file import Campaign, read_campaign
+from md_reference.campaign.campaign_file import Campaign, read_campaign
+from md_reference.campaign.cluster import open_client
+from md_reference.campaign.manifest import (
+    COMPLETE,
+    FAILED,
+    MANIFEST_NAME,
+    Manifest,
+    campaign_trajectories,
+    read_manifest,
+)
+from md_reference.campaign.scheduler import CampaignProgress, open_campaign, run_campaign
 from systems.errors import InputError
-from systems.manifest import COMPLETE, FAILED, MANIFEST_NAME, Manifest, campaign_trajectories, read_manifest
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 FOUR_RUNS = """
 scenes = ["alanine-dipeptide"]

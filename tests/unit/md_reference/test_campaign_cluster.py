@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from md_reference import campaign_cluster
-from md_reference.campaign import run_campaign
-from md_reference.campaign_cluster import job_cluster, open_client
-from md_reference.campaign_file import ClusterSpec, read_campaign
+from md_reference.campaign import cluster
+from md_reference.campaign.campaign_file import ClusterSpec, read_campaign
+from md_reference.campaign.cluster import job_cluster, open_client
+from md_reference.campaign.manifest import COMPLETE
+from md_reference.campaign.scheduler import run_campaign
 from systems.errors import InputError
-from systems.manifest import COMPLETE
 
 pytest.importorskip("dask_jobqueue")
 
@@ -39,7 +39,7 @@ def test_a_slurm_job_asks_for_what_the_file_says(tmp_path: Path) -> None:
         assert not cluster.workers, "no job before there is work"
     assert {"#SBATCH -p cpu", "#SBATCH -A chem", "#SBATCH -t 12:00:00", "#SBATCH --exclude=node7"} <= set(lines)
     assert "#SBATCH --cpus-per-task=8" in lines
-    worker = next(line for line in lines if "--preload md_reference.campaign_worker" in line)
+    worker = next(line for line in lines if "--preload md_reference.campaign.worker" in line)
     assert "--nworkers 8" in worker
     assert "--nthreads 1" in worker
     before = lines[: lines.index(worker)]
@@ -75,7 +75,7 @@ def test_local_jobs_start_without_a_shell(tmp_path: Path) -> None:
 
 
 def test_no_scheduler_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(campaign_cluster, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(cluster, "_ANSWER_S", 0.5)
     with (
         pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9") as caught,
         open_client(scheduler="tcp://127.0.0.1:9"),

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from md_reference.campaign_file import Campaign, first_seed, read_campaign
-from md_reference.campaign_settings import flat_settings
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig
+from md_reference.campaign.campaign_file import Campaign, first_seed, read_campaign
+from md_reference.campaign.run_options import flat_settings
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.simulate import MDConfig
 from systems.errors import InputError
 
 SMALL = 'scenes = ["alanine-dipeptide"]\ntime = "10ps"\n'
@@ -203,7 +203,7 @@ def test_a_campaign_s_protocol_is_outweighed_by_its_settings_and_outweighs_them_
 
 
 def test_the_bench_s_molecules_run_as_in_md17_at_both_temperatures(tmp_path: Path) -> None:
-    from surrogate.bench.campaign import campaign_text
+    from disturbed_campaign import campaign_text
 
     runs = _read(tmp_path, campaign_text(20.0)).runs
     assert len(runs) == 40

@@ -15,15 +15,15 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference import simulate as module
-from md_reference.engine import GAS_CONSTANT_KJ_MOL_K, Engine
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.platforms import PlatformChoice
-from md_reference.simulate import MDConfig, checkpoint_path, simulate
-from systems.checkpoint import CheckpointFile, read_checkpoints
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run import simulate as module
+from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, Engine
+from md_reference.run.platforms import PlatformChoice
+from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, TrajectoryError, UnknownNameError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.checkpoint import CheckpointFile, read_checkpoints
+from systems.trajectory.codec import open_trajectory, open_writer
 
 FLEXIBLE = ForceFieldSpec(solvent="vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)
 RIGID = ForceFieldSpec(solvent="vacuum", hydrogen_mass_da=None)
@@ -102,8 +102,8 @@ def test_rigid_bonds_stay_rigid_without_a_bath(alanine_dipeptide: Scene, tmp_pat
 
 @pytest.mark.slow
 def test_constant_pressure_moves_the_walls(tmp_path: Path) -> None:
-    from md_reference.solvation import solvate
-    from systems.library import load
+    from md_reference.forces.solvation import solvate
+    from systems.library.named_scenes import load
 
     spec = ForceFieldSpec(solvent="tip3p", hydrogen_mass_da=None)
     scene = solvate(load("alanine-dipeptide"), spec, seed=1)

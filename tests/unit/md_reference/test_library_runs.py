@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from library_runs import run_scene
 
-from md_reference import gaff
-from md_reference.campaign_settings import to_config
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.protocol import defaults, settle
-from surrogate.bench.library import run_scene
-from systems import library
-from systems.catalogue import MOLECULES
+from md_reference.campaign.run_options import to_config
+from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.small_molecules import gaff
+from md_reference.run.defaults import defaults, settle
+from md_reference.run.engine import Engine
+from systems.chemistry.validity import check_frames, geometry_from_scene
 from systems.errors import InputError, PreparationError
-from systems.prepare import prepare
-from systems.protocols import find_protocol
+from systems.library import named_scenes
+from systems.library.catalogue import MOLECULES
+from systems.library.protocols import find_protocol
+from systems.prepare.source import prepare
 from systems.scene import Scene
-from systems.validity import check_frames, geometry_from_scene
 
-MD17 = library.groups()[MOLECULES]
+MD17 = named_scenes.groups()[MOLECULES]
 GAFF = ForceFieldSpec("gaff2", "vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)
 
 
@@ -36,7 +36,7 @@ def no_ambertools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         raise AssertionError("a program was started")
 
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
-    monkeypatch.setattr("md_reference.ambertools.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.small_molecules.ambertools.find_ambertools", lambda: None)
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
     monkeypatch.setattr(subprocess, "run", refused)
     monkeypatch.setattr(subprocess, "Popen", refused)
@@ -57,7 +57,7 @@ def potential(scene: Scene) -> tuple[float, float]:
 def test_molecules_have_their_parameters_without_ambertools(name: str) -> None:
     from openmm import NonbondedForce
 
-    scene = library.load(name)
+    scene = named_scenes.load(name)
     system = build_system(scene, GAFF)
     nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
     charges = np.array([nonbonded.getParticleParameters(i)[0]._value for i in range(scene.n_atoms)])
@@ -72,7 +72,7 @@ def test_molecules_have_their_parameters_without_ambertools(name: str) -> None:
 
 @pytest.mark.usefixtures("no_ambertools")
 def test_another_molecule_would_need_ambertools() -> None:
-    from systems.molecule import scene_from_smiles
+    from systems.prepare.molecule import scene_from_smiles
 
     with pytest.raises(PreparationError, match="AmberTools"):
         build_system(scene_from_smiles("CO"), GAFF)
@@ -80,9 +80,9 @@ def test_another_molecule_would_need_ambertools() -> None:
 
 @pytest.mark.usefixtures("no_ambertools")
 def test_parameters_follow_the_molecule_into_another_atom_order() -> None:
-    from systems.molecule import scene_from_smiles
+    from systems.prepare.molecule import scene_from_smiles
 
-    ours, reordered = library.load("ethanol"), scene_from_smiles("OCC")
+    ours, reordered = named_scenes.load("ethanol"), scene_from_smiles("OCC")
     assert ours.elements != reordered.elements
     assert potential(ours)[1] == pytest.approx(potential(reordered)[1], abs=2.0)  # one of its conformers
 
@@ -127,13 +127,13 @@ def test_a_protocol_is_asked_for_by_name_and_outweighed_by_what_is_given() -> No
 
 
 def test_without_a_protocol_the_defaults_hold_and_nothing_is_said() -> None:
-    scene = library.load("aspirin")
+    scene = named_scenes.load("aspirin")
     assert settle(scene, {}) == (defaults(), "")
     assert settle(scene, {"temperature_k": 310.0})[0] == defaults() | {"temperature_k": 310.0}
 
 
 def test_model_systems_have_settings_of_their_own_and_take_no_protocol() -> None:
-    scene = library.load("n-body-spring")
+    scene = named_scenes.load("n-body-spring")
     settings, said = settle(scene, {})
     assert (settings["ensemble"], settings["timestep_ps"]) == ("nve", 0.001)
     assert "ensemble nve" in said and "GeoTDM" in said
@@ -142,7 +142,7 @@ def test_model_systems_have_settings_of_their_own_and_take_no_protocol() -> None
 
 
 def test_flexible_bonds_end_above_one_femtosecond() -> None:
-    scene = library.load("ethanol")
+    scene = named_scenes.load("ethanol")
     assert settle(scene, {"timestep_ps": 0.001}, "md17")[0]["constrain_hydrogens"] is False
     assert settle(scene, {"timestep_ps": 0.002}, "md17")[0]["constrain_hydrogens"] is True
     given = {"timestep_ps": 0.002, "constrain_hydrogens": False}
@@ -150,7 +150,7 @@ def test_flexible_bonds_end_above_one_femtosecond() -> None:
 
 
 def test_another_force_field_leaves_the_protocol_s_solvent() -> None:
-    scene = library.load("chignolin")
+    scene = named_scenes.load("chignolin")
     assert settle(scene, {"force_field": "gfn2-xtb"}, "fast-folders")[0]["solvent"] == "auto"
     assert settle(scene, {"solvent": "vacuum"}, "fast-folders")[0]["force_field"] == "ff14SB"
 
@@ -169,8 +169,8 @@ def test_model_systems_run_and_are_read_by_others(name: str, time_ps: float, tmp
 
 
 def test_an_n_body_file_holds_the_trajectory_of_its_generator(tmp_path: Path) -> None:
-    from md_reference.model_systems import generate_n_body
-    from systems.trajectory import open_trajectory
+    from md_reference.forces.model_forces import generate_n_body
+    from systems.trajectory.codec import open_trajectory
 
     run_scene("n-body-spring:4", tmp_path, time_ps=1.0)
     with open_trajectory(tmp_path / "n-body-spring-4.h5") as reader:
@@ -182,7 +182,7 @@ def test_an_n_body_file_holds_the_trajectory_of_its_generator(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", library.names())
+@pytest.mark.parametrize("name", named_scenes.names())
 def test_every_scene_runs_ten_picoseconds(name: str, tmp_path: Path) -> None:
     outcome = run_scene(name, tmp_path)
     assert outcome.passed, outcome.reason or f"{outcome.invalid_frames} invalid frames"

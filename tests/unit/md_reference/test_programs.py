@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from md_reference.programs import run_program, scratch_folder
+from md_reference.forces.small_molecules.programs import run_program, scratch_folder
 from process_table import needs_process_table, processes_with, runs, wait_until
 from systems.errors import StorageError
 from systems.interrupts import deferred_interrupt, stop_when
@@ -77,7 +77,7 @@ def test_kill_minus_nine_ends_the_program_and_its_children_too(tmp_path: Path) -
 _CHILD = """
 import contextlib, os, sys
 from pathlib import Path
-from md_reference.programs import run_program, scratch_folder
+from md_reference.forces.small_molecules.programs import run_program, scratch_folder
 from systems.interrupts import deferred_interrupt, interrupted_by_signals
 
 try:

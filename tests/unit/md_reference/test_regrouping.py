@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from md_reference.forcefield import ForceFieldSpec, build_system
-from md_reference.regrouping import permuted, regroup
-from md_reference.simulate import MDConfig, simulate
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.regrouping import permuted, regroup
+from md_reference.run.engine import Engine
+from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
-from systems.prepare import prepare
+from systems.prepare.source import prepare
 from systems.scene import IntArray, Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 SPECS = {
     "ff14SB": ForceFieldSpec(),

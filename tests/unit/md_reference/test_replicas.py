@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from md_reference.replicas import replica_paths, simulate_replicas
-from md_reference.simulate import MDConfig, checkpoint_path
-from systems.checkpoint import read_checkpoints
+from md_reference.run.replicas import replica_paths, simulate_replicas
+from md_reference.run.simulate import MDConfig, checkpoint_path
 from systems.errors import SimulationError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.checkpoint import read_checkpoints
+from systems.trajectory.codec import open_trajectory, open_writer
 
 SHORT = MDConfig(time_ps=0.8, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
 
@@ -70,9 +70,9 @@ PARENT = """
 import sys
 sys.path.insert(0, {repository!r})
 from pathlib import Path
-from md_reference.replicas import simulate_replicas
-from md_reference.simulate import MDConfig
-from systems.library import load
+from md_reference.run.replicas import simulate_replicas
+from md_reference.run.simulate import MDConfig
+from systems.library.named_scenes import load
 
 if __name__ == "__main__":
     config = MDConfig(time_ps=4e6, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")

@@ -15,12 +15,12 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.simulate import MDConfig, checkpoint_path, simulate
-from systems.checkpoint import read_checkpoints
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, StorageError, TrajectoryError, UnitError, UnknownNameError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.checkpoint import read_checkpoints
+from systems.trajectory.codec import open_trajectory, open_writer
 
 SUFFIXES = [".h5", ".dcd"]
 SHORT = MDConfig(time_ps=4.0, save_every_ps=0.2, equilibrate_ps=0.4, seed=7, platform="Reference")
@@ -29,8 +29,8 @@ LONG = replace(SHORT, time_ps=240.0, save_every_ps=0.4)
 TO_BE_KILLED = """
 import os, signal, sys, threading
 sys.path.insert(0, {repository!r})
-from md_reference.simulate import MDConfig, simulate
-from systems.library import load
+from md_reference.run.simulate import MDConfig, simulate
+from systems.library.named_scenes import load
 
 def kill_soon(done, total):
     global timer
@@ -51,7 +51,7 @@ def contents(path: Path) -> tuple[Any, Any, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from systems.library import load
+    from systems.library.named_scenes import load
 
     return simulate(load("alanine-dipeptide"), LONG, tmp_path_factory.mktemp("whole") / "whole.h5")
 

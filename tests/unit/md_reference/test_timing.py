@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from md_reference import platforms, timing
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
-from md_reference.timing import Timing, cache_file, recall, remember, size_class
-from systems.library import load
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.run import platforms, timing
+from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
+from md_reference.run.timing import Timing, cache_file, recall, remember, size_class
+from systems.library.named_scenes import load
 from systems.scene import Scene
 
 BY_SIZE = PlatformChoice("Reference", 1, "by size")

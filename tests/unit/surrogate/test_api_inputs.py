@@ -12,7 +12,7 @@ import pytest
 import surrogate as sm
 from systems.errors import InputError, UnitError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 from systems.units import PARSERS
 
 VERBS: dict[str, tuple[Any, ...]] = {

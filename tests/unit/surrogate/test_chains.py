@@ -7,13 +7,13 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from surrogate.data.chains import chain_layout, chain_scale, settled
-from surrogate.models.chains import RIGID, STIFF, TURNING, ChainCode, ChainLayout, ChainScale
+from surrogate.data.features.peptide_chains import chain_layout, chain_scale, settled
+from surrogate.models.peptides.chains import RIGID, STIFF, TURNING, ChainCode, ChainLayout, ChainScale
+from systems.chemistry.validity import INVALID, check_frames, geometry_from_frames
 from systems.errors import InputError
-from systems.molecule import scene_from_smiles
+from systems.prepare.molecule import scene_from_smiles
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.sequence import build_peptide
-from systems.validity import INVALID, check_frames, geometry_from_frames
 
 SEQUENCES = ("ACE-PRO-TRP-NME", "ACE-LEU-SER-NME", "LYS-ASP")
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from surrogate.bench.compare_speed import (
+from compare_speed import (
     CENTRES_RAD,
     TRANSITIONS,
     pose,
@@ -16,8 +15,9 @@ from surrogate.bench.compare_speed import (
     torsion_path,
     write_trajectory,
 )
-from systems.chemistry import backbone_torsions
-from systems.geometry import torsion
+
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
 
 

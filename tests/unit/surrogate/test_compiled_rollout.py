@@ -13,10 +13,10 @@ import torch
 
 from surrogate.data.weights import Weights
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 CONFIG = RolloutConfig(time_ps=21.0, solver_steps=2, precision="fp32", seed=3, guard="off")
 

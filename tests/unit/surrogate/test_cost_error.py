@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from compare_speed import pose, torsion_path
 from typer.testing import CliRunner
 
-from surrogate import cli
-from surrogate.bench.compare_speed import pose, torsion_path
-from surrogate.bench.cost_error import run_cost_error
-from surrogate.bench.cost_error_measures import Truth, judge_frames, judge_truth, read_truth, worth_row
-from surrogate.bench.cost_error_report import crossings, markdown
-from surrogate.bench.cost_error_settings import CostErrorConfig, Setting, choose_settings
+from surrogate.bench.cost_error.cost_page import crossings, markdown
+from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
+from surrogate.bench.cost_error.sweep import run_cost_error
+from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
+from surrogate.cli import main
 from surrogate.data.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0, "friction_per_ps": 1.0,
               "hydrogen_mass_da": 3.0}  # fmt: skip
@@ -182,7 +182,7 @@ def test_the_verb_says_in_one_line_what_it_cannot_use(
         (["-w", "alanine-dipeptyde"], "Did you mean 'alanine-dipeptide'"),
         (["-w", "alanine-dipeptide", "--solver", "rk4"], "knows no solver 'rk4'"),
     ):
-        result = CliRunner().invoke(cli.app, ["bench", "cost-error", *map(str, held), *arguments, "-o", "x"])
+        result = CliRunner().invoke(main.app, ["bench", "cost-error", *map(str, held), *arguments, "-o", "x"])
         assert result.exit_code == 1 and said in result.stderr, result.output
         assert len(result.stderr.strip().splitlines()) == 1
         assert not list(tmp_path.iterdir())

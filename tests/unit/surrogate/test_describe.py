@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from surrogate.describe import intervention_lines
+from surrogate.verbs.info import intervention_lines
 
 
 def account(chunks: int, caught: int, **more: Any) -> dict[str, Any]:

@@ -9,10 +9,10 @@ import pytest
 
 from surrogate.data.weights import Weights
 from surrogate.sampling.domain import bond_types, find_deviations, match_domain, match_scene, torsion_environments
+from systems.chemistry.geometry import signed_volumes
 from systems.errors import OutOfDomainError
-from systems.geometry import signed_volumes
-from systems.library import load
-from systems.prepare import prepare
+from systems.library.named_scenes import load
+from systems.prepare.source import prepare
 from systems.scene import Scene
 
 

@@ -6,10 +6,10 @@ import json
 import math
 from pathlib import Path
 
+import external_reference as bench
 import numpy as np
 import pytest
 
-from surrogate.bench import external_reference as bench
 from systems.errors import InputError
 from systems.scene import FloatArray
 

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 import torch
 
+from surrogate.data.features.residue_layout import residue_layout
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
 from surrogate.data.parts import part_of_frames
-from surrogate.data.residues import residue_layout
 from surrogate.data.weights import Weights, load_weights
+from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
+from surrogate.models.lam_slide.codes.residue_code import RESIDUE_TYPES
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
-from surrogate.models.lam_slide.heavy import HeavyLamSlide
+from surrogate.models.lam_slide.heavy_atoms import HeavyLamSlide
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
-from surrogate.models.lam_slide.residues import RESIDUE_TYPES
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
-from surrogate.training.objectives import autoencoder_loss, flow_loss
+from surrogate.models.lam_slide.objectives import autoencoder_loss, flow_loss
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
-from systems.library import load
+from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 QUICK = TrainingConfig(
     stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False, validate_every_s=1e9

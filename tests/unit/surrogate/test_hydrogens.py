@@ -10,15 +10,15 @@ import numpy.typing as npt
 import pytest
 import torch
 
+from surrogate.data.features.hydrogen_shapes import fit_hydrogens, hydrogen_sites, plan_hydrogens
 from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.data.hydrogens import fit_hydrogens, hydrogen_sites, plan_hydrogens
 from surrogate.data.parts import part_of_frames
 from surrogate.models.hydrogens import N_PHASES, HydrogenPlacer, HydrogenPlan, SiteGroup
+from systems.chemistry.geometry import signed_volumes, torsion
 from systems.errors import InputError
-from systems.geometry import signed_volumes, torsion
-from systems.library import load
+from systems.files.schema import built
+from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.schema import built
 
 Array = npt.NDArray[np.float64]
 
@@ -273,7 +273,7 @@ def test_rows_do_not_depend_on_each_other() -> None:
 
 def pyramidal() -> tuple[Scene, list[list[int]]]:
     """Dimethylamine, and (N, C, C, H)."""
-    from systems.prepare import prepare
+    from systems.prepare.source import prepare
 
     scene = prepare("smiles:CNC")
     nitrogen = scene.elements.index("N")
@@ -338,7 +338,7 @@ def test_frames_of_heavy_atoms_are_a_view() -> None:
 
 
 def test_the_bench_tells_right_hydrogens_from_wrong_ones() -> None:
-    from surrogate.bench.hydrogens import lines, measure_hydrogens
+    from placed_hydrogens import lines, measure_hydrogens
 
     scene = load("ethanol")
 

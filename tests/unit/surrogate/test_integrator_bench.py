@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogate.bench.integrator import IntegratorReport, angles, bonds, judge_integrator
 from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.baselines import Baseline, BaselineConfig
+from surrogate.models.baselines.model import Baseline, BaselineConfig
 from surrogate.models.interface import Chunk, Molecule
 from systems.scene import Scene
 

@@ -14,19 +14,19 @@ from torch import Tensor
 
 from surrogate.data.weights import TrainingDomain, Weights
 from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.sampling.account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Tally
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.coupling import Coupling
 from surrogate.sampling.guards import CAUGHT, Guard
 from surrogate.sampling.interventions import none_through
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from systems.claim import frames_in
+from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Tally
+from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.geometry import superpose
+from systems.chemistry.limits import limits_from_frames
+from systems.chemistry.validity import CHIRALITY, ENERGY, INVALID, geometry_from_frames
 from systems.errors import InputError, SimulationError, UnknownNameError
-from systems.geometry import superpose
-from systems.limits import limits_from_frames
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
-from systems.validity import CHIRALITY, ENERGY, INVALID, geometry_from_frames
+from systems.trajectory.claim import frames_in
+from systems.trajectory.codec import open_trajectory
 
 LAG_PS, N_NEW = 0.1, 8
 CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0, "friction_per_ps": 1.0,
@@ -105,8 +105,8 @@ def scatter(frames: Tensor, noise: Tensor) -> Tensor:
 @pytest.fixture(scope="module")
 def md(alanine_dipeptide: Scene) -> Iterator[np.ndarray]:
     """30 ps of MD, frames 0.1 ps apart, superposed: what the scripted model would have been trained on."""
-    from md_reference.engine import Engine
-    from md_reference.forcefield import ForceFieldSpec
+    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.run.engine import Engine
 
     with Engine(alanine_dipeptide, ForceFieldSpec("ff14SB", "obc2", 3.0), timestep_ps=0.002, seed=3) as engine:
         engine.minimise(max_iterations=100)
@@ -135,7 +135,7 @@ def domain(alanine_dipeptide: Scene, md: np.ndarray) -> TrainingDomain:
 @pytest.fixture
 def short_energy_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the MD that energies are otherwise measured against."""
-    from surrogate.sampling import coupling
+    from surrogate.sampling.openmm import coupling
 
     monkeypatch.setattr(coupling, "_SETTLE_PS", 2.0)
     monkeypatch.setattr(coupling, "_SAMPLES", 30)

@@ -13,14 +13,14 @@ from surrogate.data.frames import TrainingFrames
 from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.lags import choose_lag
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.sampling.simulation import Simulation
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide, window_frames
+from surrogate.sampling.openmm.simulation import Simulation
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 QUICK = TrainingConfig(
     stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False, validate_every_s=1e9,

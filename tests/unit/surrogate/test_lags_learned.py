@@ -11,10 +11,10 @@ from surrogate.bench.lags import _correlation
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.weights import load_weights
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
-from systems.molecule import scene_from_smiles
+from systems.prepare.molecule import scene_from_smiles
 
 MEMORY = 0.95
 

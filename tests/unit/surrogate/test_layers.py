@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from plain_network import plain_network
 from torch.nn import functional as F
 
-from surrogate.bench.plain_network import plain_network
-from surrogate.models.lam_slide.approximator import Approximator
 from surrogate.models.lam_slide.config import ApproximatorConfig
+from surrogate.models.lam_slide.transformer import Approximator
 from surrogate.models.layers import attend, gelu, rotary_angles, rotate
 
 

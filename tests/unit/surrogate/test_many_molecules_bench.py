@@ -6,15 +6,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import heavy_atoms
 import numpy as np
 import pytest
 
-from surrogate.bench import heavy_atoms, lags, many_molecules
-from surrogate.bench.many_molecules import change_per_frame, measure, summary, table
+from surrogate.bench import lags
+from surrogate.bench.recipes import many_molecules
+from surrogate.bench.recipes.many_molecules import change_per_frame, measure, summary, table
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import load_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 
 
 @pytest.fixture(scope="module")

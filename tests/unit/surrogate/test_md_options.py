@@ -10,11 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 import surrogate
-from md_reference.campaign_settings import key_of, read_settings
-from md_reference.protocol import defaults
-from surrogate import api, cli
-from surrogate.md_options import MDOptions, Preparation, flags_of
-from systems.prepare import prepare
+from md_reference.campaign.run_options import key_of, read_settings
+from md_reference.run.defaults import defaults
+from surrogate import api
+from surrogate.cli import main
+from surrogate.verbs.md_options import MDOptions, Preparation, flags_of
+from systems.prepare.source import prepare
 
 FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
 # How many runs there are, whose settings, and what makes the box: no fields of MDConfig or ForceFieldSpec.
@@ -53,7 +54,7 @@ def called(monkeypatch: pytest.MonkeyPatch, verb: str, arguments: list[str]) -> 
         return {} if verb == "plan" else []
 
     monkeypatch.setattr(api, verb, spy)
-    result = CliRunner().invoke(cli.app, [verb, *arguments])
+    result = CliRunner().invoke(main.app, [verb, *arguments])
     assert result.exit_code == 0, result.output
     return seen
 
@@ -127,7 +128,7 @@ def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.Monkey
 def test_help_shows_the_defaults() -> None:
     """In brackets, which the library that prints help takes for markup and swallows unless they are escaped."""
     wide = {"COLUMNS": "200", "TERM": "dumb"}
-    shown = " ".join(CliRunner().invoke(cli.app, ["reference", "--help"], env=wide).output.split())
+    shown = " ".join(CliRunner().invoke(main.app, ["reference", "--help"], env=wide).output.split())
     for text in ("Integration step. [default: 4fs]", "Of the bath. [default: 300K]", "saved frames. [default: 1ps]"):
         assert text in shown
     assert "\\[" not in shown
@@ -141,7 +142,7 @@ def test_no_help_text_loses_its_brackets() -> None:
         own = [p.help for p in command.params if getattr(p, "help", None)]
         return own + [text for sub in getattr(command, "commands", {}).values() for text in helps(sub)]
 
-    found = helps(get_command(cli.app))
+    found = helps(get_command(main.app))
     lost = [text for text in found if Text.from_markup(text).plain != text.replace("\\[", "[")]
     assert len(found) > 100 and not lost, lost
     # Negative control: what an unescaped default comes to.

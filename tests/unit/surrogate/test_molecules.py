@@ -18,14 +18,14 @@ from surrogate.data.poses import in_standard_pose
 from surrogate.data.weights import Weights, load_weights, read_header
 from surrogate.models.lam_slide.config import GraphConfig, LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.trainer import TrainingConfig, holds_hydrogens, train_lam_slide
 from surrogate.sampling.domain import find_deviations, match_domain
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.lam_slide import TrainingConfig, holds_hydrogens, train_lam_slide
+from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.symmetry import local_handedness
 from systems.errors import InputError, OutOfDomainError
-from systems.molecule import scene_from_smiles
+from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
-from systems.symmetry import local_handedness
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 
 QUICK = TrainingConfig(
     stage_one_steps=12, stage_two_steps=8, stage_one_batch=8, stage_two_batch=4, bf16=False, validate_every_s=1e9

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.bench import alanine_dipeptide_painet as recipe
+from surrogate.bench.recipes import alanine_dipeptide_painet as recipe
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights, save_weights

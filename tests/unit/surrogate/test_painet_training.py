@@ -16,11 +16,11 @@ from surrogate.data.weights import load_weights
 from surrogate.models.interface import Chunk, Molecule
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.painet import PainetTraining, StateWindows, for_frames, forecast_errors, train_painet
+from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, forecast_errors, train_painet
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 
 LAG_PS = 0.002
 SMALL = PainetConfig(n_new=3, width=16, n_heads=2, head_dim=8, n_decoder_layers=2)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.chains import chain_features
+from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights
-from surrogate.models.lam_slide.peptides import PeptideConfig, PeptideSlide
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.peptides import PeptideSubject, PeptideTraining, _with_scale, normalise, train_peptides
-from systems.sequence import build_peptide
-from systems.trajectory import open_trajectory
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.trainer import PeptideSubject, PeptideTraining, _with_scale, normalise, train_peptides
+from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.prepare.peptide import build_peptide
+from systems.trajectory.codec import open_trajectory
 
 SMALL = PeptideConfig(width=32, n_layers=1, n_heads=2, chunk_frames=4, longest_ps=40.0)
 CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0}

@@ -13,15 +13,15 @@ import torch
 
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights
-from surrogate.describe import describe_file
 from surrogate.models import precision
 from surrogate.models.precision import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from systems.checkpoint import checkpoint_path, read_checkpoints
+from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.verbs.info import describe_file
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.checkpoint import checkpoint_path, read_checkpoints
+from systems.trajectory.codec import open_trajectory
 
 FAST = ProductSpeed("avx512_bf16", 70.0, 280.0, 1)
 SLOW = ProductSpeed("", 70.0, 14.0, 1)

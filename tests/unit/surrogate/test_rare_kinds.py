@@ -14,15 +14,15 @@ from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.rarity import rare_kinds
 from surrogate.data.weights import Weights, load_weights
 from surrogate.models.interface import Molecule
-from surrogate.models.lam_slide.approximator import Approximator
 from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
 from surrogate.models.lam_slide.kinds import Kind, kinds_of_windows
 from surrogate.models.lam_slide.model import MAX_REDRAWS, LamSlide
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
-from surrogate.training.objectives import flow_loss
+from surrogate.models.lam_slide.objectives import flow_loss
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
+from surrogate.models.lam_slide.transformer import Approximator
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
-from systems.library import load
+from systems.library.named_scenes import load
 
 LENGTH = 8
 # phi > 0, where no frame is but the mirror image.

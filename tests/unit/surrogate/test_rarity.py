@@ -12,7 +12,7 @@ from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.rarity import KIND_SHARE, rare_frames, rare_kinds, window_kinds, window_sampler
 from surrogate.models.lam_slide.kinds import kinds_of_windows
 from systems.errors import InputError
-from systems.library import load
+from systems.library.named_scenes import load
 
 LENGTH = 8
 

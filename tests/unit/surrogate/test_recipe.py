@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from surrogate.bench.alanine_dipeptide import average
+from surrogate.bench.recipes.alanine_dipeptide import average
 from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.models.lam_slide.model import LamSlide
 

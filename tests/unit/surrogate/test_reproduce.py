@@ -11,10 +11,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from surrogate.bench.reproduce import reproduce, table_lines
-from surrogate.bench.reproduce_data import make_sets, make_systems, split_seeds
-from surrogate.bench.reproduce_errors import estimate, forecast_errors, ratio
-from surrogate.bench.reproduce_methods import (
+from surrogate.bench.reproduce.forecast_errors import estimate, forecast_errors, ratio
+from surrogate.bench.reproduce.forecast_methods import (
     METHODS,
     N_GIVEN,
     Settings,
@@ -23,11 +21,13 @@ from surrogate.bench.reproduce_methods import (
     extrapolate,
     polynomial_weights,
 )
-from surrogate.bench.reproduce_published import PUBLISHED
-from surrogate.cli import app
+from surrogate.bench.reproduce.n_body import reproduce, table_lines
+from surrogate.bench.reproduce.n_body_data import make_sets, make_systems, split_seeds
+from surrogate.bench.reproduce.published import PUBLISHED
+from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
-from surrogate.models.particles import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
-from surrogate.training.objectives import random_rotations
+from surrogate.models.lam_slide.objectives import random_rotations
+from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
 from systems.errors import InputError, UnknownNameError
 
 COUNTS = {"train": 8, "validation": 3, "test": 4}

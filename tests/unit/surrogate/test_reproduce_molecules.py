@@ -12,17 +12,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from surrogate.bench.molecule_methods import METHODS, lam_slide_model
-from surrogate.bench.molecule_views import BodyFrame, LinearForecast, MoleculeView
-from surrogate.bench.reproduce_errors import block_means, forecast_errors
-from surrogate.bench.reproduce_methods import N_GIVEN, N_NEW, SWITCHES, Settings, without_switches
-from surrogate.bench.reproduce_molecules import MoleculeReproduction, reproduce_molecules, table_lines
-from surrogate.bench.reproduce_molecules_data import read_md17_ethanol
-from surrogate.bench.reproduce_published import PUBLISHED_MD17
-from surrogate.cli import app
+from surrogate.bench.reproduce.forecast_errors import block_means, forecast_errors
+from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, SWITCHES, Settings, without_switches
+from surrogate.bench.reproduce.md17 import MoleculeReproduction, reproduce_molecules, table_lines
+from surrogate.bench.reproduce.md17_data import read_md17_ethanol
+from surrogate.bench.reproduce.md17_methods import METHODS, lam_slide_model
+from surrogate.bench.reproduce.md17_views import BodyFrame, LinearForecast, MoleculeView
+from surrogate.bench.reproduce.published import PUBLISHED_MD17
+from surrogate.cli.main import app
 from surrogate.data.molecule_windows import MoleculeWindows, pair_kinds, split_windows
-from systems import library
 from systems.errors import InputError, UnknownNameError
+from systems.library import named_scenes
 
 SPAN = N_GIVEN + N_NEW
 
@@ -214,7 +214,7 @@ def test_md17s_own_ethanol_is_read_in_our_atom_order(real_ethanol: Path) -> None
     assert m.name == "ethanol" != m.label
     assert m.n_independent("test") == 5
     windows = m.windows(m.starts["test"])
-    bonds = library.load("ethanol").bonds
+    bonds = named_scenes.load("ethanol").bonds
     lengths = np.linalg.norm(windows[..., bonds[:, 0], :] - windows[..., bonds[:, 1], :], axis=-1)
     assert 0.08 < lengths.min() < lengths.max() < 0.18
     # Frames of a window are 5 fs apart, none jumps from one series to the next.

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.residues import residue_layout
+from surrogate.data.features.residue_layout import residue_layout
 from surrogate.models.lam_slide.autoencoder import reconstruction_losses
-from surrogate.models.lam_slide.config import AutoencoderConfig
-from surrogate.models.lam_slide.residue_autoencoder import ResidueAutoencoder
-from surrogate.models.lam_slide.residues import (
+from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
+from surrogate.models.lam_slide.codes.residue_code import (
     N_SLOTS,
     RESIDUE_TYPES,
     ResidueAtoms,
@@ -24,12 +23,13 @@ from surrogate.models.lam_slide.residues import (
     torsion_errors,
     torsion_vectors,
 )
-from surrogate.training.objectives import random_rotations
+from surrogate.models.lam_slide.config import AutoencoderConfig
+from surrogate.models.lam_slide.objectives import random_rotations
+from systems.chemistry.geometry import torsion
 from systems.errors import InputError
-from systems.geometry import torsion
-from systems.library import load
+from systems.files.schema import built
+from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.schema import built
 from systems.selection import part_of
 
 
@@ -69,7 +69,7 @@ def test_capped_residues_are_laid_out_by_their_names() -> None:
 
 
 def test_every_library_peptide_has_a_layout() -> None:
-    from systems.library import names
+    from systems.library.named_scenes import names
 
     for name in [n for n in names() if n.startswith("ACE-")]:
         layout = residue_layout(heavy(name))

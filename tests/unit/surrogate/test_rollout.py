@@ -11,11 +11,11 @@ import torch
 
 from surrogate.data.weights import Weights
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.validity import INVALID, NOT_FINITE
 from systems.errors import InputError, OutOfDomainError, SimulationError, UnitError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
-from systems.validity import INVALID, NOT_FINITE
+from systems.trajectory.codec import open_trajectory
 
 # Weights of a second's training, no frame of which a guard lets pass.
 CONFIG = RolloutConfig(time_ps=40.0, solver_steps=2, precision="fp32", guard="off")
@@ -140,7 +140,7 @@ def test_frames_that_are_not_finite_are_marked_and_stop_the_rollout(tmp_path: Pa
 
 
 def test_a_molecule_outside_the_domain_is_refused_with_what_to_do(tmp_path: Path, small_weights: Weights) -> None:
-    from systems.prepare import prepare
+    from systems.prepare.source import prepare
 
     with pytest.raises(OutOfDomainError, match=r"cover alanine-dipeptide .*22 atoms.*surromd reference"):
         rollout(prepare("sequence:ACE-GLY-NME"), small_weights, [tmp_path / "a.h5"], CONFIG)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.bench.many_molecules import TRAINED, UNSEEN, change_per_frame
+from surrogate.bench.recipes.many_molecules import TRAINED, UNSEEN, change_per_frame
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.sampling.domain import find_deviations
-from surrogate.sampling.rollout import RolloutConfig, rollout
+from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.validity import BOND_20_PERCENT, INVALID, check_frames, geometry_from_scene
 from systems.errors import InputError
-from systems.molecule import scene_from_smiles
-from systems.trajectory import open_trajectory
-from systems.validity import BOND_20_PERCENT, INVALID, check_frames, geometry_from_scene
+from systems.prepare.molecule import scene_from_smiles
+from systems.trajectory.codec import open_trajectory
 
 NAME = "alkanes-alcohols-ethers"
 

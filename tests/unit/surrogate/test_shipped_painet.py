@@ -9,10 +9,10 @@ import numpy as np
 from surrogate.bench.integrator import bonds
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
-from surrogate.sampling.rollout import rollout
-from surrogate.sampling.settings import RolloutConfig
-from systems.trajectory import open_trajectory
-from systems.validity import INVALID, Geometry, check_frames
+from surrogate.sampling.config import RolloutConfig
+from surrogate.sampling.runner import rollout
+from systems.chemistry.validity import INVALID, Geometry, check_frames
+from systems.trajectory.codec import open_trajectory
 
 
 def test_its_frames_are_valid_and_move_as_the_reference_does(tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from surrogate.data.weights import Weights
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.sampling.simulation import Simulation
+from surrogate.sampling.openmm.simulation import Simulation
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError, OutOfDomainError, SimulationError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 N_FRAMES = 20  # two whole chunks of seven frames and a part
 

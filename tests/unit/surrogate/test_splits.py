@@ -15,10 +15,10 @@ from surrogate import api
 from surrogate.data.frames import TrainingFrames, collect_frames, load_frames, write_windows
 from surrogate.data.splits import RUN, Split, refuse_leaks
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 
 def write(path: Path, scene: Scene, n_frames: int, seed: int = 0) -> Path:
@@ -120,7 +120,7 @@ def test_training_without_a_cache_of_latents_is_the_same(tmp_path: Path, harmoni
     harmonic_frames.save(tmp_path / "w.h5")
     curves = []
     for name, limit in (("kept", 10**9), ("drawn", 0)):
-        monkeypatch.setattr("surrogate.training.lam_slide.LATENT_CACHE_BYTES", limit)
+        monkeypatch.setattr("surrogate.models.lam_slide.trainer.LATENT_CACHE_BYTES", limit)
         out = train_lam_slide(load_frames(tmp_path / "w.h5"), tmp_path / f"{name}.safetensors", small_model_config,
                               config)  # fmt: skip
         curves.append(list(csv.DictReader(out.with_suffix(".csv").open())))

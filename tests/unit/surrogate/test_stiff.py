@@ -8,23 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from impose_stiff_terms import energies
 from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
-from surrogate.bench.stiff_terms import energies
+from surrogate.data.features.stiff_terms import drawn_terms, plan_terms, rigid_hydrogens, rigid_terms
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.data.shipped import weights_path
-from surrogate.data.stiff import drawn_terms, plan_terms, rigid_hydrogens, rigid_terms
 from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.stiff import StiffTerms, Tree
-from surrogate.sampling.rollout import RolloutConfig, rollout
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError, WeightsError
 from systems.imposed import ANGLES, BONDS, RIGID_BONDS, imposed_terms
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 N = 6000
 BOND_NM, ANGLE_RAD, SHIFT_RAD = 0.003, 0.05, 0.06
@@ -145,7 +145,7 @@ def test_a_reference_without_rigid_bonds_has_none(harmonic_frames: TrainingFrame
 
 @pytest.mark.parametrize("smiles", ["c1ccccc1", "C#CC", "O"])
 def test_rings_straight_angles_and_small_molecules_are_refused(smiles: str) -> None:
-    from systems.molecule import scene_from_smiles
+    from systems.prepare.molecule import scene_from_smiles
 
     scene = scene_from_smiles(smiles)
     shaken = scene.positions_nm + 1e-3 * np.random.default_rng(0).normal(size=(50, scene.n_atoms, 3))

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.engine import Engine
-from surrogate.bench.stress import StressConfig, choose_config, run_stress
-from surrogate.bench.stress_inputs import measure_invariance, measure_odd_inputs
-from surrogate.bench.stress_measures import measure_bonds, measure_drift, measure_validity
-from surrogate.bench.stress_report import markdown
-from surrogate.bench.stress_settings import measure_batches, measure_openmm, measure_precision, openmm_of
+from md_reference.run.engine import Engine
+from surrogate.bench.stress.frame_statistics import measure_bonds, measure_drift, measure_validity
+from surrogate.bench.stress.odd_inputs import measure_invariance, measure_odd_inputs
+from surrogate.bench.stress.other_arithmetic import measure_batches, measure_openmm, measure_precision, openmm_of
+from surrogate.bench.stress.stress_page import markdown
+from surrogate.bench.stress.trials import StressConfig, choose_config, run_stress
 from surrogate.data.weights import Weights
+from systems.chemistry.validity import Geometry, geometry_from_frames
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.selection import reordered
-from systems.validity import Geometry, geometry_from_frames
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         usual(engine, n_steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surrogate.bench.stress_settings.SETTLE_PS", 0.05)
+        patch.setattr("surrogate.bench.stress.other_arithmetic.SETTLE_PS", 0.05)
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1

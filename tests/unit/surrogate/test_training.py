@@ -15,13 +15,13 @@ from surrogate.data.weights import Weights, load_weights, read_header, save_weig
 from surrogate.models.lam_slide.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.objectives import flow_loss
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.models.settings import read_toml
-from surrogate.training.lam_slide import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
-from surrogate.training.objectives import flow_loss
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 QUICK = TrainingConfig(
     stage_one_steps=12, stage_two_steps=8, stage_one_batch=8, stage_two_batch=4, bf16=False, validate_every_s=1e9

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from surrogate.training.curves import plot_curves, read_curves, series
 from surrogate.training.devices import choose_device, is_first_process
 from surrogate.training.health import FACTOR, IN_A_ROW, Watch, first_not_finite
 from surrogate.training.loop import StageConfig, append_row, run_stage
+from surrogate.training.loss_curves import plot_curves, read_curves, series
 from systems.errors import InputError, SimulationError
 
 LINE = """

@@ -14,9 +14,9 @@ from surrogate import api
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights, save_weights
-from surrogate.training_verdicts import TrainingVerdict, judge_training, word_of
+from surrogate.verbs.train_verdict import TrainingVerdict, judge_training, word_of
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 SMALL = """
 [autoencoder]

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from add_limits import add_limits
 
-from surrogate.bench.limits import add_limits
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 
 @pytest.mark.parametrize("half", [False, True])

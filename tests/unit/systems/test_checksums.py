@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.checksums import frame_checksums, sealed, unsealed
 from systems.errors import SurromdError, TrajectoryError
+from systems.files.checksums import frame_checksums, sealed, unsealed
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 
 CELL = np.diag([2.0, 2.1, 2.2])
 

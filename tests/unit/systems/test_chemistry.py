@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from systems.bond_orders import ValenceError, perceive
-from systems.chemistry import (
+from systems.chemistry.bond_orders import ValenceError, perceive
+from systems.chemistry.geometry import signed_volumes, superpose, torsion
+from systems.chemistry.graph import (
     atom_classes,
     backbone_torsions,
     bonded_graph,
@@ -27,9 +28,8 @@ from systems.chemistry import (
     stereocentres,
 )
 from systems.errors import OutOfDomainError
-from systems.geometry import signed_volumes, superpose, torsion
-from systems.library import load
-from systems.molecule import n_unpaired_electrons
+from systems.library.named_scenes import load
+from systems.prepare.molecule import n_unpaired_electrons
 from systems.scene import Scene
 from systems.selection import part_of
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry import backbone_torsions
-from systems.components import component, hydrogens_of, known_template
+from systems.chemistry.components import component, hydrogens_of, known_template
+from systems.chemistry.graph import backbone_torsions
+from systems.chemistry.residues import template_for
 from systems.errors import PreparationError
-from systems.molecule import scene_from_smiles
-from systems.prepare import prepare
-from systems.residues import template_for
+from systems.prepare.molecule import scene_from_smiles
+from systems.prepare.peptide import build_peptide
+from systems.prepare.source import prepare
 from systems.scene import Scene
-from systems.sequence import build_peptide
 
 INSIDE = {"N": 1, "C": 1}
 
@@ -56,7 +56,7 @@ def test_links_and_ends_take_and_give_hydrogens() -> None:
 
 
 def test_every_component_can_be_read() -> None:
-    from systems.components import _lines
+    from systems.chemistry.components import _lines
 
     for name in list(_lines())[::12]:
         found = component(name)
@@ -119,7 +119,7 @@ def test_a_cycle_without_hydrogens_gets_them_and_stays_one(tmp_path: Path) -> No
 
 
 def test_a_phosphoserine_without_hydrogens_is_charged_and_covered(tmp_path: Path) -> None:
-    from md_reference.forcefield import ForceFieldSpec, resolve
+    from md_reference.forces.forcefield import ForceFieldSpec, resolve
 
     scene = build_peptide("ACE-ALA-SER-ALA-NME")
     at = {scene.atom_names[i]: i for i in range(scene.n_atoms) if scene.residue_of_atom[i] == 2}

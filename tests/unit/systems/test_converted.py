@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.converted import to_mdanalysis, to_mdtraj
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.converted import to_mdanalysis, to_mdtraj
 
 
 def write(path: Path, scene: Scene, times: np.ndarray) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Structure files that others wrote (docs/studies/corpus.py): taken as they are, or refused for a reason."""
+"""Structure files that others wrote (docs/studies/preparation/corpus.py): taken as they are, or refused for a
+reason."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ def test_a_file_is_taken_and_every_alteration_noticed(corpus: ModuleType, reposi
     row = _row(corpus, path)
     taken = corpus.try_row(row)
     assert (taken.state, taken.n_atoms, taken.faults) == ("ok", 22, ())
-    from systems.prepare import prepare
+    from systems.prepare.source import prepare
 
     scene = prepare(str(path))
     moved = scene.positions_nm.copy()

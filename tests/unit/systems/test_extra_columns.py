@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.cell_shape import box_vectors, lengths_and_angles, volumes_nm3
+from systems.chemistry.cell_shape import box_vectors, lengths_and_angles, volumes_nm3
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 
 N = 5
 # A truncated octahedron's kind of cell: three lengths, three angles, all different.

@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.distance_bonds import bonds_by_distance
+from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
+from systems.trajectory.codec import open_trajectory
 
 mdtraj = pytest.importorskip("mdtraj")
 mda = pytest.importorskip("MDAnalysis")

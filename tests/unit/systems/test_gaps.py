@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry import backbone_torsions
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
-from systems.geometry import torsion
-from systems.pdb_text import pdb_text
-from systems.prepare import prepare
+from systems.prepare.source import prepare
 from systems.scene import Scene
+from systems.trajectory.pdb_text import pdb_text
 
 
 def _without(scene: Scene, numbers: tuple[str, ...], folder: Path, *, hydrogens: bool = True) -> str:

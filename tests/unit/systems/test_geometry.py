@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from systems.chemistry import backbone_torsions
+from systems.chemistry.geometry import signed_volumes, superpose, superposition, torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
-from systems.geometry import signed_volumes, superpose, superposition, torsion
 from systems.scene import Scene
 
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems import library
-from systems.bonding import find_bonds
-from systems.element_data import element_symbol, ion_symbol
+from systems.chemistry.element_data import element_symbol, ion_symbol
 from systems.errors import InputError
-from systems.heterogens import is_water
-from systems.pdb_records import AtomRecord
-from systems.pdb_text import pdb_text
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.bonding import find_bonds
+from systems.prepare.heterogens import is_water
+from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.source import prepare
+from systems.trajectory.pdb_text import pdb_text
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.startswith("ATOM"))
 
 

@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from systems import library
-from systems.catalogue import ENTRIES
-from systems.chemistry import backbone_torsions, match_atoms
+from systems.chemistry.geometry import signed_volumes, torsion
+from systems.chemistry.graph import backbone_torsions, match_atoms
+from systems.chemistry.validity import check_frames, geometry_from_scene
 from systems.errors import UnknownNameError
-from systems.geometry import signed_volumes, torsion
-from systems.prepare import prepare
-from systems.protocols import PROTOCOLS, find_protocol
-from systems.validity import check_frames, geometry_from_scene
+from systems.library import named_scenes
+from systems.library.catalogue import ENTRIES
+from systems.library.protocols import PROTOCOLS, find_protocol
+from systems.prepare.source import prepare
 
 MD17 = {"aspirin": ("C9H8O4", 21), "benzene": ("C6H6", 12), "ethanol": ("C2H6O", 9), "malonaldehyde": ("C3H4O2", 9),
         "naphthalene": ("C10H8", 18), "salicylic-acid": ("C7H6O3", 16), "toluene": ("C7H8", 15),
@@ -31,9 +31,9 @@ STRUCTURES = [name for name, entry in ENTRIES.items() if entry.smiles or entry.s
 
 
 def test_the_groups_hold_every_name_once() -> None:
-    listed = [name for members in library.groups().values() for name in members]
-    assert sorted(listed) == library.names()
-    sizes = {group: len(members) for group, members in library.groups().items()}
+    listed = [name for members in named_scenes.groups().values() for name in members]
+    assert sorted(listed) == named_scenes.names()
+    sizes = {group: len(members) for group, members in named_scenes.groups().items()}
     assert sizes == {"peptides": 4, "capped amino acids": 22, "MD17 molecules": 8, "n-body systems": 3,
                      "analytic systems": 2}  # fmt: skip
 
@@ -43,9 +43,9 @@ def test_molecules_are_what_their_smiles_says(name: str) -> None:
     from rdkit import Chem
     from rdkit.Chem.rdMolDescriptors import CalcMolFormula
 
-    from systems.molecule import scene_from_smiles, to_rdkit
+    from systems.prepare.molecule import scene_from_smiles, to_rdkit
 
-    scene = library.load(name)
+    scene = named_scenes.load(name)
     formula, n_atoms = MD17[name]
     smiles = ENTRIES[name].smiles
     assert (scene.formula, scene.n_atoms) == (formula, n_atoms)
@@ -58,7 +58,7 @@ def test_molecules_are_what_their_smiles_says(name: str) -> None:
 
 
 def test_malonaldehyde_is_the_dialdehyde_of_md17() -> None:
-    scene = library.load("malonaldehyde")
+    scene = named_scenes.load("malonaldehyde")
     n_hydrogens = [
         sum(scene.elements[i + j - k] == "H" for i, j in scene.bonds.tolist() if k in (i, j)) for k in range(3)
     ]
@@ -72,7 +72,7 @@ def test_ethanol_has_the_atom_order_of_the_published_data(shared_data) -> None:
     if not path.exists():
         pytest.skip("no MD17 ethanol")
     data = np.load(path)
-    scene = library.load("ethanol")
+    scene = named_scenes.load("ethanol")
     symbols = {1: "H", 6: "C", 8: "O"}
     assert scene.elements == tuple(symbols[int(z)] for z in data["z"])
     frames = data["R"] / 10.0
@@ -84,7 +84,7 @@ def test_ethanol_has_the_atom_order_of_the_published_data(shared_data) -> None:
 
 @pytest.mark.parametrize("code", AMINO_ACIDS)
 def test_capped_amino_acids_have_their_atoms_charge_and_handedness(code: str) -> None:
-    scene = library.load(f"ACE-{code}-NME")
+    scene = named_scenes.load(f"ACE-{code}-NME")
     assert (scene.n_atoms, int(scene.formal_charges.sum())) == AMINO_ACIDS[code]
     torsions = backbone_torsions(scene)
     assert [len(torsions[key]) for key in ("phi", "psi", "omega")] == [1, 1, 2]
@@ -97,31 +97,31 @@ def test_capped_amino_acids_have_their_atoms_charge_and_handedness(code: str) ->
 
 def test_the_three_histidines_differ_in_their_hydrogens() -> None:
     found = {code: {n for n, r in zip(scene.atom_names, scene.residue_of_atom, strict=True) if r == 1}
-             for code in ("HID", "HIE", "HIP") for scene in [library.load(f"ACE-{code}-NME")]}  # fmt: skip
+             for code in ("HID", "HIE", "HIP") for scene in [named_scenes.load(f"ACE-{code}-NME")]}  # fmt: skip
     assert found["HIP"] - found["HID"] == {"HE2"}
     assert found["HIP"] - found["HIE"] == {"HD1"}
 
 
 @pytest.mark.parametrize("name", PEPTIDES)
 def test_peptides_have_their_atoms_and_charge(name: str) -> None:
-    scene = library.load(name)
+    scene = named_scenes.load(name)
     assert (scene.n_atoms, int(scene.formal_charges.sum())) == PEPTIDES[name]
 
 
 def test_chignolins_are_told_apart_and_extended() -> None:
     for name, ends in (("chignolin", ("GLY", "GLY")), ("cln025", ("TYR", "TYR"))):
-        scene = library.load(name)
+        scene = named_scenes.load(name)
         assert len(scene.residue_names) == 10
         assert (scene.residue_names[0], scene.residue_names[-1]) == ends
         ca = [i for i, n in enumerate(scene.atom_names) if n == "CA"]
         # Folded, the ends meet within 0.7 nm.
         assert np.linalg.norm(scene.positions_nm[ca[0]] - scene.positions_nm[ca[-1]]) > 2.0
-        assert "not folded" in library.describe(name)
+        assert "not folded" in named_scenes.describe(name)
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_starting_structures_are_valid(name: str) -> None:
-    scene = library.load(name)
+    scene = named_scenes.load(name)
     assert check_frames(scene.positions_nm, geometry_from_scene(scene))[0] == 0
     assert scene.provenance["library_name"] == name
     assert len(set(zip(scene.residue_of_atom.tolist(), scene.atom_names, strict=True))) == scene.n_atoms
@@ -134,60 +134,60 @@ def test_capped_dipeptides_are_made_from_their_name() -> None:
     scene = prepare("ACE-SER-GLY-NME")
     assert scene.residue_names == ("ACE", "SER", "GLY", "NME")
     assert scene.name == scene.provenance["library_name"] == "ACE-SER-GLY-NME"
-    assert library.protocols("ACE-SER-GLY-NME") == ()
+    assert named_scenes.protocols("ACE-SER-GLY-NME") == ()
 
 
 def test_tetrapeptides_are_made_from_one_letter_code() -> None:
     scene = prepare("SDFS")
     assert scene.residue_names == ("SER", "ASP", "PHE", "SER")
     assert int(scene.formal_charges.sum()) == -1
-    assert library.protocols("SDFS") == library.protocols("SER-ASP-PHE-SER") == ("mdgen",)
+    assert named_scenes.protocols("SDFS") == named_scenes.protocols("SER-ASP-PHE-SER") == ("mdgen",)
 
 
 def test_a_seed_may_follow_the_name_of_an_n_body_system() -> None:
-    assert library.load("n-body-charged").name == "n-body-charged:0"
+    assert named_scenes.load("n-body-charged").name == "n-body-charged:0"
     assert prepare("n-body-charged:12").provenance["seed"] == 12
-    assert library.own_settings("n-body-charged:12")["ensemble"] == "nve"
+    assert named_scenes.own_settings("n-body-charged:12")["ensemble"] == "nve"
 
 
 @pytest.mark.parametrize("name", ["n-body-charged:", "n-body-charged:x", "n-body-charged:-1", "harmonic-oscillator:1",
                                   "SDF", "SDFX", "ACE-XXX-NME", "aspirine", "alanine dipeptide"])  # fmt: skip
 def test_other_names_are_refused_in_one_line(name: str) -> None:
-    assert not library.knows(name)
+    assert not named_scenes.knows(name)
     with pytest.raises(UnknownNameError) as caught:
-        library.load(name)
+        named_scenes.load(name)
     assert "\n" not in str(caught.value)
 
 
 def test_a_near_miss_is_told() -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'aspirin'"):
-        library.load("aspirine")
+        named_scenes.load("aspirine")
 
 
 # ---- protocols -----------------------------------------------------------------------------------------------------
 
 
 def test_protocols_name_settings_that_runs_have() -> None:
-    from md_reference.forcefield import ForceFieldSpec
-    from md_reference.simulate import MDConfig
+    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.run.simulate import MDConfig
 
     known = {f.name for c in (MDConfig, ForceFieldSpec) for f in dataclasses.fields(c)} | {"ensemble"}
-    for name in library.names():
-        own = library.own_settings(name)
+    for name in named_scenes.names():
+        own = named_scenes.own_settings(name)
         assert set(own) <= known, name
         # Settings of its own has what no other name can ask for.
-        is_model = library.load(name).interactions is not None
-        assert bool(own) == is_model == bool(library.source_of_settings(name)), name
-        assert all(find_protocol(each) for each in library.protocols(name))
+        is_model = named_scenes.load(name).interactions is not None
+        assert bool(own) == is_model == bool(named_scenes.source_of_settings(name)), name
+        assert all(find_protocol(each) for each in named_scenes.protocols(name))
         own.clear()  # a copy
     for protocol in PROTOCOLS.values():
         assert set(protocol.settings) <= known, protocol.name
         assert protocol.source
-    assert library.own_settings("n-body-spring")
+    assert named_scenes.own_settings("n-body-spring")
 
 
 def test_the_md17_protocol_is_the_published_one() -> None:
-    assert all(library.protocols(name) == ("md17",) for name in MD17)
+    assert all(named_scenes.protocols(name) == ("md17",) for name in MD17)
     settings = find_protocol("md17").settings
     published = {"temperature_k": 500.0, "timestep_ps": 0.0005, "save_every_ps": 0.005}
     assert {key: settings[key] for key in published} == published

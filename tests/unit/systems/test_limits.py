@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from systems.chemistry.limits import Limits, check_limits, limits_from_frames
+from systems.chemistry.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
 from systems.errors import InputError
-from systems.limits import Limits, check_limits, limits_from_frames
 from systems.scene import Scene
-from systems.trajectory import open_trajectory
-from systems.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
+from systems.trajectory.codec import open_trajectory
 
 HA, CH3, C, O_, N, CA, HB = 2, 1, 4, 5, 6, 8, 11  # atoms of the library's ACE-ALA-NME
 
@@ -130,7 +130,7 @@ def test_limits_survive_json_exactly(limits: Limits, alanine_dipeptide: Scene) -
 
 
 def test_molecules_too_small_for_angles_or_jumps_have_none() -> None:
-    from systems.molecule import scene_from_smiles
+    from systems.prepare.molecule import scene_from_smiles
 
     scene = scene_from_smiles("[HH]")
     frames = np.repeat(scene.positions_nm[None], 5, axis=0)

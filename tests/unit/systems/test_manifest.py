@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.errors import InputError, TrajectoryError
-from systems.manifest import (
+from md_reference.campaign.manifest import (
     COMPLETE,
     FAILED,
     MANIFEST_NAME,
@@ -22,8 +21,9 @@ from systems.manifest import (
     read_manifest,
     write_manifest,
 )
+from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 
 def _run(name: str, file: str, **entries: object) -> RunEntry:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from systems import library
 from systems.errors import InputError, PreparationError
-from systems.pdb_records import read_structure
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.read.pdb_records import read_structure
+from systems.prepare.source import prepare
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 COLUMNS = (
     "group_PDB id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id label_entity_id label_seq_id",
     "pdbx_PDB_ins_code Cartn_x Cartn_y Cartn_z occupancy B_iso_or_equiv pdbx_formal_charge auth_seq_id auth_comp_id",

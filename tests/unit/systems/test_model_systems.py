@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry import backbone_torsions, match_atoms, rotatable_torsions, stereocentres
+from systems.chemistry.graph import backbone_torsions, match_atoms, rotatable_torsions, stereocentres
+from systems.chemistry.validity import NOT_FINITE, check_frames, geometry_from_frames, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
-from systems.model_systems import N_BODY, double_well, harmonic_oscillator, n_body, particles
+from systems.library.particles import N_BODY, double_well, harmonic_oscillator, n_body, particles
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
-from systems.validity import NOT_FINITE, check_frames, geometry_from_frames, geometry_from_scene
+from systems.trajectory.codec import open_trajectory, open_writer
 
 SCENES = {"harmonic": harmonic_oscillator, "double-well": double_well} | {
     name: (lambda name=name: n_body(name, 7)) for name in N_BODY

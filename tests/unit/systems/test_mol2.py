@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems import library
 from systems.errors import InputError, PreparationError
-from systems.mol2_file import element_of
-from systems.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles
+from systems.prepare.read.mol2_file import element_of
+from systems.prepare.source import prepare
 from systems.scene import Scene
 
 SYBYL = {"C": "C.3", "N": "N.3", "O": "O.3", "S": "S.3", "P": "P.3"}
@@ -169,7 +169,7 @@ def test_broken_records_are_named(tmp_path: Path) -> None:
 
 
 def _peptide(residue: str = "{name}{number}") -> str:
-    scene = library.load("alanine-dipeptide")
+    scene = named_scenes.load("alanine-dipeptide")
     lines = _mol2(scene, AMBER).splitlines()
     first = lines.index("@<TRIPOS>ATOM") + 1
     for i in range(scene.n_atoms):
@@ -180,7 +180,7 @@ def _peptide(residue: str = "{name}{number}") -> str:
 
 
 def test_a_peptide_keeps_its_residues_and_is_one_for_its_force_field(tmp_path: Path) -> None:
-    known = library.load("alanine-dipeptide")
+    known = named_scenes.load("alanine-dipeptide")
     for residue in ("{name}{number}", "{name}"):
         path = tmp_path / "x.mol2"
         path.write_text(_peptide(residue))

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drug_like_smiles import Case, cases, what_is_wrong
 from rdkit import Chem, rdBase
 from rdkit.Chem import rdDepictor
 
-from surrogate.bench.smiles import Case, cases, what_is_wrong
-from systems import library
-from systems.embedding import refuse_changed_stereo, stereo_labels
 from systems.errors import InputError, PreparationError
-from systems.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles, to_rdkit
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.embedding import refuse_changed_stereo, stereo_labels
+from systems.prepare.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles, to_rdkit
+from systems.prepare.source import prepare
 from systems.scene import Scene
 
 ACCEPTED = [c for c in cases() if not c.refusal]
@@ -148,7 +148,7 @@ def test_to_rdkit_is_exact_for_bonds_charges_and_aromaticity() -> None:
 
 
 def test_to_rdkit_reads_a_peptide() -> None:
-    scene = library.load("alanine-dipeptide")
+    scene = named_scenes.load("alanine-dipeptide")
     assert _canonical(to_rdkit(scene)) == Chem.CanonSmiles("CC(=O)N[C@@H](C)C(=O)NC")
 
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems import library
-from systems.clashes import check_contacts
-from systems.element_data import element_symbol
+from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, PreparationError
-from systems.pdb_records import AtomRecord
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.clashes import check_contacts
+from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.source import prepare
 from systems.scene import Scene
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 ROWS = [
     line
-    for line in (Path(library.__file__).parent / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
+    for line in (Path(named_scenes.__file__).parent / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
     if line.startswith("ATOM")
 ]
 WATER = (

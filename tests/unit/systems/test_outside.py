@@ -9,15 +9,15 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forcefield import ForceFieldSpec
-from md_reference.parameter_cache import Entry, _read, store
-from md_reference.replicas import replica_paths
-from md_reference.run_config import MDConfig, check_run
-from systems.distance_bonds import bonds_by_distance
+from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.small_molecules.parameter_cache import Entry, _read, store
+from md_reference.run.config import MDConfig, check_run
+from md_reference.run.replicas import replica_paths
+from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.errors import InputError, PreparationError, TrajectoryError
-from systems.outside import content, printable
+from systems.files.outside import content, printable
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory, open_writer
 
 
 def trajectory(path: Path, scene: Scene) -> Path:
@@ -61,7 +61,7 @@ def test_links_into_other_files_are_not_followed(tmp_path: Path, alanine_dipepti
 
 
 def test_files_that_hold_or_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("systems.outside._TEXT_BYTES", 1_000_000)
+    monkeypatch.setattr("systems.files.outside._TEXT_BYTES", 1_000_000)
     path = tmp_path / "a.pdb"
 
     def read(data: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Scenes from files of other programs, broken files, sequences, the library."""
+"""Scenes from files of other programs, broken files, sequences, the named_scenes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from systems import library
-from systems.chemistry import backbone_torsions, match_atoms, molecule_key, stereocentres
+from systems.chemistry.geometry import signed_volumes, superpose, torsion
+from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key, stereocentres
 from systems.errors import InputError, OutOfDomainError, PreparationError, SurromdError, UnknownNameError
-from systems.geometry import signed_volumes, superpose, torsion
-from systems.prepare import prepare
+from systems.library import named_scenes
+from systems.prepare.peptide import parse_sequence
+from systems.prepare.source import prepare
 from systems.scene import Scene
-from systems.sequence import parse_sequence
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 RESIDUES = [ALA2.residue_names[r] for r in ALA2.residue_of_atom]
 NUMBERS = [int(ALA2.residue_ids[r]) for r in ALA2.residue_of_atom]
 
@@ -81,8 +81,8 @@ def _assert_is_ala2(scene: Scene, tolerance_nm: float = 1e-3) -> None:
 
 
 def test_library_alanine_dipeptide_is_l_trans_and_whole() -> None:
-    assert "alanine-dipeptide" in library.names()
-    assert "phi, psi" in library.describe("alanine-dipeptide")
+    assert "alanine-dipeptide" in named_scenes.names()
+    assert "phi, psi" in named_scenes.describe("alanine-dipeptide")
     assert (ALA2.formula, ALA2.n_atoms, len(ALA2.bonds)) == ("C6H12N2O2", 22, 21)
     assert ALA2.residue_names == ("ACE", "ALA", "NME")
     double = ALA2.bonds[ALA2.bond_orders == 2].tolist()
@@ -104,8 +104,8 @@ def test_library_scene_agrees_with_rdkit_that_it_is_s(tmp_path: Path) -> None:
 
 
 def test_library_load_hands_out_independent_provenance() -> None:
-    library.load("alanine-dipeptide").provenance["spoiled"] = True
-    assert "spoiled" not in library.load("alanine-dipeptide").provenance
+    named_scenes.load("alanine-dipeptide").provenance["spoiled"] = True
+    assert "spoiled" not in named_scenes.load("alanine-dipeptide").provenance
 
 
 def test_unknown_name_gives_the_nearest_and_the_command() -> None:
@@ -370,7 +370,7 @@ def test_sequence_protonation_follows_names_and_ph() -> None:
 
 
 def test_a_peptide_bond_built_cis_is_refused() -> None:
-    from systems.sequence import _verify
+    from systems.prepare.peptide import _verify
 
     x = ALA2.positions_nm.copy()
     axis = (x[16] - x[14]) / np.linalg.norm(x[16] - x[14])

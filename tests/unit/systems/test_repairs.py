@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems import library
-from systems.bonding import find_bonds
+from systems.chemistry.geometry import signed_volumes
 from systems.errors import InputError, PreparationError
-from systems.geometry import signed_volumes
-from systems.handedness import compare, handedness, say_inverted
-from systems.heterogens import ligand_atoms
-from systems.hybrid36 import decode, encode
-from systems.hydrogens import protonation_account
-from systems.modified_residues import standardise
-from systems.pdb_records import AtomRecord, read_structure
-from systems.pdb_text import pdb_text
-from systems.prepare import prepare
-from systems.repair import _with_usual_lengths, complete
+from systems.library import named_scenes
+from systems.prepare.bonding import find_bonds
+from systems.prepare.handedness import compare, handedness, say_inverted
+from systems.prepare.heterogens import ligand_atoms
+from systems.prepare.modified_residues import standardise
+from systems.prepare.protonation import protonation_account
+from systems.prepare.read.hybrid36 import decode, encode
+from systems.prepare.read.pdb_records import AtomRecord, read_structure
+from systems.prepare.repair import _with_usual_lengths, complete
+from systems.prepare.source import prepare
+from systems.trajectory.pdb_text import pdb_text
 
-ALA2 = library.load("alanine-dipeptide")
+ALA2 = named_scenes.load("alanine-dipeptide")
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"
 METHANE = (
     "HETATM  910  C1  LIG A 201      30.000  20.000  20.000  1.00  0.00           C\n"
@@ -241,7 +241,7 @@ def test_insertion_codes_and_hybrid_36_survive_the_way_through(tmp_path: Path) -
 
 def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Negative control of the check around `complete`: a repair that mirrors what it returns is refused."""
-    import systems.repair
+    import systems.prepare.repair
 
     def mirrored(atoms, bonding, *, ph):
         records, bonds, account = complete(atoms, bonding, ph=ph)
@@ -250,7 +250,7 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
 
     path = _write(tmp_path / "x.pdb", _peptide(drop=("HB1", "HB2", "HB3")))
     prepare(path)
-    monkeypatch.setattr(systems.repair, "complete", mirrored)
+    monkeypatch.setattr(systems.prepare.repair, "complete", mirrored)
     with pytest.raises(PreparationError, match=r"ALA A?2: CA came out inverted"):
         prepare(path)
 

@@ -10,8 +10,8 @@ from rdkit import Chem
 from rdkit.Chem import rdDistGeom
 
 from systems.errors import PreparationError
-from systems.molecule import to_rdkit
-from systems.prepare import prepare
+from systems.prepare.molecule import to_rdkit
+from systems.prepare.source import prepare
 
 
 @pytest.mark.parametrize(

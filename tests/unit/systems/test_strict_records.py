@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from systems.errors import InputError
-from systems.prepare import prepare
+from systems.prepare.source import prepare
 
 
 @pytest.fixture

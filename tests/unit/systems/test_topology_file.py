@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.outputs import TRAJECTORY_SUFFIXES, check_outputs
-from systems.claim import claimed_outputs
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs
 from systems.errors import SimulationError, TrajectoryError
-from systems.pdb_text import pdb_text
 from systems.scene import Scene
 from systems.selection import part_of, reordered
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory.claim import claimed_outputs
+from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.pdb_text import pdb_text
 
 SUFFIXES = (".h5", ".dcd")
 

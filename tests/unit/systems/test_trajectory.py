@@ -19,10 +19,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from systems import atomic_file, frame_store, hdf5_file
 from systems.errors import InputError, StorageError, TrajectoryError
+from systems.files import atomic_file
 from systems.scene import Scene
-from systems.trajectory import open_trajectory, open_writer
+from systems.trajectory import frame_store, hdf5_file
+from systems.trajectory.codec import open_trajectory, open_writer
 
 SUFFIXES = (".h5", ".dcd")
 RECORD = {"kind": "reference", "timestep_ps": 0.004, "save_every_ps": 1.0, "seed": 7, "completed": False}
@@ -471,7 +472,7 @@ def test_kill_minus_nine(tmp_path: Path, repository: Path) -> None:
     program.write_text(
         f"import sys; sys.path[:0] = [{str(repository)!r}, {str(Path(__file__).parent)!r}]\n"
         "import numpy as np\nfrom pathlib import Path\n"
-        "from test_trajectory import chain\nfrom systems.trajectory import open_writer\n"
+        "from test_trajectory import chain\nfrom systems.trajectory.codec import open_writer\n"
         "w = open_writer(Path(sys.argv[1]), chain(50), {}, append=Path(sys.argv[1]).exists())\n"
         "begun = w.n_frames\n"
         "while True:\n"
@@ -536,7 +537,7 @@ def test_a_running_trajectory_can_be_read_but_not_written(tmp_path: Path, reposi
         writer.append(frames(3), [1.0, 2.0, 3.0])
         program = (
             f"import sys; sys.path[:0] = [{str(repository)!r}, {str(Path(__file__).parent)!r}]\n"
-            "from test_trajectory import chain\nfrom systems.trajectory import open_trajectory, open_writer\n"
+            "from test_trajectory import chain\nfrom systems.trajectory.codec import open_trajectory, open_writer\n"
             f"print(open_trajectory({str(path)!r}).n_frames)\nopen_writer({str(path)!r}, chain(5), {{}}, append=True)\n"
         )
         run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -666,7 +667,7 @@ def test_file_size_limit_of_the_system(tmp_path: Path, suffix: str, repository: 
     program = (
         f"import sys; sys.path[:0] = [{str(repository)!r}, {str(Path(__file__).parent)!r}]\n"
         "import resource, numpy as np\nfrom test_trajectory import chain, frames\n"
-        "from systems.errors import StorageError\nfrom systems.trajectory import open_writer\n"
+        "from systems.errors import StorageError\nfrom systems.trajectory.codec import open_writer\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))\n"
         f"w = open_writer({str(path)!r}, chain(22), {{}})\n"
         "try:\n"

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from systems.errors import InputError
-from systems.scene import Scene
-from systems.validity import (
+from systems.chemistry.validity import (
     BOND_20_PERCENT,
     BOND_HALF_ANGSTROM,
     CHIRALITY,
@@ -28,6 +26,8 @@ from systems.validity import (
     geometry_from_frames,
     geometry_from_scene,
 )
+from systems.errors import InputError
+from systems.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def rotated(positions: np.ndarray, atoms: list[int], axis: tuple[int, int], angl
 
 def beyond(scene: Scene, start: int, end: int) -> list[int]:
     """Atoms on the side of `end` of the bond from `start` to `end`."""
-    from systems.chemistry import bonded_graph
+    from systems.chemistry.graph import bonded_graph
 
     graph = bonded_graph(scene)
     graph.remove_edge(start, end)
@@ -106,7 +106,7 @@ def test_the_start_is_valid_however_it_lies(alanine_dipeptide: Scene, geometry: 
 
 
 def test_every_frame_of_a_real_simulation_is_valid(shared_data: Path) -> None:
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     folder = shared_data / "alanine-dipeptide"
     with open_trajectory(folder / "trajectory-1.dcd", top=folder / "ala2.pdb") as reader:
@@ -128,7 +128,7 @@ def test_every_frame_of_a_real_simulation_is_valid(shared_data: Path) -> None:
 @pytest.mark.filterwarnings("ignore:.*header states 500 frames")
 def test_a_protein_on_its_way_is_valid(shared_data: Path) -> None:
     """Adenylate kinase, 3,341 atoms, 98 frames of a transition."""
-    from systems.trajectory import open_trajectory
+    from systems.trajectory.codec import open_trajectory
 
     folder = shared_data / "adk"
     with open_trajectory(folder / "adk_dims.dcd", top=folder / "adk_open.pdb") as reader:
@@ -202,7 +202,7 @@ def test_cis_peptide(alanine_dipeptide: Scene, geometry: Geometry) -> None:
 
 
 def test_a_free_torsion_may_turn(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    from systems.chemistry import backbone_torsions
+    from systems.chemistry.graph import backbone_torsions
 
     for key in ("phi", "psi"):
         _, b, c, _ = backbone_torsions(alanine_dipeptide)[key][0].tolist()
@@ -235,7 +235,7 @@ def test_clash(alanine_dipeptide: Scene, geometry: Geometry) -> None:
 
 
 def test_neighbours_up_to_three_bonds_never_clash(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    from systems.chemistry import exclusions
+    from systems.chemistry.graph import exclusions
 
     pairs = {tuple(p) for p in geometry.clash_idx.tolist()}
     near = {tuple(p) for p in exclusions(alanine_dipeptide, depth=3).tolist()}
@@ -394,7 +394,7 @@ def test_blocks_and_order_make_no_difference(
 
 def test_large_scenes_give_the_same_clashes() -> None:
     """Above the limit neighbours are searched with a tree; below, all pairs are listed. Both agree."""
-    from systems import validity
+    from systems.chemistry import validity
 
     generator = np.random.default_rng(5)
     n = 300

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from systems.errors import StorageError
-from systems.whole_file import create_whole
+from systems.files.whole_file import create_whole
 
 
 def test_a_file_that_its_writer_made_private_has_the_rights_of_a_new_one(tmp_path: Path) -> None:

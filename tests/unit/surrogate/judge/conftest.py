@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from surrogate.judge.ensemble import Ensemble
-from systems.chemistry import backbone_torsions, bonded_graph
-from systems.geometry import torsion
+from surrogate.judge.read.ensemble import Ensemble
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions, bonded_graph
 from systems.scene import Scene
 
 # States: beta, alpha, left-handed. Rows sum to one; the slowest exchange takes some ten frames.

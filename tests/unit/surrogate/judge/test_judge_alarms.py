@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from judge_alarms import Alarms, count_alarms, cut, fair_trios, report
 
-from surrogate.bench.judge_alarms import Alarms, count_alarms, cut, fair_trios, report
-from surrogate.judge.ensemble import Ensemble
+from surrogate.judge.read.ensemble import Ensemble
 from systems.errors import InputError
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from surrogate.bench.judge_cases import CASES, Case, Outcome, run_cases, table
+from judge_cases import CASES, Case, Outcome, run_cases, table
 
 
 @pytest.mark.slow

@@ -15,12 +15,12 @@ import pytest
 
 from surrogate.judge.comparison import Comparison, Judgement
 from surrogate.judge.comparison import compare as compare_with_everything
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows import Options
-from systems import validity
-from systems.chemistry import backbone_torsions, bonded_graph
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.rows import Options
+from systems.chemistry import validity
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions, bonded_graph
 from systems.errors import InputError
-from systems.geometry import torsion
 from systems.scene import Scene
 
 Trio = tuple[Ensemble, Ensemble, Ensemble]
@@ -140,7 +140,7 @@ def test_frames_that_are_not_finite_fail_and_help_no_score(trio: Trio, fair: Jud
 
 def test_hiding_a_wrong_region_behind_nan_gains_nothing(trio: Trio, alanine_dipeptide: Scene) -> None:
     """A candidate that visits what the reference never does scores no better when those frames become NaN."""
-    from systems.geometry import superpose
+    from systems.chemistry.geometry import superpose
 
     frames = frames_of(trio)
     wrong = frames.copy()
@@ -393,7 +393,7 @@ def test_real_torsions_equal_mdtrajs(shared_data: Path) -> None:
     """An independent implementation on real frames."""
     import mdtraj
 
-    from surrogate.judge import structure
+    from surrogate.judge.measure import structure
 
     folder = shared_data / "alanine-dipeptide"
     files = [folder / "trajectory-1.dcd"]

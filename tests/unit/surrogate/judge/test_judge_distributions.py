@@ -12,9 +12,9 @@ from scipy.integrate import quad
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import norm
 
-from surrogate.judge import distributions
-from surrogate.judge.distributions import Bins, block_counts, block_counts_joint, distance, divergence
-from surrogate.judge.statistics import Blocks, make_blocks
+from surrogate.judge.measure import distributions
+from surrogate.judge.measure.distributions import Bins, block_counts, block_counts_joint, distance, divergence
+from surrogate.judge.measure.statistics import Blocks, make_blocks
 
 WIDE = Bins(-8.0, 9.0, 400)
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.judge.charts import Histogram
 from surrogate.judge.comparison import Judgement, compare
-from surrogate.judge.energy_rows import measure_energies
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.rows import Options
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.charts import Histogram
+from surrogate.judge.rows.rows import Options
+from surrogate.judge.rows.shape.energy_rows import measure_energies
 from systems.scene import Scene
 
 QUICK = Options(n_bootstrap=100, n_permutations=100, peptide_recipe=False)

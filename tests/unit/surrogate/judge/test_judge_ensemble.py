@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate.judge.ensemble import Ensemble, equal_lags, load_ensemble
+from surrogate.judge.read.ensemble import Ensemble, equal_lags, load_ensemble
+from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
-from systems.geometry import torsion
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 Save = Callable[..., Path]
 

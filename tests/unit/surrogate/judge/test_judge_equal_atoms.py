@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.lifetimes import lifetime_rows
-from surrogate.judge.probes import MAX_COLUMNS, _foremost, measure_block
-from surrogate.judge.rows import Options, Row, Trio, make_sample
-from surrogate.judge.shape_rows import shape_rows
-from surrogate.judge.statistics import make_blocks
-from surrogate.judge.structure import backbone, measure, reference_geometry, reference_probes
-from systems.prepare import prepare
+from surrogate.judge.measure.probes import MAX_COLUMNS, _foremost, measure_block
+from surrogate.judge.measure.statistics import make_blocks
+from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.motion.lifetimes import lifetime_rows
+from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
+from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
+from surrogate.judge.rows.shape.shape_rows import shape_rows
+from systems.prepare.source import prepare
 from systems.scene import Scene
 
 ROOMS = (shape_rows, contact_rows, hydrogen_bond_rows, lifetime_rows)

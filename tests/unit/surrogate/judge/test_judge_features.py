@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import puckers
-from surrogate.judge.couplings import KARPLUS, coupling_hz, find_sites
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.probes import find_probes, mean_structure, measure_block
-from surrogate.judge.structure import backbone
-from surrogate.judge.torsions import find_torsions
-from systems.chemistry import bonded_graph
-from systems.geometry import torsion
+from surrogate.judge.measure import puckers
+from surrogate.judge.measure.probes import find_probes, mean_structure, measure_block
+from surrogate.judge.measure.structure import backbone
+from surrogate.judge.measure.torsions import find_torsions
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.shape.couplings import KARPLUS, coupling_hz, find_sites
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import bonded_graph
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.sequence import build_peptide
 
 mdtraj = pytest.importorskip("mdtraj")
 mda = pytest.importorskip("MDAnalysis")
@@ -197,7 +197,7 @@ def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fol
 
 
 def test_small_molecules_have_every_rotatable_torsion() -> None:
-    from systems.prepare import prepare
+    from systems.prepare.source import prepare
 
     kinds = {name: sorted((t.kind, t.fold) for t in find_torsions(prepare(f"smiles:{smiles}")))
              for name, smiles in (("aspirin", "CC(=O)Oc1ccccc1C(=O)O"), ("ethanol", "CCO"), ("benzene", "c1ccccc1"),
@@ -290,7 +290,7 @@ def test_the_mean_structure_is_free_of_rotation(simulate: Callable[..., Ensemble
     spins = np.linalg.qr(rng.standard_normal((400, 3, 3)))[0]
     spins *= np.sign(np.linalg.det(spins))[:, None, None]
     mean = mean_structure(np.einsum("nij,nkj->nki", spins, noisy) + rng.standard_normal((400, 1, 3)))
-    from systems.geometry import superpose
+    from systems.chemistry.geometry import superpose
 
     assert superpose(mean, template) == pytest.approx(template, abs=6e-4)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surrogate.judge.charts import LineChart
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.forecast import find_pairs, forecast_charts, forecasts
-from surrogate.judge.rows import Options
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.charts import LineChart
+from surrogate.judge.rows.motion.forecast import find_pairs, forecast_charts, forecasts
+from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
 
 N_PAIRS, N_FRAMES, N_GIVEN = 4, 30, 2

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from surrogate.judge.comparison import Comparison, Judgement, compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.report import render
-from surrogate.judge.rows import Options
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.report.report import render
+from surrogate.judge.rows.rows import Options
 from systems.imposed import ANGLES, BONDS, KEY, RIGID_BONDS, imposed_terms
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 QUICK = Options(n_bootstrap=60, n_permutations=20, peptide_recipe=False)
 _IMPOSED = {"bond_shift", "bond_width:flexible bonds", "bond_jsd", "bond_wasserstein",

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows import Options
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 RECORD = {"temperature_k": 300.0, "interventions": {"guard": "fallback", "chunks": 100, "chunks_caught": 7,
           "frames": {"MD after a failure": 30}, "bias": ["a mixture"]}}  # fmt: skip

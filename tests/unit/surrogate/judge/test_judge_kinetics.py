@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from surrogate.judge import kinetics
-from surrogate.judge.statistics import Blocks, make_blocks
+from surrogate.judge.measure import kinetics
+from surrogate.judge.measure.statistics import Blocks, make_blocks
 
 
 def ar1(a: float, n: int, rng: np.random.Generator) -> np.ndarray:

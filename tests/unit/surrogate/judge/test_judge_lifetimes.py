@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.lifetimes import lifetime_sums
-from surrogate.judge.rows import Options
-from surrogate.judge.statistics import Blocks, make_blocks
+from surrogate.judge.measure.statistics import Blocks, make_blocks
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.motion.lifetimes import lifetime_sums
+from surrogate.judge.rows.rows import Options
 
 
 def chain(n: int, leave: float, enter: float, rng: np.random.Generator) -> np.ndarray:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate.judge import movie
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.structure import Features
-from systems import validity
-from systems.geometry import signed_volumes
+from surrogate.judge.measure import movie
+from surrogate.judge.measure.structure import Features
+from surrogate.judge.read.ensemble import Ensemble
+from systems.chemistry import validity
+from systems.chemistry.geometry import signed_volumes
 
 
 def features_of(ensemble: Ensemble) -> Features:

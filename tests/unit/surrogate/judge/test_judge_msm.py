@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from surrogate.judge import kinetics, msm
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.rows import Options
-from surrogate.judge.statistics import make_blocks
+from surrogate.judge.measure import kinetics, msm
+from surrogate.judge.measure.statistics import make_blocks
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.rows import Options
 
 # Reversible: detailed balance with populations 0.6, 0.3, 0.1.
 CHAIN = np.array([[0.94, 0.05, 0.01], [0.10, 0.88, 0.02], [0.06, 0.06, 0.88]])
@@ -135,8 +135,8 @@ def test_rows_pass_a_replicate_and_reject_a_wrong_time_axis(trio: tuple[Ensemble
 
 
 def phi_of(ensemble: Ensemble) -> np.ndarray:
-    from systems.chemistry import backbone_torsions
-    from systems.geometry import torsion
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
 
     return torsion(ensemble.segments[0][:], backbone_torsions(ensemble.scene)["phi"])[:, 0]
 

@@ -10,9 +10,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.distance import jensenshannon
 
-from surrogate.judge import peptide_protocol, structure
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.structure import Features
+from surrogate.judge.measure import structure
+from surrogate.judge.measure.structure import Features
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.motion import peptide_protocol
 from systems.scene import Scene
 
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.judge.charts import LineChart
 from surrogate.judge.comparison import Judgement, compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.peptide_shape import in_a_row
-from surrogate.judge.probes import _ends
-from surrogate.judge.rows import Options
+from surrogate.judge.measure.probes import _ends
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.charts import LineChart
+from surrogate.judge.rows.rows import Options
+from surrogate.judge.rows.shape.peptide_shape import in_a_row
 from surrogate.judge.worth import Worth
 
 
@@ -41,7 +41,7 @@ def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
 
 
 def test_ends_are_those_of_the_chain() -> None:
-    from systems.prepare import prepare
+    from systems.prepare.source import prepare
 
     scene = prepare("sequence:ACE-LYS-ALA-ARG-NME")
     ends = _ends(scene)

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import distributions
-from surrogate.judge.common_atoms import match_scenes, solute_atoms
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble, on_common_atoms
-from surrogate.judge.rows import Options
-from surrogate.judge.statistics import Blocks
-from surrogate.judge.stored_frames import StoredFrames, bond_tree, make_whole
-from surrogate.judge.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.measure import distributions
+from surrogate.judge.measure.statistics import Blocks
+from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.read.common_atoms import match_scenes, solute_atoms
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble, on_common_atoms
+from surrogate.judge.read.stored_frames import StoredFrames, bond_tree, make_whole
+from surrogate.judge.rows.rows import Options
 from systems.errors import InputError, OutOfDomainError
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.selection import part_of
-from systems.sequence import build_peptide
-from systems.trajectory import open_writer
+from systems.trajectory.codec import open_writer
 
 BOX = np.array([[2.4, 0.0, 0.0], [0.7, 2.2, 0.0], [-0.6, 0.5, 2.1]])
 

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import report, wording
-from surrogate.judge.cards import side_by_side
-from surrogate.judge.charts import BarChart, Landscape, Line, LineChart
 from surrogate.judge.comparison import Comparison, compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.markdown import to_markdown
-from surrogate.judge.pictures import Album, albums
-from surrogate.judge.report import write_report
-from surrogate.judge.statistics import Estimate
+from surrogate.judge.measure.statistics import Estimate
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.report import report, wording
+from surrogate.judge.report.cards import side_by_side
+from surrogate.judge.report.markdown import to_markdown
+from surrogate.judge.report.pictures import Album, albums
+from surrogate.judge.report.report import write_report
+from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import kinetics, msm
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import load_ensemble
-from surrogate.judge.equal_atoms import evenly
-from surrogate.judge.relaxation import speed_words
+from surrogate.judge.measure import kinetics, msm
+from surrogate.judge.measure.equal_atoms import evenly
+from surrogate.judge.read.ensemble import load_ensemble
+from surrogate.judge.rows.motion.relaxation_rows import speed_words
 
 
 def test_more_torsions_than_frames_have_no_slowest_combination() -> None:

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from surrogate.judge import distributions, statistics
-from surrogate.judge.statistics import Estimate
+from surrogate.judge.measure import distributions, statistics
+from surrogate.judge.measure.statistics import Estimate
 
 
 def ar1_batch(a: float, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:

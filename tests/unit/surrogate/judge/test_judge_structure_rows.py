@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.judge.contact_rows import contact_rows, hydrogen_bond_rows
-from surrogate.judge.couplings import coupling_hz, coupling_rows
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.rows import Options, Row, Trio, make_sample
-from surrogate.judge.shape_rows import shape_rows
-from surrogate.judge.statistics import make_blocks
-from surrogate.judge.structure import Features, backbone, measure, reference_geometry, reference_probes
-from surrogate.judge.torsion_rows import other_torsion_rows
+from surrogate.judge.measure.statistics import make_blocks
+from surrogate.judge.measure.structure import Features, backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
+from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
+from surrogate.judge.rows.shape.couplings import coupling_hz, coupling_rows
+from surrogate.judge.rows.shape.shape_rows import shape_rows
+from surrogate.judge.rows.shape.torsion_rows import other_torsion_rows
 from surrogate.judge.verdict import judge_rows
-from systems.chemistry import backbone_torsions, bonded_graph
+from systems.chemistry.graph import backbone_torsions, bonded_graph
 from systems.scene import Scene
 
 ROOMS = (shape_rows, other_torsion_rows, contact_rows, hydrogen_bond_rows, coupling_rows)
@@ -155,7 +155,7 @@ def test_noise_shows_in_angles_and_fluctuations(judged: Judge, ensembles: tuple[
 
 def test_the_shape_of_one_basin_only(judged: Judge, ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> None:
     """Frames of the extended states alone: size, contacts, fluctuation and coupling all say so."""
-    from systems.geometry import torsion
+    from systems.chemistry.geometry import torsion
 
     x, scene = frames_of(ensembles), ensembles[0].scene
     phi = torsion(x, backbone(scene).phi)[:, 0]

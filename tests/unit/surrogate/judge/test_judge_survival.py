@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.judge.charts import LineChart
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.rows import Options
-from surrogate.judge.survival import survival
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.charts import LineChart
+from surrogate.judge.rows.motion.survival import survival
+from surrogate.judge.rows.rows import Options
 
 
 def test_survival_equals_scipys_with_censored_replicas() -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from surrogate.judge.comparison import Judgement, compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.reading import time_axis
-from surrogate.judge.rows import Options
-from surrogate.judge.statistics import Estimate
-from surrogate.judge.wording import interval, number
+from surrogate.judge.measure.statistics import Estimate
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.read.reading import time_axis
+from surrogate.judge.report.wording import interval, number
+from surrogate.judge.rows.rows import Options
 from systems.errors import InputError
 from systems.scene import Scene
 
@@ -139,7 +139,7 @@ NUMBERED = [((0, 1, 2), ("1", "2", "3")), ((0, 5, 6), ("0", "5", "6")), ((7, 8, 
 def test_residues_that_were_never_numbered_count_from_one(numbers: tuple[int, ...], expected: tuple[str, ...]) -> None:
     import mdtraj
 
-    from systems.from_mdtraj import scene_from_mdtraj_topology
+    from systems.trajectory.from_mdtraj import scene_from_mdtraj_topology
 
     topology = mdtraj.Topology()
     chain = topology.add_chain()

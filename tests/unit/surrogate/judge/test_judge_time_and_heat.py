@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge import kinetics, relaxation
 from surrogate.judge.comparison import Judgement, compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows import Options
-from surrogate.judge.slow_motion import longest_correlation, rarely_crossed
-from surrogate.judge.statistics import block_length, bootstrap_weights, estimate, make_blocks, permutation_p
-from surrogate.judge.structure import Features
+from surrogate.judge.measure import kinetics
+from surrogate.judge.measure.slow_motion import longest_correlation, rarely_crossed
+from surrogate.judge.measure.statistics import block_length, bootstrap_weights, estimate, make_blocks, permutation_p
+from surrogate.judge.measure.structure import Features
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.motion import relaxation_rows
+from surrogate.judge.rows.rows import Options
 
 OPTIONS = Options(peptide_recipe=False)
 
@@ -66,7 +67,7 @@ def test_a_wrong_time_between_frames_is_seen(judged: dict[str, Judgement], label
 
 def test_phi_shifted_against_psi_is_seen_within_the_basins(runs: list[Ensemble]) -> None:
     """Phi and psi of different times: each alone is right, their maps together are not."""
-    from surrogate.judge import structure
+    from surrogate.judge.measure import structure
 
     three = runs
     torsions = structure.backbone(three[0].scene)
@@ -79,8 +80,9 @@ def test_phi_shifted_against_psi_is_seen_within_the_basins(runs: list[Ensemble])
 
 
 def _within(reference: Ensemble, measured: list[Features], candidate: Features) -> dict[str, str]:
-    from surrogate.judge import comparison, structure, verdict
-    from surrogate.judge.within_rows import within_rows
+    from surrogate.judge import comparison, verdict
+    from surrogate.judge.measure import structure
+    from surrogate.judge.rows.motion.within_rows import within_rows
 
     torsions, geometry = structure.backbone(reference.scene), structure.reference_geometry(reference)
     three = (measured[0], candidate, measured[2])
@@ -150,7 +152,7 @@ def test_intervals_of_relaxation_times_hold_what_they_say() -> None:
         weights = bootstrap_weights(blocks.n_blocks, 200, rng)
         sums = kinetics.lag_sums(series, blocks, 3 * crossing + 2)
         draws = kinetics.correlation_time(kinetics.autocorrelation(sums, weights))
-        wide = relaxation._widened(draws, blocks.n_blocks, crossing, n)
+        wide = relaxation_rows._widened(draws, blocks.n_blocks, crossing, n)
         for k, d in enumerate((wide, draws)):
             found = estimate(time, d, blocks.n_blocks, log=True)
             inside = found.low <= truth <= found.high

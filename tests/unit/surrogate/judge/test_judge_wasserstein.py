@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble
-from surrogate.judge.rows import Options
-from surrogate.judge.statistics import make_blocks
-from surrogate.judge.wasserstein_rows import binned, wasserstein
+from surrogate.judge.measure.statistics import make_blocks
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.rows import Options
+from surrogate.judge.rows.shape.wasserstein_rows import binned, wasserstein
 
 
 def test_distances_equal_scipys() -> None:

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from surrogate.judge.comparison import compare
-from surrogate.judge.ensemble import Ensemble, load_ensemble
-from surrogate.judge.report import write_report
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.report.report import write_report
 
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from surrogate.bench.recipes import peptide_gates
-from systems.sequence import build_peptide
-from systems.trajectory import open_writer
+from systems.prepare.peptide import build_peptide
+from systems.trajectory.codec import open_writer
 
 
 @pytest.fixture(scope="module")

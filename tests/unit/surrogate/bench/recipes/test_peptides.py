@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.platforms import PlatformChoice
+from md_reference.run.platforms import PlatformChoice
 from surrogate.bench.recipes import peptide_runs, peptide_seeds
 from surrogate.bench.recipes.peptide_list import (
     RESIDUES,
@@ -18,10 +18,10 @@ from surrogate.bench.recipes.peptide_list import (
     TEST_PAIRS,
     training_peptides,
 )
-from systems import library
-from systems.geometry import torsion
-from systems.sequence import build_peptide
-from systems.trajectory import open_trajectory
+from systems.chemistry.geometry import torsion
+from systems.library import named_scenes
+from systems.prepare.peptide import build_peptide
+from systems.trajectory.codec import open_trajectory
 
 
 def test_every_residue_stands_three_times_at_either_place_of_the_capped_pairs() -> None:
@@ -41,7 +41,7 @@ def test_no_test_molecule_is_trained_on() -> None:
 
 
 def test_residues_are_those_that_the_library_has_capped() -> None:
-    assert set(RESIDUES) == {n.split("-")[1] for n in library.names() if n.startswith("ACE-")} | {"ALA"}
+    assert set(RESIDUES) == {n.split("-")[1] for n in named_scenes.names() if n.startswith("ACE-")} | {"ALA"}
 
 
 def test_a_turned_peptide_bond_is_cis() -> None:

@@ -1,0 +1,141 @@
+"""How often the judge raises a false alarm: `python docs/studies/judge/judge_alarms.py REF... --piece 20ns`.
+
+Runs of one simulation are cut into pieces. Each piece is judged once as the candidate, against a piece of another run
+as the reference and one of a third as the replicate: nothing is wrong with any of them, so that every word worse than
+"undecided" is a false alarm. At a significance of 5 % over all rows, Holm-corrected, at most one in twenty is due.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from surrogate.judge.read.ensemble import Ensemble
+from systems.units import format_time_ps, parse_time_ps
+
+_LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """What came of fair comparisons: how many ended in which word, and which rows were to blame how often.
+
+    `replicate_off`: in how many the replicate was said to differ from the reference, an alarm of the same kind.
+    """
+
+    n: int
+    piece_ps: float
+    status: dict[str, int]
+    rows: dict[str, int]
+    replicate_off: int
+
+    @property
+    def n_alarms(self) -> int:
+        return self.n - self.status.get("indistinguishable", 0) - self.status.get("undecided", 0)
+
+    def p_value(self) -> float:
+        """Return the probability of so many alarms or more when one in twenty is due (exact binomial test)."""
+        from scipy.stats import binomtest
+
+        return float(binomtest(self.n_alarms, self.n, _LEVEL, alternative="greater").pvalue)
+
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the share of alarms (Clopper and Pearson, Biometrika 26, 404, 1934)."""
+        from scipy.stats import binomtest
+
+        found = binomtest(self.n_alarms, self.n).proportion_ci(0.95, method="exact")
+        return float(found.low), float(found.high)
+
+
+def cut(runs: Sequence[Ensemble], piece_ps: float) -> list[tuple[int, Ensemble]]:
+    """Return the whole pieces of each run with the number of the run; pieces do not cross segments."""
+    out = []
+    for k, run in enumerate(runs):
+        n = round(piece_ps / run.lag_ps)
+        for s, segment in enumerate(run.segments):
+            for start in range(0, len(segment) - n + 1, n):
+                name = f"{run.label} {s} at {format_time_ps(start * run.lag_ps)}"
+                frames = segment[start : start + n]
+                piece = replace(
+                    run, label=name, segments=[frames], flags=None, chunk_idx=None, changed=None, sources=()
+                )
+                out.append((k, piece))
+    return out
+
+
+def fair_trios(pieces: Sequence[tuple[int, Ensemble]]) -> Iterator[tuple[Ensemble, Ensemble, Ensemble]]:
+    """Yield (reference, candidate, replicate): each piece once as candidate, the others as far round the list as a
+    third and two thirds of it, moved on until all three come from different runs."""
+    n = len(pieces)
+    for k, (run, piece) in enumerate(pieces):
+        others: list[tuple[int, Ensemble]] = []
+        for share in (n // 3, 2 * n // 3):
+            taken = {run, *(r for r, _ in others)}
+            ahead = (pieces[(k + share + i) % n] for i in range(n))
+            found = next((p for p in ahead if p[0] not in taken), None)
+            if found is not None:
+                others.append(found)
+        if len(others) == 2:
+            yield others[0][1], piece, others[1][1]
+
+
+def count_alarms(runs: Sequence[Ensemble], piece_ps: float, most: int | None = None) -> Alarms:
+    """Judge every piece as the module says and count. Raises InputError when fewer than three runs hold a piece."""
+    from surrogate.judge.comparison import compare
+    from surrogate.judge.rows.rows import Options
+    from systems.errors import InputError
+
+    status: Counter[str] = Counter()
+    rows: Counter[str] = Counter()
+    off = 0
+    for done, (reference, candidate, replicate) in enumerate(fair_trios(cut(runs, piece_ps))):
+        if most is not None and done >= most:
+            break
+        found = compare(reference, [candidate], replicate, options=Options(peptide_recipe=False)).judgements[0]
+        status[found.status] += 1
+        rows.update(r.key for r in found.rows if r.verdict in ("close", "differs", "fails"))
+        off += any(note.startswith("The replicate itself differs") for note in found.notes)
+    if not status:
+        raise InputError(f"Fewer than three runs hold a piece of {format_time_ps(piece_ps)}: nothing to compare.")
+    return Alarms(sum(status.values()), piece_ps, dict(status), dict(rows), off)
+
+
+def report(found: Alarms) -> str:
+    """Return the count in words."""
+    low, high = (100 * x for x in found.interval())
+    length = f" of {format_time_ps(found.piece_ps)}" if found.piece_ps else ""
+    lines = [
+        f"{found.n} fair comparisons{length}: {found.n_alarms} false alarms "
+        f"({100 * found.n_alarms / found.n:.1f} % [{low:.1f}, {high:.1f}]; 5 % are due, p {found.p_value():.2g})",
+        ", ".join(f"{n} {word}" for word, n in sorted(found.status.items())),
+        f"replicate said to differ: {found.replicate_off}",
+    ]
+    return "\n".join([*lines, *(f"  {n} x {key}" for key, n in sorted(found.rows.items(), key=lambda x: -x[1]))])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    from surrogate.judge.read.ensemble import load_ensemble
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="REF", help="three or more runs of one simulation")
+    parser.add_argument("--piece", default="20ns", help="length of each piece (default 20ns)")
+    parser.add_argument("--most", type=int, default=None, help="stop after so many comparisons")
+    parser.add_argument("--json", type=Path, default=None)
+    args = parser.parse_args(arguments)
+    first = load_ensemble([args.runs[0]])
+    runs = [first, *(load_ensemble([path], template=first.scene) for path in args.runs[1:])]
+    found = count_alarms(runs, parse_time_ps(args.piece), args.most)
+    sys.stdout.write(report(found) + "\n")
+    if args.json is not None:
+        record: dict[str, Any] = vars(found) | {"n_alarms": found.n_alarms, "p_value": found.p_value()}
+        args.json.write_text(json.dumps(record, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Make the data files of the library: `python docs/studies/preparation/make_library_data.py [NAME...]`.
+
+A file that is there stays as it is, because weights and trajectories know a scene by its atoms and their order.
+Molecules come from their SMILES through RDKit, peptides from their sequence; GAFF2 parameters of the molecules are made
+by AmberTools and written beside them.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+from systems.library.catalogue import ENTRIES, Entry
+from systems.scene import Scene
+
+
+def make(entry: Entry) -> list[Path]:
+    """Write the structure of one entry and, for a molecule, its parameters; return what is new."""
+    from md_reference.forces.small_molecules.gaff import write_shipped
+    from systems.library.named_scenes import load
+
+    written = []
+    path = Path(str(files("systems.library.named_scenes") / "data" / f"{entry.file or entry.name}.pdb"))
+    if not path.exists():
+        replace(_scene(entry), name=entry.name).write_pdb(path)
+        written.append(path)
+    if entry.smiles:
+        written.append(write_shipped(load(entry.name)))
+    return written
+
+
+def _scene(entry: Entry) -> Scene:
+    if entry.smiles:
+        from systems.prepare.molecule import scene_from_smiles
+
+        return scene_from_smiles(entry.smiles)
+    from systems.prepare.peptide import build_peptide
+
+    return build_peptide(entry.sequence)
+
+
+def main(chosen: list[str]) -> None:
+    """Make the files of the entries named, or of all."""
+    for entry in ENTRIES.values():
+        if (entry.smiles or entry.sequence) and (not chosen or entry.name in chosen):
+            for path in make(entry):
+                sys.stdout.write(f"{path}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

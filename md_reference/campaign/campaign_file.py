@@ -1,0 +1,298 @@
+"""The TOML file of a campaign: scenes x temperatures x replicas with the settings of a reference run, checked whole."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from glob import glob
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, cast, get_type_hints
+
+from md_reference.campaign.manifest import file_sha256
+from md_reference.campaign.run_options import Settings, read_settings, to_config
+from md_reference.run.config import MDConfig
+from md_reference.run.defaults import settle_by_name
+from systems.errors import InputError, SurromdError
+from systems.files.outside import content
+from systems.files.schema import built, fitted, parsed
+from systems.library.protocols import find_protocol
+from systems.units import parse_temperature_k, parse_wall_s
+
+T = TypeVar("T")
+_SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
+# Folder of the batch system's logs, inside the campaign's.
+JOB_LOGS = "jobs"
+_LONGEST_NAME, _MOST_RUNS = 40, 100_000
+_SEEDS = 2**31
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """One scene: its name in the campaign, what `prepare` is given, and the hash of the file that this names."""
+
+    name: str
+    source: str
+    source_sha256: str
+    preparation: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One replica of one scene at one temperature; `file` is relative to the campaign's folder."""
+
+    name: str
+    scene: str
+    replica: int
+    config: MDConfig
+    file: str
+
+
+@dataclass(frozen=True)
+class ClusterSpec:
+    """What is asked of a batch system, through dask-jobqueue: `jobs` jobs at most, each with `cores` runs at a time.
+
+    `interface`: the network interface on which scheduler and workers talk. `dashboard`: where Dask's status page is to
+    be shown (`127.0.0.1:8787`); whoever can reach it sees it. Without it there is none. Of the kinds, which are those
+    that dask-jobqueue knows, `local` starts the same jobs as processes here, to try a file out.
+    """
+
+    kind: Literal["slurm", "pbs", "sge", "lsf", "htcondor", "moab", "oar", "local"]
+    jobs: Annotated[int, range(1, 10_000)] = 1
+    cores: Annotated[int, range(1, 10_000)] = 1
+    memory: str = "2GB"
+    walltime: str = ""
+    queue: str = ""
+    account: str = ""
+    interface: str = ""
+    dashboard: str = ""
+    python: str = ""
+    directives: tuple[str, ...] = ()
+    prologue: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Everything a campaign's file says, with every run spelled out."""
+
+    name: str
+    folder: Path
+    seed: int
+    scenes: tuple[SceneSpec, ...]
+    runs: tuple[Run, ...]
+    retries: int = 2
+    checkpoint_every_s: float = 20.0
+    cluster: ClusterSpec | None = None
+    text: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True)
+class _Head:
+    """What a campaign's file says beside what its runs are like."""
+
+    scenes: tuple[str | dict[str, Any], ...]
+    name: str = ""
+    out: str = ""
+    format: Literal["h5", "dcd"] = "h5"
+    seed: Annotated[int, range(2**63)] = 0
+    retries: Annotated[int, range(1000)] = 2
+    checkpoint_every: str = "20s"
+    cluster: ClusterSpec | None = None
+
+
+@dataclass(frozen=True)
+class _SceneHead:
+    """What a scene's table says beside what its runs are like."""
+
+    scene: str
+    name: str = ""
+
+
+def read_campaign(path: str | Path, *, folder: str | Path | None = None) -> Campaign:
+    """Return the campaign that a TOML file describes; paths in it are relative to the file's folder.
+
+    `folder` replaces the file's own `out`. Raises InputError, in one line, for unknown keys (with the nearest known),
+    values of the wrong kind, scenes named twice, and settings that no run can have.
+    """
+    path = Path(path)
+    try:
+        text = content(path).decode()
+        table = parsed(text, tomllib.loads)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as TOML: {error}.") from error
+    try:
+        return _campaign(table, path, text, None if folder is None else Path(folder))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}.") from error
+    except InputError as error:
+        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+# What a table says of its runs beside their settings.
+_AXES = {
+    "replicas": Annotated[int, range(1, _MOST_RUNS + 1)],
+    "temperatures": tuple[float | str, ...],
+    "protocol": str,
+}
+
+
+def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None) -> Campaign:
+    if not table.get("scenes"):
+        raise InputError("name the scenes: scenes = ['alanine-dipeptide', ...], or a [[scenes]] table for each.")
+    head, shared = _read(_Head, table, "")
+    scenes: list[SceneSpec] = []
+    runs: list[Run] = []
+    for number, entry in enumerate(_scene_tables(head, path.parent)):
+        where = f"scenes[{number}] ({entry['scene']}): "
+        own_head, own = _read(_SceneHead, entry, where)
+        spec = _scene_spec(own_head, {**shared.preparation, **own.preparation}, path.parent, where)
+        # Some file systems take A and a for the same.
+        if spec.name.lower() in {other.name.lower() for other in scenes}:
+            raise InputError(f"two scenes are called {spec.name!r}; give one of them a name of its own (name = ...).")
+        scenes.append(spec)
+        try:
+            runs += _runs_of(spec, shared, own, head)
+        except SurromdError as error:
+            raise InputError(f"scene {spec.name!r}: {error}") from error
+    if len(runs) > _MOST_RUNS:
+        raise InputError(f"{len(runs)} runs are too many, {_MOST_RUNS} at most; write several campaigns.")
+    return Campaign(
+        name=head.name or path.stem,
+        folder=folder if folder is not None else path.parent / (head.out or path.stem),
+        seed=head.seed,
+        scenes=tuple(scenes),
+        runs=tuple(runs),
+        retries=head.retries,
+        checkpoint_every_s=parse_wall_s(head.checkpoint_every, "checkpoint_every"),
+        cluster=head.cluster,
+        text=text,
+    )
+
+
+def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings]:
+    """Return what a table says of itself and of its runs: axes, preparation and settings, unknown keys refused."""
+    from md_reference.forces.solvation import solvate
+    from systems.prepare.source import prepare
+
+    own = {f.name for f in fields(cast(Any, kind))}
+    settings = read_settings(
+        {key: value for key, value in table.items() if key not in own},
+        axes=_AXES,
+        # A campaign takes what the command line takes.
+        preparation=switches_of(prepare) | switches_of(solvate),
+        others=own,
+        where=where,
+    )
+    return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
+
+
+def switches_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of a function's parameters that have defaults, but its seed."""
+    parameters, hints = inspect.signature(function).parameters.values(), get_type_hints(function)
+    return {p.name: hints[p.name] for p in parameters if p.default is not p.empty and p.name != "seed"}
+
+
+def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:
+    """Return one table per scene; a pattern such as `pdb/*.pdb` stands for its files, in order of name."""
+    found: list[dict[str, Any]] = []
+    for number, listed in enumerate(head.scenes):
+        entry = {"scene": listed} if isinstance(listed, str) else listed
+        text = fitted(entry.get("scene"), str, f"scenes[{number}].scene").strip()
+        if "*" in text and not _kind(text):
+            paths = sorted(glob(text, root_dir=base, recursive=True))
+            if not paths:
+                raise InputError(f"scenes[{number}]: no file matches {text}.")
+            if "name" in entry:
+                raise InputError(f"scenes[{number}]: one name cannot serve the {len(paths)} files of {text}.")
+            found += [{**entry, "scene": path} for path in paths]
+        else:
+            found.append({**entry, "scene": text})
+    return found
+
+
+def _kind(text: str) -> str:
+    """`sequence` of `sequence:ACE-ALA-NME`, `smiles` of `smiles:CCO`, else nothing."""
+    kind, colon, _ = text.partition(":")
+    return kind if colon and kind.lower() in ("sequence", "smiles") else ""
+
+
+def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where: str) -> SceneSpec:
+    source, digest = head.scene, ""
+    if not _kind(source) and (Path(source).suffix.lower() in _SCENE_FILES or "/" in source):
+        path = (base / source).resolve()
+        if not path.is_file():
+            raise InputError(f"{where}no such file: {path}.")
+        source, digest = str(path), file_sha256(path)
+    elif not _kind(source):
+        from systems.library import named_scenes
+
+        named_scenes.describe(source)  # an unknown name is refused now, with the nearest
+    if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
+        raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
+    return SceneSpec(head.name or _name_of(source), source, digest, preparation)
+
+
+def _name_of(source: str) -> str:
+    """A name for files: a file's stem, a sequence, a SMILES with what files cannot have replaced, and then a hash."""
+    kind = _kind(source)
+    text = source.partition(":")[2] if kind else Path(source).name.removesuffix(".gz")
+    stem = text if kind or "." not in text else text.rsplit(".", 1)[0]
+    plain = re.sub(r"[^A-Za-z0-9._+-]+", "_", stem).strip("._-+")[:_LONGEST_NAME]
+    if plain == stem and kind.lower() != "smiles":
+        return plain
+    # SMILES differ in case and in signs that file names cannot have.
+    return f"{plain or kind or 'scene'}-{sha256(source.encode()).hexdigest()[:6]}"
+
+
+def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> list[Run]:
+    shared, protocol = _by_protocol(shared, own)
+    given = {**shared.values, **own.values}
+    values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given, protocol)
+    axes = {**shared.axes, **own.axes}
+    # A single temperature of the scene's own outweighs the campaign's list.
+    if "temperature_k" in own.values and "temperatures" not in own.axes:
+        axes.pop("temperatures", None)
+    elif "temperatures" in axes and "temperature_k" in (own if "temperatures" in own.axes else shared).values:
+        raise InputError("give temperature or temperatures, not both.")
+    replicas, temperatures = axes.get("replicas", 1), [values["temperature_k"]]
+    if "temperatures" in axes:
+        temperatures = [parse_temperature_k(str(entry), "temperatures") for entry in axes["temperatures"]]
+    if not 0 < replicas * len(temperatures) <= _MOST_RUNS:
+        raise InputError(f"{replicas} x {len(temperatures)} temperatures: from 1 to {_MOST_RUNS} runs are made.")
+    runs = []
+    for temperature_k in temperatures:
+        asked = {**values, "temperature_k": temperature_k}
+        base = to_config(asked, seed=0)
+        first = first_seed(head.seed, spec.name, base.temperature_k)
+        for replica in range(replicas):
+            label = f"{base.temperature_k:g}K"
+            name = f"{spec.name}_{label}_r{replica}"
+            config = to_config(asked, seed=(first + replica) % _SEEDS)
+            _ = config.n_frames, config.steps_per_frame  # intervals that do not divide are refused here
+            runs.append(Run(name, spec.name, replica, config, f"{spec.name}/{label}/{name}.{head.format}"))
+    if len({run.name for run in runs}) < len(runs):
+        raise InputError("a temperature is listed twice.")
+    return runs
+
+
+def _by_protocol(shared: Settings, own: Settings) -> tuple[Settings, str | None]:
+    """Return the protocol that a scene's runs go by, and the campaign's settings without what it outweighs: a protocol
+    of the scene's own outweighs what the campaign says, that of the campaign does not."""
+    if "protocol" not in own.axes:
+        return shared, shared.axes.get("protocol")
+    name = own.axes["protocol"]
+    decided = find_protocol(name).settings
+    values = {key: value for key, value in shared.values.items() if key not in decided}
+    left_out = ("protocol", "temperatures") if "temperature_k" in decided else ("protocol",)
+    return replace(shared, values=values, axes={k: v for k, v in shared.axes.items() if k not in left_out}), name
+
+
+def first_seed(seed: int, scene: str, temperature_k: float) -> int:
+    """Return the seed of replica 0; replica k adds k. It depends on what the run is, never on when it is started."""
+    digest = sha256(f"{seed}/{scene}/{temperature_k!r}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") % _SEEDS

@@ -1,0 +1,84 @@
+"""A scene of a campaign, prepared once and kept as JSON: what all its replicas start from, on whichever machine."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from md_reference.campaign.campaign_file import SceneSpec, switches_of
+from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.run.config import MDConfig
+from md_reference.run.platforms import PlatformChoice, measured_platform
+from systems.errors import InputError
+from systems.files.outside import content
+from systems.files.schema import built, parsed
+from systems.scene import Scene
+
+
+@dataclass(frozen=True)
+class PreparedScene:
+    """What replicas share: the scene, the force field settled for it, and the platform they run on."""
+
+    scene: Scene
+    force: ForceFieldSpec
+    platform: PlatformChoice
+
+    def account(self) -> dict[str, Any]:
+        """Return what the manifest says of it."""
+        return {
+            "n_atoms": self.scene.n_atoms,
+            "formula": self.scene.formula,
+            "topology_hash": self.scene.topology_hash,
+            "molecule_key": self.scene.molecule_key,
+            "platform": self.platform.name,
+            "force": asdict(self.force),
+            "repairs": list(self.scene.provenance.get("repairs", [])),
+        }
+
+
+def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> PreparedScene:
+    """Return the prepared scene, from `path` where it lies there already, else made and written to `path`.
+
+    Prepared, solvated where the solvent is made of molecules (`seed`), its forces built, so that parameters which take
+    long are in the cache, and its platform chosen. Raises what `prepare` and the force field refuse.
+    """
+    if path.is_file():
+        return load_prepared(path)
+    from md_reference.forces.solvation import require_molecules, solvate
+    from systems.files.whole_file import create_whole
+    from systems.prepare.source import prepare
+
+    switches = switches_of(prepare)
+    scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})
+    force = resolve(scene, config.force)
+    if spec.preparation.get("keep_water"):
+        require_molecules(force)
+    if force.is_explicit and scene.cell_nm is None:
+        of_water = {key: value for key, value in spec.preparation.items() if key not in switches}
+        scene = solvate(scene, force, seed=seed, **of_water)
+    system = build_system(scene, force)
+    platform = measured_platform(
+        scene,
+        force,
+        requested=config.platform,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
+        system=lambda: system,
+    )
+    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
+    record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    create_whole(path, json.dumps(record))
+    return prepared
+
+
+def load_prepared(path: Path) -> PreparedScene:
+    """Read what `prepare_once` wrote. Raises InputError when it cannot be read."""
+    try:
+        return built(PreparedScene, parsed(content(path)))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error

@@ -1,0 +1,237 @@
+"""Peptides, water and ions: Systems from OpenMM's residue templates."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from md_reference.forces import born
+from md_reference.forces.glycans import GLYCAM_FILE, covered_by_glycam, glycan_templates
+from md_reference.forces.mixture import is_water, molecules_of
+from md_reference.forces.regrouping import permuted, regroup
+from systems.errors import InputError, PreparationError
+from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from md_reference.forces.forcefield import ForceFieldSpec
+
+# OpenMM's own file names: the proteins, then water and ions for each explicit solvent.
+PROTEIN_FILES = {
+    "ff14SB": "amber14/protein.ff14SB.xml",
+    "ff19SB": "amber19/protein.ff19SB.xml",
+    "ff99SB-ILDN": "amber99sbildn.xml",
+    "charmm36": "charmm36.xml",
+}
+# ff14SB with what Amber pairs with it: DNA, RNA and phosphorylated residues
+# (docs/studies/reference/phosphorylated_residues.py).
+CHAIN_FILES = (
+    PROTEIN_FILES["ff14SB"],
+    str(files("systems.library.named_scenes") / "data" / "phosaa14SB.xml"),
+    "amber14/DNA.OL15.xml",
+    "amber14/RNA.OL3.xml",
+)
+_WATER_FILES = {
+    "tip3p": {"ff14SB": "amber14/tip3p.xml", "ff19SB": "amber19/tip3p.xml", "ff99SB-ILDN": "amber14/tip3p.xml",
+              "charmm36": "charmm36/water.xml"},
+    "opc": {"ff14SB": "amber14/opc.xml", "ff19SB": "amber19/opc.xml", "ff99SB-ILDN": "amber14/opc.xml"},
+}  # fmt: skip
+# (cut-off, start of the switching function or None), nm: Amber's and CHARMM's own practice.
+CUTOFFS_NM = {"charmm36": (1.2, 1.0)}
+DEFAULT_CUTOFF_NM: tuple[float, float | None] = (0.9, None)
+
+
+class Unmatched(Exception):
+    """No template of the force field has the bonds of this residue."""
+
+    def __init__(self, residue: str) -> None:
+        super().__init__(residue)
+        self.residue = residue
+
+
+def water_file(protein: str, solvent: str) -> str | None:
+    """Return OpenMM's file of this water (TIP3P where the solvent is implicit) and its ions, or None."""
+    return _WATER_FILES["opc" if solvent == "opc" else "tip3p"].get(protein)
+
+
+def chain_files(protein: str) -> tuple[str, ...]:
+    """Return the files of a protein force field: its own, and those of the other residues that it goes with."""
+    return CHAIN_FILES if protein == "ff14SB" else (PROTEIN_FILES[protein],)
+
+
+def cutoff_nm(protein: str) -> tuple[float, float | None]:
+    """Return the cut-off of direct interactions in a periodic cell and where it starts to act, in nm."""
+    return CUTOFFS_NM.get(protein, DEFAULT_CUTOFF_NM)
+
+
+def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
+    """Return the `openmm.System` of a scene that the templates of `spec.force_field` cover, implicit solvent included.
+
+    Where the scene's own division into residues is not known to the force field, the one found in the bond graph is
+    tried (`regrouping`). Particles are in the scene's order either way, virtual sites after all atoms.
+    Raises PreparationError when the force field has no parameters for a residue.
+    """
+    scene = _with_water_named(scene)
+    try:
+        return _build(scene, spec, native_gb)
+    except (Unmatched, InputError) as error:
+        if isinstance(error, PreparationError):
+            raise
+        regrouped, order = regroup(scene)
+    try:
+        return permuted(_build(regrouped, spec, native_gb), order)
+    except Unmatched as error:
+        raise PreparationError(
+            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, hydrogens as they are; "
+            "leave --force-field out, or give --force-field ff14SB+gaff2, for residues that it lacks."
+        ) from error
+
+
+def uncovered_residue(scene: Scene, protein: str) -> str | None:
+    """Return which residue the templates lack, in words, or None: the scene is covered, as it is or regrouped."""
+    force_field = force_field_of(chain_files(protein))
+    try:
+        found = unmatched_residues(scene, force_field)
+        if found and protein == "ff14SB":
+            found = sorted(set(found) - covered_by_glycam(scene))
+    except InputError:
+        found = [0]  # residues that are not contiguous
+    if found:
+        scene = regroup(scene)[0]
+        found = unmatched_residues(scene, force_field)
+    return _describe(scene, found[0]) if found else None
+
+
+@cache
+def force_field_of(names: tuple[str, ...]) -> Any:
+    """Return OpenMM's force field of these files, read once."""
+    from openmm import app
+
+    return app.ForceField(*names)
+
+
+def unmatched_residues(scene: Scene, force_field: Any) -> list[int]:
+    """Return the residues whose bonds fit no template. Raises InputError for residues that are not contiguous."""
+    return [r.index for r in force_field.getUnmatchedResidues(scene.to_openmm_topology())]
+
+
+def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
+    """Return the System of a scene whose residues the force field knows; raises Unmatched for one it does not."""
+    from openmm import app, unit
+
+    if spec.force_field == "charmm36":
+        scene = _with_caps_joined(scene)
+    topology = scene.to_openmm_topology()
+    wanted = [*chain_files(spec.force_field)]
+    needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene, m) for m in molecules_of(scene))
+    water = water_file(spec.force_field, spec.solvent) if needs_water else None
+    if water is not None:
+        wanted.append(water)
+    if spec.solvent == "amber99-obc":
+        wanted.append("amber99_obc.xml")
+    elif spec.solvent == "obc2" and not native_gb:
+        wanted.append("implicit/obc2.xml")
+    names = glycan_templates(scene) if spec.force_field == "ff14SB" else {}
+    if names:
+        wanted.insert(1, GLYCAM_FILE)
+        # GLYCAM has an acetyl, ACX, with the bonds of ACE.
+        names |= {r: "ACE" for r, name in enumerate(scene.residue_names) if name == "ACE"}
+    force_field = force_field_of(tuple(wanted))
+    settings: dict[str, Any] = {"nonbondedMethod": app.NoCutoff}
+    if spec.is_explicit:
+        far_nm, near_nm = cutoff_nm(spec.force_field)
+        topology.setPeriodicBoxVectors(scene.cell_nm * unit.nanometer)
+        settings = {"nonbondedMethod": app.PME, "nonbondedCutoff": far_nm * unit.nanometer}
+        if near_nm is not None:
+            settings["switchDistance"] = near_nm * unit.nanometer
+    real: list[int] = list(range(scene.n_atoms))
+    try:
+        if spec.solvent == "opc":
+            topology, real = _with_virtual_sites(topology, scene, force_field, names)
+        elif spec.force_field != "charmm36" and not names:
+            # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
+            for residue in force_field.getUnmatchedResidues(topology):
+                raise Unmatched(_describe(scene, residue.index))
+        system = force_field.createSystem(
+            topology,
+            residueTemplates=_chosen_templates(topology)
+            if spec.force_field == "charmm36"
+            else _by_residue(topology, names),
+            **settings,
+            constraints=app.HBonds if spec.constrain_hydrogens else None,
+            rigidWater=True,
+            removeCMMotion=False,
+            hydrogenMass=None if spec.hydrogen_mass_da is None else spec.hydrogen_mass_da * unit.dalton,
+        )
+    except Unmatched:
+        raise
+    except Exception as error:  # OpenMM raises KeyError, ValueError and bare Exception here
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        absent = re.match(r"No template found for residue (\d+)", reason)
+        if absent:
+            raise Unmatched(_describe(scene, int(absent[1]))) from error
+        raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
+    if spec.solvent == "obc2" and native_gb:
+        system.addForce(born.native_obc2(topology, system))
+    elif spec.solvent == "gbn2":
+        system.addForce(born.gbn2(scene, topology, system))
+    if len(real) != system.getNumParticles():
+        virtual = sorted(set(range(system.getNumParticles())) - set(real))
+        order = np.empty(system.getNumParticles(), dtype=np.int64)
+        order[[*real, *virtual]] = np.arange(len(order))
+        system = permuted(system, order)
+    return system
+
+
+def _by_residue(topology: Any, names: dict[int, str]) -> dict[Any, str]:
+    return {residue: names[residue.index] for residue in topology.residues() if residue.index in names}
+
+
+def _with_virtual_sites(topology: Any, scene: Scene, force_field: Any, names: dict[int, str]) -> tuple[Any, list[int]]:
+    """Return the topology with the force field's extra particles in place, and which of its particles are atoms."""
+    from openmm import app, unit
+
+    modeller = app.Modeller(topology, scene.positions_nm * unit.nanometer)
+    modeller.addExtraParticles(force_field, residueTemplates=_by_residue(topology, names))
+    return modeller.topology, [a.index for a in modeller.topology.atoms() if a.element is not None]
+
+
+def _with_water_named(scene: Scene) -> Scene:
+    """Return the scene with every water molecule called HOH, the name by which OpenMM knows what is rigid."""
+    water = {int(scene.residue_of_atom[m[0]]) for m in molecules_of(scene) if is_water(scene, m)}
+    names = tuple("HOH" if r in water else name for r, name in enumerate(scene.residue_names))
+    return scene if names == scene.residue_names else replace(scene, residue_names=names)
+
+
+def _with_caps_joined(scene: Scene) -> Scene:
+    """Return the scene with each cap in the residue it sits on: CHARMM's caps are patches of that residue."""
+    last = len(scene.residue_names) - 1
+    joined = {r: r + 1 for r, name in enumerate(scene.residue_names) if name == "ACE" and r < last}
+    joined |= {r: r - 1 for r, name in enumerate(scene.residue_names) if name in ("NME", "NH2") and r > 0}
+    if not joined:
+        return scene
+    kept = [r for r in range(last + 1) if r not in joined]
+    rank = {r: k for k, r in enumerate(kept)}
+    return replace(
+        scene,
+        residue_of_atom=np.array([rank[joined.get(r, r)] for r in scene.residue_of_atom.tolist()], dtype=np.int64),
+        residue_names=tuple(scene.residue_names[r] for r in kept),
+        residue_ids=tuple(scene.residue_ids[r] for r in kept),
+        chain_of_residue=tuple(scene.chain_of_residue[r] for r in kept),
+    )
+
+
+def _chosen_templates(topology: Any) -> dict[Any, str]:
+    """Capped alanine is in CHARMM's files twice; ALAD is the one with the protein's types."""
+    return {residue: "ALAD" for residue in topology.residues() if residue.name == "ALA" and len(residue) == 22}
+
+
+def _describe(scene: Scene, residue: int) -> str:
+    """`residue UNL 1 (C9 H8 O4)`, for messages."""
+    symbols = [e for e, r in zip(scene.elements, scene.residue_of_atom, strict=True) if r == residue]
+    formula = " ".join(f"{e}{symbols.count(e) if symbols.count(e) > 1 else ''}" for e in sorted(set(symbols)))
+    return f"residue {scene.residue_names[residue]} {scene.residue_ids[residue]} ({formula})"

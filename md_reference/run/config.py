@@ -1,0 +1,91 @@
+"""The settings of one reference run, as records and checkpoints keep them, and whether two runs have the same."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from md_reference.forces.forcefield import ForceFieldSpec, resolve
+from md_reference.run.integrators import check_ensemble
+from systems.errors import InputError
+from systems.files.outside import check_disk
+from systems.scene import Scene
+from systems.units import format_time_ps, whole_steps
+
+
+@dataclass(frozen=True)
+class MDConfig:
+    """One run. Times in ps, temperature in K, friction in 1/ps.
+
+    `ensemble`: 'nvt' (Langevin middle integrator, Zhang 2019), 'npt' (the same with a Monte Carlo barostat at
+    `pressure_bar`; scenes with a cell only), or 'nve' (velocity Verlet, started from an equilibration in NVT).
+    """
+
+    time_ps: float
+    save_every_ps: float = 1.0
+    temperature_k: float = 300.0
+    friction_per_ps: float = 1.0
+    timestep_ps: float = 0.004
+    equilibrate_ps: float = 100.0
+    seed: int = 0
+    platform: str = "auto"
+    force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
+    ensemble: str = "nvt"
+    pressure_bar: float = 1.0
+    save_velocities: bool = False
+    save_forces: bool = False
+
+    @property
+    def steps_per_frame(self) -> int:
+        return whole_steps(self.save_every_ps, self.timestep_ps, "save interval in time steps")
+
+    @property
+    def n_frames(self) -> int:
+        return whole_steps(self.time_ps, self.save_every_ps, "run length in save intervals")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """What is stored of each frame beside positions."""
+        wanted = {"velocities": self.save_velocities, "forces": self.save_forces}
+        return tuple(name for name, asked in wanted.items() if asked)
+
+
+def settings_of(config: MDConfig) -> dict[str, Any]:
+    """Return the settings of a run as one level of names and plain values."""
+    flat = asdict(config)
+    force = flat.pop("force")
+    return {**flat, **force}
+
+
+def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
+    """Raise InputError unless a record or a checkpoint states the settings of `config`.
+
+    A setting that an older version did not know counts as its default. A run may be resumed to become longer, never
+    shorter.
+    """
+    before = settings_of(MDConfig(time_ps=config.time_ps)) | old
+    for key, value in json.loads(json.dumps(settings_of(config))).items():
+        if key not in ("time_ps", *ignoring) and before.get(key) != value:
+            raise InputError(
+                f"{out} was started with {key} = {before.get(key)!r}, not {value!r}; resume with the same settings "
+                "or write to another file."
+            )
+    if config.time_ps < before["time_ps"]:
+        raise InputError(
+            f"{out} was started for {format_time_ps(before['time_ps'])} and cannot become shorter; resume with as much "
+            "or more, or write to another file."
+        )
+
+
+def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
+    """Return the settings with force field and ensemble settled for this scene, before anything is computed.
+
+    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
+    """
+    _ = config.steps_per_frame
+    check_disk(out, config.n_frames, scene.n_atoms)
+    if config.columns and out.suffix.lower() == ".dcd":
+        raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
+    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))

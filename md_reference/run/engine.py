@@ -1,0 +1,289 @@
+"""An OpenMM Context behind six verbs: energy, forces, minimise, step, state, close."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
+from md_reference.run.platforms import choose_platform
+from systems.errors import SimulationError
+from systems.scene import FloatArray, Scene
+
+GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
+# Minus the logarithm of how often chance may be taken for a blow-up.
+_UNLIKELINESS = 50.0
+_VELOCITY_TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class State:
+    """Positions `(n_atoms, 3)` nm, energies in kJ/mol, time in ps, kinetic temperature in K.
+
+    Where asked for: velocities `(n_atoms, 3)` nm/ps and forces `(n_atoms, 3)` kJ/mol/nm, without those of constraints.
+    Box vectors `(3, 3)` nm in a periodic system.
+    """
+
+    positions_nm: FloatArray
+    potential_kj_mol: float
+    kinetic_kj_mol: float
+    time_ps: float
+    temperature_k: float
+    velocities_nm_ps: FloatArray | None = None
+    forces_kj_mol_nm: FloatArray | None = None
+    cell_nm: FloatArray | None = None
+
+
+def platform_properties(name: str, threads: int) -> dict[str, str]:
+    """Return the properties of a Context. More threads than one add up forces in a fixed order, so that runs repeat."""
+    if name != "CPU":
+        return {}
+    return {"Threads": str(threads)} | ({"DeterministicForces": "true"} if threads > 1 else {})
+
+
+def one_line(error: Exception) -> str:
+    """OpenMM's own words, without its advice and its address."""
+    return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
+
+
+class Engine:
+    """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
+
+    `system`: what `build_system` returned for this scene and spec, where it is there already; a barostat is added to
+    it. Virtual sites are placed here and appear nowhere else. Raises what `build_system` and `check_ensemble` raise,
+    and SimulationError when the platform cannot run the scene.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        spec: ForceFieldSpec,
+        *,
+        temperature_k: float = 300.0,
+        friction_per_ps: float = 1.0,
+        timestep_ps: float = 0.004,
+        seed: int = 0,
+        platform: str = "auto",
+        threads: int | None = None,
+        native_gb: bool = True,
+        ensemble: str = "nvt",
+        pressure_bar: float = 1.0,
+        system: Any = None,
+    ) -> None:
+        import openmm
+
+        self.ensemble = check_ensemble(ensemble, scene)
+        self.scene = scene
+        self.spec = spec
+        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
+        self.platform_name, self.threads = choice.name, threads or choice.threads
+        self._system = build_system(scene, spec, native_gb=native_gb) if system is None else system
+        # OpenMM reads a seed of 0 as "choose one from the clock".
+        self._seed = seed % (2**31 - 1) + 1
+        self._temperature_k = temperature_k
+        if self.ensemble == "npt":
+            add_barostat(self._system, pressure_bar=pressure_bar, temperature_k=temperature_k, seed=self._seed)
+        self._integrator = make_integrator(
+            scene,
+            self._system,
+            self.ensemble,
+            temperature_k=temperature_k,
+            friction_per_ps=friction_per_ps,
+            timestep_ps=timestep_ps,
+        )
+        self._integrator.setRandomNumberSeed(self._seed)
+        properties = platform_properties(self.platform_name, self.threads)
+        try:
+            self._context: Any = openmm.Context(
+                self._system, self._integrator, openmm.Platform.getPlatform(self.platform_name), properties
+            )
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"platform {choice.name} cannot run {scene.name!r}: {one_line(error)}") from error
+        masses = [self._system.getParticleMass(k)._value for k in range(self._system.getNumParticles())]
+        self._masses_da = np.array(masses, dtype=np.float64)
+        self.set_positions(scene.positions_nm)
+        self._n_dof = 3 * int(np.count_nonzero(self._masses_da)) - self.n_constraints
+        if self._keeps_momentum:
+            self._n_dof -= 3
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def n_constraints(self) -> int:
+        return int(self._system.getNumConstraints())
+
+    @property
+    def n_dof(self) -> int:
+        """Degrees of freedom that hold kinetic energy; without a bath those of the centre of mass are at rest."""
+        return self._n_dof
+
+    @property
+    def _keeps_momentum(self) -> bool:
+        return self.ensemble == "nve" and self.scene.interactions is None
+
+    @property
+    def _n_virtual(self) -> int:
+        return len(self._masses_da) - self.scene.n_atoms
+
+    def _with_virtual(self, values: npt.ArrayLike) -> FloatArray:
+        """Append a row of zeros for each virtual site to per-atom vectors."""
+        given = np.asarray(values, dtype=np.float64)
+        return np.concatenate([given, np.zeros((self._n_virtual, 3))]) if self._n_virtual else given
+
+    def set_positions(self, positions_nm: npt.ArrayLike) -> None:
+        """Place the atoms, `(n_atoms, 3)` nm."""
+        self._context.setPositions(self._with_virtual(positions_nm))
+        if self._n_virtual:
+            self._context.computeVirtualSites()
+
+    def set_velocities(self, velocities_nm_ps: npt.ArrayLike) -> None:
+        """Set velocities `(n_atoms, 3)` nm/ps. In NVE the centre of mass is put at rest, where it then stays."""
+        velocities = self._with_virtual(velocities_nm_ps)
+        if self._keeps_momentum:
+            drift = self._masses_da @ velocities / self._masses_da.sum()
+            velocities = velocities - drift * (self._masses_da > 0)[:, None]
+        self._context.setVelocities(velocities)
+
+    def take_over(self, state: State) -> None:
+        """Go on from where another engine of this scene was, clock apart: cell, positions and velocities."""
+        if state.cell_nm is not None:
+            self.set_cell(state.cell_nm)
+        self.set_positions(state.positions_nm)
+        if state.velocities_nm_ps is not None:
+            self.set_velocities(state.velocities_nm_ps)
+
+    def set_cell(self, cell_nm: npt.ArrayLike) -> None:
+        """Set the box vectors `(3, 3)` nm of a periodic system; before the positions."""
+        self._context.setPeriodicBoxVectors(*np.asarray(cell_nm, dtype=np.float64).tolist())
+
+    def energy(self, positions_nm: npt.ArrayLike | None = None) -> float:
+        """Return the potential energy in kJ/mol, here or at given positions `(n_atoms, 3)` nm."""
+        if positions_nm is not None:
+            self.set_positions(positions_nm)
+        return float(self._query(energy=True).getPotentialEnergy()._value)
+
+    def forces(self, positions_nm: npt.ArrayLike | None = None) -> FloatArray:
+        """Return the forces `(n_atoms, 3)` in kJ/mol/nm."""
+        if positions_nm is not None:
+            self.set_positions(positions_nm)
+        return self._of_atoms(self._query(forces=True).getForces(asNumpy=True))
+
+    def minimise(self, *, max_iterations: int = 0) -> float:
+        """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
+
+        Raises SimulationError when the energy is not finite, as with atoms on top of each other.
+        """
+        import openmm
+
+        # Without this the minimiser may search for ever.
+        if not math.isfinite(self.energy()):
+            raise SimulationError("the energy of the starting positions is not finite; atoms lie on top of each other")
+        try:
+            openmm.LocalEnergyMinimizer.minimize(self._context, maxIterations=max_iterations)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"minimisation failed: {one_line(error)}") from error
+        energy = self.energy()
+        if not math.isfinite(energy):
+            raise SimulationError("minimisation failed: the energy is no longer finite")
+        return energy
+
+    def thermalise(self) -> None:
+        """Draw velocities from the Maxwell-Boltzmann distribution at the bath's temperature."""
+        self._context.setVelocitiesToTemperature(self._temperature_k, self._seed)
+        if self._keeps_momentum:
+            self.set_velocities(self._of_atoms(self._query(velocities=True).getVelocities(asNumpy=True)))
+
+    def reset_clock(self) -> None:
+        self._context.setTime(0.0)
+        self._context.setStepCount(0)
+
+    def step(self, n_steps: int) -> None:
+        """Integrate. Raises SimulationError when OpenMM itself notices that coordinates are no longer finite."""
+        import openmm
+
+        try:
+            self._integrator.step(n_steps)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"integration failed: {one_line(error)}") from error
+
+    def positions(self) -> FloatArray:
+        """Return positions `(n_atoms, 3)` nm without computing any energy."""
+        return self._of_atoms(self._query(positions=True).getPositions(asNumpy=True))
+
+    def _of_atoms(self, values: Any) -> FloatArray:
+        """Return OpenMM's per-particle vectors without those of virtual sites."""
+        return np.asarray(values._value, dtype=np.float64)[: self.scene.n_atoms]
+
+    def state(self, *, velocities: bool = False, forces: bool = False) -> State:
+        """Return positions, energies, time and kinetic temperature, and what else is asked for.
+
+        With a bath, velocities are those of half steps (Zhang et al., J. Phys. Chem. A 123, 6056 (2019)), and so is the
+        temperature; without one they belong to the time of the positions.
+
+        The Langevin middle integrator leaves in its velocities half of each step's noise along the constrained bonds,
+        and projects it out after the next kick. Seen as temperature it would be n_constraints / (4 n_dof) of
+        1 - exp(-2 friction timestep) too much: 5 K of 300 at 91/ps and 2 fs. It is projected out here, which changes
+        no trajectory but in its rounding.
+
+        Raises SimulationError for a state that is not finite, or hotter than the bath can make it: 1 + 2 sqrt(x/n) +
+        2 x/n times, n degrees of freedom, x = 50, which chance exceeds in one frame of 10^21 (Laurent and Massart,
+        Ann. Statist. 28, 1302 (2000), lemma 1). A model system without a bath may be as hot as it likes.
+        """
+        if self.n_constraints and self.ensemble != "nve":
+            self._context.applyVelocityConstraints(_VELOCITY_TOLERANCE)
+        raw = self._query(positions=True, energy=True, velocities=velocities, forces=forces)
+        kinetic = float(raw.getKineticEnergy()._value)
+        periodic = self.scene.cell_nm is not None
+        state = State(
+            positions_nm=self._of_atoms(raw.getPositions(asNumpy=True)),
+            potential_kj_mol=float(raw.getPotentialEnergy()._value),
+            kinetic_kj_mol=kinetic,
+            time_ps=float(raw.getTime()._value),
+            temperature_k=2.0 * kinetic / (max(self._n_dof, 1) * GAS_CONSTANT_KJ_MOL_K),
+            velocities_nm_ps=self._of_atoms(raw.getVelocities(asNumpy=True)) if velocities else None,
+            forces_kj_mol_nm=self._of_atoms(raw.getForces(asNumpy=True)) if forces else None,
+            cell_nm=np.asarray(raw.getPeriodicBoxVectors(asNumpy=True)._value) if periodic else None,
+        )
+        if not (np.isfinite(state.positions_nm).all() and math.isfinite(state.potential_kj_mol)):
+            raise SimulationError("coordinates or energy are no longer finite")
+        if self.ensemble == "nve" and self.scene.interactions is not None:
+            return state
+        x = _UNLIKELINESS / self._n_dof
+        if not state.temperature_k <= self._temperature_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x):
+            raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
+        return state
+
+    def _query(self, **what: bool) -> Any:
+        """Return OpenMM's State; some platforms notice here that coordinates are no longer finite."""
+        import openmm
+
+        try:
+            return self._context.getState(**what)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"evaluation failed: {one_line(error)}") from error
+
+    def checkpoint(self) -> bytes:
+        """Return OpenMM's binary checkpoint: positions, velocities, time, random states. Same platform only."""
+        return bytes(self._context.createCheckpoint())
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a checkpoint. Raises SimulationError when it was made by another platform or system."""
+        import openmm
+
+        try:
+            self._context.loadCheckpoint(blob)
+        except openmm.OpenMMException as error:
+            raise SimulationError(f"checkpoint does not fit this run: {one_line(error)}") from error
+
+    def close(self) -> None:
+        """Free the Context. The engine cannot be used afterwards."""
+        self._context = None

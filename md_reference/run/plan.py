@@ -1,0 +1,356 @@
+"""What a reference run of a scene will compute, what it leaves out, why, and what that saves on this machine."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.mixture import molecules_of
+from md_reference.forces.nonstandard import lacking_residues
+from md_reference.run.config import MDConfig
+from md_reference.run.engine import Engine
+from md_reference.run.integrators import check_ensemble, integrator_name
+from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform
+from md_reference.run.replicas import available_cores
+from md_reference.run.timing import as_records
+from systems.scene import FloatArray, Scene
+from systems.selection import part_of
+from systems.units import format_time_ps, format_wall
+
+# Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.
+_LONGEST_NATURAL_STEP_PS = 0.0025
+_STEPS_AT_ONCE = 50
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Something a general MD program would do and this run does not: why that is exact, and what it saves."""
+
+    what: str
+    why: str
+    saves: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run before it starts. `terms` counts the interactions of each force; what was not measured is None.
+
+    `wall_s`: seconds for all replicas of the asked length, equilibration included, if the cores are free. `line` says
+    it all in one; `timings` is the table the platform was chosen by.
+    """
+
+    line: str
+
+    scene: str
+    formula: str
+    n_atoms: int
+    force_field: str
+    solvent: str
+    integrator: str
+    platform: str
+    platform_reason: str
+    timings: tuple[dict[str, Any], ...]
+    threads: int
+    parallel: str
+    hydrogen_mass: str
+    constraints: str
+    terms: dict[str, int]
+    us_per_step: float | None
+    ns_per_day: float | None
+    length: str | None
+    wall_s: float | None
+    skipped: tuple[Skip, ...]
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return asdict(self)
+
+
+def make_plan(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    *,
+    temperature_k: float = 300.0,
+    friction_per_ps: float = 1.0,
+    timestep_ps: float = 0.004,
+    platform: str = "auto",
+    replicas: int = 1,
+    time_ps: float | None = None,
+    equilibrate_ps: float = 100.0,
+    ensemble: str = "nvt",
+    pressure_bar: float = 1.0,
+    save_velocities: bool = False,
+    measure_s: float = 0.3,
+) -> Plan:
+    """Return the plan of a run with these settings (units as in `simulate.MDConfig`).
+
+    The platform is the one that `reference` would measure. For `measure_s` of wall time each, steps are timed as
+    planned and as OpenMM would do it unasked; 0 times nothing, and the size of the scene decides.
+    Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
+    """
+    ensemble = check_ensemble(ensemble, scene)
+    spec = resolve(scene, spec)
+    system = build_system(scene, spec)
+    n_constraints = int(system.getNumConstraints())
+    cores = available_cores()
+    side_by_side = min(replicas, cores)
+    if measure_s > 0:
+        choice = measured_platform(
+            scene,
+            spec,
+            requested=platform,
+            temperature_k=temperature_k,
+            friction_per_ps=friction_per_ps,
+            timestep_ps=timestep_ps,
+            max_threads=max(1, cores // side_by_side),
+            side_by_side=side_by_side,
+            system=lambda: system,
+        )
+    else:
+        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
+    planned = default = None
+    if measure_s > 0:
+        bath = (temperature_k, friction_per_ps, timestep_ps)
+        planned, relaxed_nm = _time_step_s(scene, spec, bath, measure_s, choice)
+        if spec.force_field not in ("gfn2-xtb", "model"):
+            alone = PlatformChoice("CPU", 1, "OpenMM's own")
+            default, _ = _time_step_s(scene, spec, bath, measure_s, alone, relaxed_nm=relaxed_nm)
+    wall_s = None
+    if planned is not None and time_ps is not None:
+        wall_s = math.ceil(replicas / cores) * (time_ps + equilibrate_ps) / timestep_ps * planned
+    integrator = _integrator(scene, ensemble, timestep_ps, temperature_k, friction_per_ps, pressure_bar)
+    return Plan(
+        line=plan_line(
+            scene, spec, choice, integrator=integrator, timestep_ps=timestep_ps, step_s=planned, wall_s=wall_s
+        ),
+        scene=scene.name,
+        formula=scene.formula,
+        n_atoms=scene.n_atoms,
+        force_field=spec.force_field,
+        solvent=spec.solvent,
+        integrator=integrator,
+        platform=choice.name,
+        platform_reason=choice.reason,
+        timings=tuple(as_records(list(choice.timings))),
+        threads=choice.threads,
+        parallel=_parallel(replicas, cores, choice.threads),
+        hydrogen_mass="natural"
+        if spec.hydrogen_mass_da is None
+        else f"{spec.hydrogen_mass_da:g} Da, taken from the atom it is bonded to",
+        constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
+        terms=_terms(system),
+        us_per_step=None if planned is None else planned * 1e6,
+        ns_per_day=None if planned is None else timestep_ps * 1e-3 * 86_400.0 / planned,
+        length=None if time_ps is None else format_time_ps(time_ps),
+        wall_s=wall_s,
+        skipped=_skips(scene, spec, ensemble, n_constraints, planned, default, save_velocities=save_velocities),
+        warnings=(*spec.warnings, *_warnings(scene, spec, timestep_ps)),
+    )
+
+
+def _time_step_s(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    bath: tuple[float, float, float],
+    wall_s: float,
+    choice: PlatformChoice,
+    *,
+    relaxed_nm: FloatArray | None = None,
+) -> tuple[float, FloatArray]:
+    """Return the seconds of one step, the fastest of all batches measured for `wall_s`, and the positions before them.
+
+    On one core it is processor time, which other work on the machine does not lengthen; `bath`: temperature in K,
+    friction in 1/ps, time step in ps. With `relaxed_nm` OpenMM's own way to the same forces is timed from there: to
+    minimise by it would take minutes from a thousand atoms on.
+    """
+    temperature_k, friction_per_ps, timestep_ps = bath
+    with Engine(
+        scene,
+        spec,
+        temperature_k=temperature_k,
+        friction_per_ps=friction_per_ps,
+        timestep_ps=timestep_ps,
+        platform=choice.name,
+        threads=choice.threads,
+        native_gb=relaxed_nm is None,
+    ) as engine:
+        if relaxed_nm is None:
+            engine.minimise(max_iterations=100)
+            relaxed_nm = engine.state().positions_nm
+        else:
+            engine.set_positions(relaxed_nm)
+        engine.thermalise()
+        began = time.perf_counter()
+        engine.step(1)
+        at_once = max(1, min(_STEPS_AT_ONCE, round(0.25 * wall_s / max(time.perf_counter() - began, 1e-9))))
+        engine.step(at_once)
+        on_one_core = engine.platform_name in ("Reference", "CPU") and engine.threads == 1
+        clock = time.process_time if on_one_core else time.perf_counter
+        fastest = math.inf
+        began = time.perf_counter()
+        while math.isinf(fastest) or time.perf_counter() - began < wall_s:
+            start = clock()
+            engine.step(at_once)
+            fastest = min(fastest, (clock() - start) / at_once)
+        return fastest, relaxed_nm
+
+
+def _integrator(
+    scene: Scene, ensemble: str, timestep_ps: float, temperature_k: float, friction_per_ps: float, pressure_bar: float
+) -> str:
+    step = f"{timestep_ps * 1000:g} fs"
+    if ensemble == "nve":
+        name = {"VelocityVerlet": "velocity Verlet", "SymplecticEuler": "symplectic Euler"}[
+            integrator_name(ensemble, scene)
+        ]
+        own = scene.velocities_nm_ps is not None
+        return f"{name}, {step}, no bath (started {'as the scene says' if own else f'at {temperature_k:g} K'})"
+    text = f"Langevin middle, {step}, {temperature_k:g} K, {friction_per_ps:g}/ps"
+    return text + (f"; Monte Carlo barostat at {pressure_bar:g} bar" if ensemble == "npt" else "")
+
+
+def plan_line(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    choice: PlatformChoice,
+    *,
+    integrator: str,
+    timestep_ps: float,
+    step_s: float | None = None,
+    wall_s: float | None = None,
+) -> str:
+    """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known."""
+    periodic = scene.cell_nm is not None
+    threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
+    law = spec.force_field if scene.interactions is None else str(scene.interactions.get("kind"))
+    born = " (native GBSAOBCForce)" if spec.solvent == "obc2" else ""
+    rigid = spec.constrain_hydrogens and "H" in scene.elements
+    parts = [
+        f"{scene.n_atoms} atoms, {law} in {spec.solvent}{born}",
+        f"{choice.name} on {threads} ({choice.reason})",
+        integrator,
+        "bonds to hydrogen rigid" if rigid else "no constraints",
+        "PME in a cell" if periodic else "all pairs; no cut-off, cell, PME or barostat without a cell",
+    ]
+    if step_s is not None:
+        parts.append(f"about {timestep_ps * 1e-3 * 86_400.0 / step_s:.3g} ns/day")
+    if wall_s is not None:
+        parts.append(f"about {format_wall(wall_s)}")
+    return "; ".join(parts)
+
+
+def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:
+    """Return the line of a run whose platform has been chosen, by the timing that chose it."""
+    spec, ensemble = resolve(scene, config.force), check_ensemble(config.ensemble, scene)
+    timed = next(
+        (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads)), None
+    )
+    step_s = None if timed is None else timed * 1e-6
+    rounds = math.ceil(replicas / available_cores())
+    n_steps = (config.time_ps + config.equilibrate_ps) / config.timestep_ps
+    return plan_line(
+        scene,
+        spec,
+        choice,
+        integrator=_integrator(
+            scene, ensemble, config.timestep_ps, config.temperature_k, config.friction_per_ps, config.pressure_bar
+        ),
+        timestep_ps=config.timestep_ps,
+        step_s=step_s,
+        wall_s=None if step_s is None else rounds * n_steps * step_s,
+    )
+
+
+def _parallel(replicas: int, cores: int, threads: int) -> str:
+    each = "one thread" if threads == 1 else f"{threads} threads"
+    if replicas == 1:
+        return f"one replica, {each}"
+    side_by_side = min(replicas, cores)
+    return f"{replicas} replicas, {side_by_side} side by side, one process and {each} each"
+
+
+def _terms(system: Any) -> dict[str, int]:
+    counters = {
+        "HarmonicBondForce": "getNumBonds",
+        "HarmonicAngleForce": "getNumAngles",
+        "PeriodicTorsionForce": "getNumTorsions",
+        "CMAPTorsionForce": "getNumTorsions",
+        "NonbondedForce": "getNumParticles",
+        "GBSAOBCForce": "getNumParticles",
+    }
+    found = {}
+    for force in system.getForces():
+        name = force.getName()
+        found[name] = int(getattr(force, counters[name])()) if name in counters else 1
+    return found
+
+
+def _skips(
+    scene: Scene,
+    spec: ForceFieldSpec,
+    ensemble: str,
+    n_constraints: int,
+    planned: float | None,
+    default: float | None,
+    *,
+    save_velocities: bool,
+) -> tuple[Skip, ...]:
+    skips = []
+    if scene.cell_nm is None:
+        skips.append(
+            Skip("periodic box, PME, neighbour lists", "the scene has no periodic cell; all pairs are computed exactly")
+        )
+        skips.append(Skip("barostat", "there is no volume to control"))
+    elif ensemble != "npt":
+        skips.append(Skip("barostat", f"the ensemble is {ensemble}; npt has one"))
+    if ensemble == "nve":
+        skips.append(Skip("thermostat", "the ensemble is nve"))
+        own = scene.interactions is not None
+        why = "it is part of the model system" if own else "it is put at rest once and stays there"
+        skips.append(Skip("removal of centre-of-mass motion", why))
+    else:
+        skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
+    if not save_velocities:
+        skips.append(Skip("velocities on disk", "nobody asked for them (--save-velocities)", "half of the file"))
+    skips.append(Skip("energies and copies between saved frames", "nobody keeps them"))
+    if spec.solvent == "vacuum":
+        skips.append(Skip("generalised Born term", "the solvent is vacuum"))
+    elif spec.solvent == "obc2":
+        skips.append(
+            Skip("CustomGBForce of implicit/obc2.xml", "the native GBSAOBCForce has the same energies and forces")
+        )
+    if n_constraints == 0:
+        why = "there is no hydrogen" if "H" not in scene.elements else "bonds to hydrogen move freely here"
+        skips.append(Skip("constraints", why))
+    if planned is not None and default is not None:
+        skips.append(
+            Skip(
+                "OpenMM's own choice of platform and forces (CPU)",
+                "timed here, on one thread",
+                f"{default * 1e6:.0f} -> {planned * 1e6:.0f} µs a step, {default / planned:.1f} times faster",
+            )
+        )
+    return tuple(skips)
+
+
+def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[str, ...]:
+    found = []
+    if spec.force_field.endswith("+gaff2"):
+        lacking = [name for m in molecules_of(scene) for name in lacking_residues(part_of(scene, m))]
+        if lacking:
+            found.append(
+                f"{', '.join(lacking)}: not in {spec.protein}; side chains by GAFF2, charges by AM1-BCC of the residue "
+                "with its neighbours' ends."
+            )
+    natural = spec.hydrogen_mass_da is None or spec.hydrogen_mass_da < 1.5
+    if timestep_ps > _LONGEST_NATURAL_STEP_PS and natural and "H" in scene.elements:
+        found.append(
+            f"{timestep_ps * 1000:g} fs is long for hydrogens of natural mass; use --hydrogen-mass 3Da or 2fs."
+        )
+    if timestep_ps > 0.001 and not spec.constrain_hydrogens and "H" in scene.elements:
+        found.append(f"{timestep_ps * 1000:g} fs is long for unconstrained bonds to hydrogen; use at most 1fs.")
+    return tuple(found)

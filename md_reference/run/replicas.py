@@ -1,0 +1,179 @@
+"""Several independent replicas of one run, one process and one thread each."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from md_reference.forces.forcefield import resolve
+from md_reference.run.config import MDConfig, check_run
+from md_reference.run.parent_watch import end_with_parent
+from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.simulate import PreparingFn, checkpoint_path, simulate
+from systems.errors import InputError, SimulationError, SurromdError
+from systems.interrupts import deferred_interrupt
+from systems.scene import Scene
+
+_MOST_REPLICAS = 10_000
+# (frames done over all replicas, frames in all) -> None
+ProgressFn = Callable[[int, int], None]
+
+
+def replica_paths(out: Path, n_replicas: int) -> list[Path]:
+    """Return `out` itself for one replica, else NAME_r0.h5, NAME_r1.h5, ... Raises InputError for too many."""
+    if n_replicas == 1:
+        return [out]
+    if n_replicas > _MOST_REPLICAS:
+        raise InputError(f"{n_replicas:.4g} replicas are too many, {_MOST_REPLICAS} at most; use a campaign for more.")
+    return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
+
+
+def available_cores() -> int:
+    """Cores this process may use (affinity respected where the system tells)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def simulate_replicas(
+    scene: Scene,
+    config: MDConfig,
+    outs: Sequence[Path],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: ProgressFn | None = None,
+    preparing: PreparingFn | None = None,
+    announce: Callable[[str], None] | None = None,
+    workers: int | None = None,
+) -> list[Path]:
+    """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
+
+    Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
+    small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in
+    one line; `preparing` the share of the equilibration that is done, until there are frames to count. Ctrl-C and
+    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
+    themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
+    stay on disk.
+    """
+    for out in outs:
+        check_run(scene, config, out)
+    configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
+    width = workers or min(len(outs), available_cores())
+    # What goes on keeps its platform.
+    fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
+    choice = None
+    if fresh:
+        choice = measured_platform(
+            scene,
+            resolve(scene, config.force),
+            requested=config.platform,
+            temperature_k=config.temperature_k,
+            friction_per_ps=config.friction_per_ps,
+            timestep_ps=config.timestep_ps,
+            max_threads=max(1, available_cores() // width),
+            side_by_side=width,
+        )
+        if announce is not None:
+            from md_reference.run.plan import line_of_run
+
+            announce(line_of_run(scene, config, choice, replicas=len(outs)))
+    if len(outs) == 1:
+        how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
+        return [simulate(scene, configs[0], outs[0], progress=progress, preparing=preparing, **how)]
+    context = multiprocessing.get_context("spawn")
+    # Without a lock, which a killed process would never give back: each number has one writer.
+    done = context.Array("Q", len(outs), lock=False)
+    equilibrated = context.Array("d", len(outs), lock=False)
+    errors = context.Queue()
+    waiting = list(range(len(outs)))
+    running: dict[int, Any] = {}
+    failures: dict[int, str] = {}
+    reasons: dict[int, str] = {}
+    with deferred_interrupt() as asked_to_stop:
+        try:
+            while waiting or running:
+                while waiting and len(running) < width:
+                    k = waiting.pop(0)
+                    args = (
+                        scene.to_dict(),
+                        configs[k],
+                        str(outs[k]),
+                        resume,
+                        overwrite,
+                        choice,
+                        done,
+                        equilibrated,
+                        k,
+                        errors,
+                    )
+                    running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
+                    running[k].start()
+                time.sleep(0.1)
+                if asked_to_stop():
+                    raise KeyboardInterrupt
+                n_done = int(sum(done[:]))
+                if n_done == 0 and preparing is not None:
+                    preparing(sum(equilibrated[:]) / len(outs))
+                elif progress is not None:
+                    progress(n_done, config.n_frames * len(outs))
+                for k in [k for k, process in running.items() if not process.is_alive()]:
+                    process = running.pop(k)
+                    process.join()
+                    if process.exitcode != 0:
+                        _collect(errors, reasons, k)
+                        failures[k] = reasons.get(k, f"exit code {process.exitcode}")
+        finally:
+            for process in running.values():
+                process.terminate()
+            for process in running.values():
+                process.join()
+    if failures:
+        k = min(failures)
+        raise SimulationError(f"{len(failures)} of {len(outs)} replicas failed; replica {k}: {failures[k]}")
+    return list(outs)
+
+
+def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
+    """Read what replicas said when they failed, until `wanted` is among them; a killed one says nothing."""
+    try:
+        while wanted not in reasons:
+            k, reason = errors.get(timeout=1)
+            reasons[k] = reason
+    except queue.Empty:
+        pass
+
+
+def _replica(
+    scene: dict[str, Any],
+    config: MDConfig,
+    out: str,
+    resume: bool,
+    overwrite: bool,
+    choice: PlatformChoice | None,
+    done: Any,
+    equilibrated: Any,
+    k: int,
+    errors: Any,
+) -> None:
+    end_with_parent()
+    os.environ["OPENMM_CPU_THREADS"] = "1"
+
+    def report(frames: int, _: int) -> None:
+        done[k] = frames
+
+    def prepare(share: float) -> None:
+        equilibrated[k] = share
+
+    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
+    try:
+        simulate(Scene.from_dict(scene), config, out, progress=report, preparing=prepare, **how)
+    except SurromdError as error:
+        errors.put((k, str(error)))
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None

@@ -1,0 +1,138 @@
+"""What a finished run says about itself: temperature, energy and drift with their statistical errors."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K
+from systems.scene import Scene
+
+_G_ML_PER_DA_NM3 = 1.66053906660e-3
+# Fewer frames than this carry no error bar.
+_FEWEST_FRAMES = 10
+_STANDARD_ERRORS, _BIAS = 4.0, 0.02
+
+
+def correlation_frames(values: npt.ArrayLike) -> float:
+    """Return the statistical inefficiency in frames: 1 + 2 x autocorrelation, summed to its first zero crossing."""
+    x = np.asarray(values, dtype=np.float64)
+    x = x - x.mean()
+    n = len(x)
+    if n < 2 or not x.any():
+        return 1.0
+    spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
+    correlation /= correlation[0]
+    negative = np.flatnonzero(correlation <= 0)
+    stop = int(negative[0]) if len(negative) else n
+    return max(1.0, 1.0 + 2.0 * float(correlation[1:stop].sum()))
+
+
+def mean_and_error(values: npt.ArrayLike) -> dict[str, float | None]:
+    """Return the mean and its standard error, that of correlated frames; None where there are too few."""
+    x = np.asarray(values, dtype=np.float64)
+    error = None
+    if len(x) >= _FEWEST_FRAMES:
+        error = float(x.std(ddof=1) * math.sqrt(correlation_frames(x) / len(x)))
+    return {"mean": float(x.mean()), "standard_error": error}
+
+
+def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> dict[str, float | None]:
+    """Return the slope of the total energy by least squares, kJ/mol per ns and degree of freedom, and its error.
+
+    The residuals are correlated: their statistical inefficiency widens the error of the slope.
+    """
+    t = np.asarray(time_ps, dtype=np.float64) * 1e-3
+    energy = np.asarray(energy_kj_mol, dtype=np.float64) / max(n_dof, 1)
+    if len(t) < 3:
+        return {"kj_mol_ns_dof": None, "standard_error": None}
+    t = t - t.mean()
+    slope = float((t * energy).sum() / (t * t).sum())
+    residual = energy - energy.mean() - slope * t
+    variance = float((residual * residual).sum()) / (len(t) - 2)
+    error = math.sqrt(variance * correlation_frames(residual) / float((t * t).sum()))
+    return {"kj_mol_ns_dof": slope, "standard_error": error if len(t) >= _FEWEST_FRAMES else None}
+
+
+def summarise(
+    scene: Scene,
+    time_ps: npt.ArrayLike,
+    scalars: dict[str, npt.NDArray[np.float64]],
+    *,
+    ensemble: str,
+    temperature_k: float,
+    n_dof: int,
+) -> dict[str, Any]:
+    """Return the summary of a run's frames, JSON-able: temperature and potential; drift in NVE; volume and density.
+
+    Frames without a value (written by an older version) are left out. `target` is the bath's temperature, None without.
+    """
+    known = {name: values[np.isfinite(values)] for name, values in scalars.items()}
+    if not len(known.get("temperature_k", ())):
+        return {}
+    out: dict[str, Any] = {
+        "n_frames": len(np.asarray(time_ps)),
+        "degrees_of_freedom": n_dof,
+        "temperature_k": {**mean_and_error(known["temperature_k"]), "target": _target(ensemble, temperature_k)},
+        "potential_kj_mol": mean_and_error(known["potential_kj_mol"]),
+    }
+    if ensemble == "nve":
+        kinetic = 0.5 * n_dof * GAS_CONSTANT_KJ_MOL_K * scalars["temperature_k"]
+        total = scalars["potential_kj_mol"] + kinetic
+        out["total_kj_mol"] = {"mean": float(total.mean()), "standard_deviation": float(total.std())}
+        out["drift"] = drift(time_ps, total, n_dof)
+    if len(known.get("volume_nm3", ())):
+        volume = mean_and_error(known["volume_nm3"])
+        out["volume_nm3"] = volume
+        mass = float(scene.masses_da.sum())
+        out["density_g_ml"] = mean_and_error(mass * _G_ML_PER_DA_NM3 / known["volume_nm3"])
+    return out
+
+
+def _target(ensemble: str, temperature_k: float) -> float | None:
+    return None if ensemble == "nve" else temperature_k
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """Return the summary for people, a line or two."""
+    if "temperature_k" not in summary:
+        return []
+    temperature = summary["temperature_k"]
+    parts = [f"temperature {_with_error(temperature, 'K')}"]
+    if temperature.get("target") is not None:
+        parts[0] += f" (bath {temperature['target']:g} K)"
+    parts.append(f"potential {_with_error(summary['potential_kj_mol'], 'kJ/mol')}")
+    if "density_g_ml" in summary:
+        parts.append(f"density {_with_error(summary['density_g_ml'], 'g/mL')}")
+    slope = summary.get("drift", {})
+    if slope.get("kj_mol_ns_dof") is not None:
+        shown = {"mean": slope["kj_mol_ns_dof"], "standard_error": slope["standard_error"]}
+        parts.append(f"total energy drifts by {_with_error(shown, 'kJ/mol/ns per degree of freedom')}")
+    lines = [", ".join(parts)]
+    off = _off_target(temperature)
+    if off:
+        lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter --timestep.")
+    return lines
+
+
+def _off_target(temperature: dict[str, Any]) -> float:
+    """Return how far the mean is from the bath in K where neither chance nor a usual time step explains it, else 0."""
+    target, error = temperature.get("target"), temperature.get("standard_error")
+    if target is None or error is None:
+        return 0.0
+    off = float(temperature["mean"] - target)
+    return off if abs(off) > _STANDARD_ERRORS * error + _BIAS * target else 0.0
+
+
+def _with_error(value: dict[str, Any], unit: str) -> str:
+    error = value.get("standard_error")
+    if error is None:
+        return f"{value['mean']:.4g} {unit}"
+    if error <= 0 or not math.isfinite(error):
+        return f"{value['mean']:.6g} {unit}"
+    digits = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value['mean']:.{digits}f} ± {error:.{digits}f} {unit}"

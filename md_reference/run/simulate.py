@@ -1,0 +1,360 @@
+"""Minimise, equilibrate, produce: reference MD of one replica, streamed, checkpointed, resumable to the frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from md_reference.forces.forcefield import build_system
+from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
+from md_reference.run.engine import Engine, State
+from md_reference.run.integrators import integrator_name
+from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.run_summary import summarise
+from systems.errors import InputError, SimulationError
+from systems.interrupts import deferred_interrupt
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryWriter
+from systems.trajectory.checkpoint import (
+    FLUSH_SHARE,
+    Checkpoint,
+    CheckpointFile,
+    checkpoint_path,
+    last_supported,
+    new_header,
+    writer_at,
+)
+from systems.trajectory.claim import claimed_outputs
+from systems.trajectory.codec import open_trajectory
+from systems.units import format_time_ps
+
+__all__ = ["MDConfig", "checkpoint_path", "simulate"]
+
+# (frames done, frames in all) -> None, called after each block that is on disk.
+ProgressFn = Callable[[int, int], None]
+# Share of the equilibration that is done -> None; 0 while minimising.
+PreparingFn = Callable[[float], None]
+
+# Python sees Ctrl-C only between calls of OpenMM: about so long may pass until it does.
+_SIGNAL_S = 0.25
+# Held in memory, then flushed together with a checkpoint: what a `kill -9` costs at most, or one frame if that is more.
+_BLOCK_S = 0.5
+
+
+def simulate(
+    scene: Scene,
+    config: MDConfig,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: ProgressFn | None = None,
+    preparing: PreparingFn | None = None,
+    checkpoint_every_s: float = 20.0,
+    max_threads: int = 1,
+    choice: PlatformChoice | None = None,
+    patience_s: float = 0.0,
+) -> Path:
+    """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
+
+    A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
+    time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure
+    loses at most one save interval, half a second of work, or fifty times what it takes to write, whichever is the
+    longest; `resume=True` goes on from there with the same random stream, on the same platform, if the frames are still
+    those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
+    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile; for one that does,
+    `patience_s` is waited.
+
+    With `platform='auto'` the platform is measured (`platforms.measured_platform`, at most `max_threads`), unless
+    `choice` says what has been. Raises SimulationError when coordinates stop being finite or the system blows up
+    (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
+    """
+    out = Path(out)
+    config = check_run(scene, config, out)
+    chk = checkpoint_path(out)
+    with (
+        deferred_interrupt() as asked_to_stop,
+        claimed_outputs([out], may_exist=resume or overwrite, patience_s=patience_s, stopped=asked_to_stop),
+    ):
+        if resume and out.exists() and not chk.exists():
+            return _already_complete(out, config)
+        kept = last_supported(chk, [out]) if resume and chk.exists() else None
+        run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
+        run.asked_to_stop = asked_to_stop
+        run.preparing = preparing or run.preparing
+        run.prepare(choice, max_threads)
+        with run.engine_at_start() as engine, run.writer(engine) as writer:
+            run.produce(engine, writer, progress)
+        chk.unlink(missing_ok=True)
+    return out
+
+
+class _Run:
+    """One run on its way: what is done, since when, and where its checkpoint goes."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: MDConfig,
+        out: Path,
+        checkpoint_every_s: float,
+        kept: Checkpoint | None,
+        *,
+        overwrite: bool,
+    ) -> None:
+        self.scene, self.config, self.out = scene, config, out
+        self.checkpoint_every_s, self.resumed = checkpoint_every_s, kept is not None
+        self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
+        if kept is not None:
+            check_same_run(self.header["config"], config, out)
+        self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
+        self.asked_to_stop: Callable[[], bool] = lambda: False
+        self.preparing: PreparingFn = lambda _: None
+        self.done = int(self.header["files"][0]["n_frames"])
+        self.steps_into_frame = int(self.header.get("steps_into_frame", 0))
+        self.spent_s = float(self.header.get("wall_s", 0.0))
+        self.started = self.saved_at = time.monotonic()
+        self.piece = 10
+        self.system: Any = None
+
+    @property
+    def wall_s(self) -> float:
+        return self.spent_s + time.monotonic() - self.started
+
+    def prepare(self, choice: PlatformChoice | None, max_threads: int) -> None:
+        """Build the forces and settle the platform."""
+        self.system = build_system(self.scene, self.config.force)
+        if self.resumed:
+            choice = PlatformChoice(self.header["platform"], self.header["threads"], "as before it was resumed")
+        self.choice = choice or measured_platform(
+            self.scene,
+            self.config.force,
+            requested=self.config.platform,
+            temperature_k=self.config.temperature_k,
+            friction_per_ps=self.config.friction_per_ps,
+            timestep_ps=self.config.timestep_ps,
+            max_threads=max_threads,
+            system=lambda: self.system,
+        )
+
+    def engine(self, ensemble: str) -> Engine:
+        return Engine(
+            self.scene,
+            self.config.force,
+            temperature_k=self.config.temperature_k,
+            friction_per_ps=self.config.friction_per_ps,
+            timestep_ps=self.config.timestep_ps,
+            seed=self.config.seed,
+            platform=self.choice.name,
+            threads=self.choice.threads,
+            ensemble=ensemble,
+            pressure_bar=self.config.pressure_bar,
+            system=self.system,
+        )
+
+    def engine_at_start(self) -> Engine:
+        """Return the engine where the run was left, or at time 0."""
+        if self.resumed and "equilibrated_steps" not in self.header:
+            engine = self.engine(self.config.ensemble)
+            engine.restore(self.blob)
+        else:
+            engine = self._equilibrated()
+        if not self.done:
+            # Before there is a file, so that a run killed at any later moment can be resumed like any other.
+            self.save(engine)
+        return engine
+
+    def writer(self, engine: Engine) -> TrajectoryWriter:
+        """Return the writer of the trajectory, which holds the frames that are done."""
+        columns = self.config.columns
+        return writer_at(self.out, self.scene, self._record(engine), self.header, resumed=self.resumed, columns=columns)
+
+    def _equilibrated(self) -> Engine:
+        """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
+
+        A model system that brings its own velocities starts from them as it stands, if nothing is to heat it.
+        """
+        config = self.config
+        if config.ensemble == "nve" and self.scene.velocities_nm_ps is not None:
+            engine = self.engine("nve")
+            engine.set_velocities(self.scene.velocities_nm_ps)
+            return engine
+        bath = self.engine("nvt" if config.ensemble == "nve" else config.ensemble)
+        try:
+            self._equilibrate(bath)
+            if config.ensemble != "nve":
+                bath.reset_clock()
+                return bath
+            state = bath.state(velocities=True)
+        except SimulationError as error:
+            raise SimulationError(f"{self.scene.name}: {error} before the first frame. {_advice(config)}") from error
+        bath.close()
+        engine = self.engine("nve")
+        engine.take_over(state)
+        return engine
+
+    def _equilibrate(self, engine: Engine) -> None:
+        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
+        done = int(self.header.get("equilibrated_steps", 0))
+        self.preparing(done / max(n_steps, 1))
+        if self.blob:
+            engine.restore(self.blob)
+        else:
+            engine.minimise()
+            engine.thermalise()
+        while done < n_steps:
+            done += self._advance(engine, n_steps - done)
+            self.preparing(done / n_steps)
+            stop = self.asked_to_stop()
+            if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
+                self.save(engine, equilibrated_steps=done)
+            if stop:
+                raise KeyboardInterrupt
+        engine.state()
+
+    def _advance(self, engine: Engine, n_steps: int) -> int:
+        """Take steps until somebody may want to look whether to stop, and return how many."""
+        taken = min(self.piece, n_steps)
+        began = time.monotonic()
+        engine.step(taken)
+        seconds = max(time.monotonic() - began, 1e-9)
+        self.piece = max(1, min(2 * self.piece, math.ceil(taken * _SIGNAL_S / seconds), 100_000))
+        return taken
+
+    def save(self, engine: Engine, **more: Any) -> None:
+        """Write the checkpoint."""
+        said = {
+            "config": settings_of(self.config),
+            "wall_s": self.wall_s,
+            "platform": engine.platform_name,
+            "threads": engine.threads,
+        }
+        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
+        self.checkpoint.write(self.header, engine.checkpoint())
+        self.saved_at = time.monotonic()
+
+    def produce(self, engine: Engine, writer: TrajectoryWriter, progress: ProgressFn | None) -> None:
+        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
+        config, n_frames = self.config, self.config.n_frames
+        block = 1
+        while self.done < n_frames:
+            size = min(block, n_frames - self.done)
+            began = time.monotonic()
+            states, failure = self._frames(engine, size)
+            computed = time.monotonic()
+            self._write(writer, states)
+            self.done += len(states)
+            self.header["files"] = [{"n_frames": self.done, "digest": writer.digest()}]
+            if failure:
+                writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+                raise SimulationError(
+                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
+                    f"{self.done} good frames are in {self.out}. {_advice(config)}"
+                )
+            stop = self.asked_to_stop() and self.done < n_frames
+            if self.done < n_frames:
+                self.save(engine, steps_into_frame=self.steps_into_frame)
+            flushed_s = time.monotonic() - computed
+            if progress is not None:
+                progress(self.done, n_frames)
+            if stop:
+                writer.update_record({"cost": self.cost()})
+                raise KeyboardInterrupt
+            per_frame_s = max((computed - began) / max(len(states), 1), 1e-6)
+            block = min(max(1, round(max(_BLOCK_S, FLUSH_SHARE * flushed_s) / per_frame_s)), 1000, 2 * block)
+        time_ps, scalars = writer.series()
+        summary = summarise(
+            self.scene,
+            time_ps,
+            scalars,
+            ensemble=config.ensemble,
+            temperature_k=config.temperature_k,
+            n_dof=engine.n_dof,
+        )
+        # A resumed run may have become longer than the one that wrote the record.
+        writer.update_record({"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary})
+
+    def _frames(self, engine: Engine, n: int) -> tuple[list[State], str]:
+        """Return up to `n` frames, fewer when somebody asked to stop or the run failed, and why it failed."""
+        states: list[State] = []
+        config, per_frame = self.config, self.config.steps_per_frame
+        while len(states) < n:
+            try:
+                while self.steps_into_frame < per_frame:
+                    if self.asked_to_stop():
+                        return states, ""
+                    self.steps_into_frame += self._advance(engine, per_frame - self.steps_into_frame)
+                    if not states and time.monotonic() - self.saved_at > self.checkpoint_every_s:
+                        self.save(engine, steps_into_frame=self.steps_into_frame)
+                states.append(engine.state(velocities=config.save_velocities, forces=config.save_forces))
+                self.steps_into_frame = 0
+            except SimulationError as error:
+                return states, str(error)
+        return states, ""
+
+    def _write(self, writer: TrajectoryWriter, states: list[State]) -> None:
+        if not states:
+            return
+        config, periodic = self.config, self.scene.cell_nm is not None
+        scalars = {
+            "potential_kj_mol": np.array([s.potential_kj_mol for s in states]),
+            "temperature_k": np.array([s.temperature_k for s in states]),
+        }
+        cells = np.array([s.cell_nm for s in states]) if periodic else None
+        if cells is not None and config.ensemble == "npt":
+            scalars["volume_nm3"] = np.linalg.det(cells)
+        writer.append(
+            np.array([s.positions_nm for s in states], dtype=np.float32),
+            (self.done + 1 + np.arange(len(states))) * config.save_every_ps,
+            scalars=scalars,
+            velocities_nm_ps=np.array([s.velocities_nm_ps for s in states]) if config.save_velocities else None,
+            forces_kj_mol_nm=np.array([s.forces_kj_mol_nm for s in states]) if config.save_forces else None,
+            cell_nm=cells,
+        )
+
+    def cost(self) -> dict[str, float]:
+        """Cost of what is in the file; equilibration is in the wall time and not in the count of production steps."""
+        simulated_ps = self.done * self.config.save_every_ps
+        return {
+            "wall_s": self.wall_s,
+            "energy_evaluations": self.done * self.config.steps_per_frame,
+            "ns_per_day": simulated_ps * 1e-3 / self.wall_s * 86400.0,
+        }
+
+    def _record(self, engine: Engine) -> dict[str, Any]:
+        import openmm
+
+        return {
+            "kind": "reference",
+            "integrator": integrator_name(self.config.ensemble, self.scene),
+            "program": {"openmm": openmm.__version__},
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "completed": False,
+            **settings_of(self.config),
+            "platform": engine.platform_name,
+            "threads": engine.threads,
+            "platform_reason": self.choice.reason,
+        }
+
+
+def _advice(config: MDConfig) -> str:
+    return f"Try a shorter --timestep (now {config.timestep_ps * 1000:g} fs)."
+
+
+def _already_complete(out: Path, config: MDConfig) -> Path:
+    with open_trajectory(out) as reader:
+        record, n_frames = reader.record, reader.n_frames
+    # The record names the platform that ran, which "auto" leaves open.
+    check_same_run(record, config, out, ignoring=("platform",))
+    if record.get("completed") and n_frames == config.n_frames:
+        return out
+    raise InputError(
+        f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
+        "--overwrite, or keep it under another name."
+    )

@@ -1,0 +1,87 @@
+"""What a ns takes: the surrogate and OpenMM by turns, in processor seconds of this process."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
+from surrogate.bench.rolling import Frames, Roller
+from surrogate.bench.speed import seconds_of
+from surrogate.bench.stress.other_arithmetic import openmm_of
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+    from surrogate.sampling.chunks import ChunkSampler
+
+TIMESTEPS_PS = (0.001, 0.002, 0.004)
+
+
+def chunk_ps(weights: Weights, sampler: ChunkSampler, setting: Setting) -> float:
+    """Simulated time of a chunk of all replicas together."""
+    return sampler.n_new * setting.batch * weights.domain.lag_ps
+
+
+def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setting: Setting,
+                   config: CostErrorConfig) -> tuple[list[Frames], dict[str, Any]]:  # fmt: skip
+    """Return the frames of each part, and what a ns of the surrogate and of MD at 4 fs took beside each other."""
+    n_chunks = max(config.rounds, math.ceil(config.time_ps / chunk_ps(weights, sampler, setting)))
+    shares = [n_chunks * k // config.rounds for k in range(config.rounds + 1)]
+    parts, cpu, wall, md, sizes = [], [], [], [], []
+    with openmm_of(weights.domain, TIMESTEPS_PS[-1], config.seed) as engine:
+        n_steps = _steps(config.slice_ps, TIMESTEPS_PS[-1])
+        for k in range(config.rounds):
+            md.append(_seconds_per_ns(config.slice_ps, lambda: engine.step(n_steps))[0])
+            n = (shares[k + 1] - shares[k]) * sampler.n_new
+            ps = n * setting.batch * weights.domain.lag_ps
+            found: list[Frames] = []
+            seconds = _seconds_per_ns(ps, lambda n=n, found=found: found.append(roller.advance(n)))  # type: ignore[misc]
+            parts += found
+            sizes.append(ps)
+            cpu.append(seconds[0])
+            wall.append(seconds[1])
+    ratios = [m / c for m, c in zip(md, cpu, strict=True)]
+    return parts, {
+        "cpu_s_per_ns": _spread(cpu, sizes),
+        "wall_s_per_ns": _spread(wall, sizes),
+        "md_s_per_ns": _spread(md),
+        "speed_over_md": _spread(ratios),
+    }
+
+
+def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
+    """Return processor and wall seconds of OpenMM for a ns at each time step, by turns."""
+    with ExitStack() as stack:
+        engines = {dt: stack.enter_context(openmm_of(weights.domain, dt, config.seed)) for dt in TIMESTEPS_PS}
+        found: dict[float, list[tuple[float, float]]] = {dt: [] for dt in TIMESTEPS_PS}
+        for _ in range(config.rounds):
+            for dt, engine in engines.items():
+                n = _steps(config.slice_ps, dt)
+                found[dt].append(_seconds_per_ns(config.slice_ps, lambda e=engine, n=n: e.step(n)))  # type: ignore[misc]
+    return [
+        {
+            "timestep_fs": 1e3 * dt,
+            "cpu_s_per_ns": _spread([cpu for cpu, _ in times]),
+            "wall_s_per_ns": _spread([wall for _, wall in times]),
+        }
+        for dt, times in found.items()
+    ]
+
+
+def _steps(time_ps: float, timestep_ps: float) -> int:
+    return max(1, round(time_ps / timestep_ps))
+
+
+def _seconds_per_ns(simulated_ps: float, run: Callable[[], object]) -> tuple[float, float]:
+    """Return processor and wall seconds of `run` for each ns that it simulates."""
+    cpu, wall = seconds_of(run)
+    return 1e3 * cpu / simulated_ps, 1e3 * wall / simulated_ps
+
+
+def _spread(values: Sequence[float], shares: Sequence[float] | None = None) -> dict[str, float]:
+    """Return the mean of all parts together, and the extremes: what a chunk takes depends on what happens in it."""
+    weights = [1.0] * len(values) if shares is None else shares
+    mean = sum(x * w for x, w in zip(values, weights, strict=True)) / sum(weights)
+    return {"mean": mean, "least": min(values), "greatest": max(values)}

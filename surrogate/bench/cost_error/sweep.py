@@ -1,0 +1,210 @@
+"""Run time against error: a surrogate at many settings beside OpenMM at many lengths, on one core.
+
+`surromd bench cost-error REFERENCE REPLICATE --weights NAME`, or `python -m surrogate.bench.cost_error.sweep` with the
+same arguments. Each setting rolls the same time; its error is that of the φ/ψ map against two held-out runs, its cost
+the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so that the ratio of
+the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out run against the
+whole of the other (`judge.worth`): it is taken to be the same at each time step, by simulated time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from surrogate.bench.cost_error.cost_page import markdown, write_cost_error
+from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
+from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
+from surrogate.bench.cost_error.sweep_settings import USUAL_BATCH, CostErrorConfig, Setting, choose_settings
+from surrogate.bench.held_out import refuse_trained_on
+from surrogate.bench.machine import machine_facts
+from surrogate.bench.rolling import Roller
+from surrogate.sampling.chunks import ChunkSampler
+from surrogate.verbs.outputs import Trajectories, find_trajectories
+from systems.errors import InputError, StorageError, SurromdError
+from systems.units import parse_time_ps
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+ReportFn = Callable[[str], None]
+
+
+def cost_error(
+    reference: Trajectories,
+    replicate: Trajectories,
+    weights: Sequence[str | Path],
+    folder: Path,
+    config: CostErrorConfig,
+    *,
+    solvers: Sequence[str] | None = None,
+    steps: Sequence[int] | None = None,
+    precisions: Sequence[str] | None = None,
+    batches: Sequence[int] | None = None,
+    compiled: bool = False,
+    report: ReportFn = lambda line: None,
+) -> dict[str, Any]:
+    """Measure weights, by name or file, at the settings of `choose_settings`; see `run_cost_error`."""
+    from surrogate.data.shipped import weights_path
+    from surrogate.data.weights import load_weights
+
+    def settings(one: Weights) -> list[Setting]:
+        return choose_settings(
+            one, solvers=solvers, steps=steps, precisions=precisions, batches=batches, compiled=compiled
+        )
+
+    loaded = [load_weights(weights_path(name)) for name in weights]
+    chosen = [(one, settings(one)) for one in loaded]  # what cannot be is said before anything is read
+    first, second = find_trajectories(reference), find_trajectories(replicate)
+    return run_cost_error(chosen, first, second, folder, config, report=report)
+
+
+def run_cost_error(
+    chosen: Sequence[tuple[Weights, Sequence[Setting]]],
+    reference: Sequence[Path],
+    replicate: Sequence[Path],
+    folder: Path,
+    config: CostErrorConfig,
+    *,
+    report: ReportFn = lambda line: None,
+) -> dict[str, Any]:
+    """Measure weights at their settings and write cost_error.json, .md and .svg into `folder` after each.
+
+    What an earlier run left there is kept, if it was of the same references and the same `config`. Raises InputError
+    for references that weights were trained on, for a folder of another benchmark, and for weights of several scenes;
+    StorageError; KeyboardInterrupt says what is kept.
+    """
+    weights = [one for one, _ in chosen]
+    prints = [refuse_trained_on(w, reference, replicate) for w in weights]
+    if len({w.domain.scene.topology_hash for w in weights}) != 1:
+        raise InputError("weights of several scenes cannot be measured by one reference; run them one by one.")
+    header = {"references": prints[0], "config": asdict(config)}
+    result = _earlier(folder, header)
+    scene = weights[0].domain.scene
+    report("reading the references")
+    truth = read_truth(scene, reference, replicate)
+    result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
+    try:
+        with _threads(config.threads):
+            if "md" not in result:
+                report("OpenMM")
+                result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(weights[0], config)}
+            for one, settings in chosen:
+                for setting in settings:
+                    if not any(row["weights_hash"] == one.hash and _is(row, setting) for row in result["rows"]):
+                        report(f"{one.path.stem}: {setting.label}")
+                        result["rows"].append(measure_setting(one, setting, truth, config))
+                        write_cost_error(result, folder)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{folder} keeps the settings that were finished; the same command goes on") from None
+    write_cost_error(result, folder)
+    return result
+
+
+def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: CostErrorConfig) -> dict[str, Any]:
+    """Roll one setting in parts, by turns with OpenMM; return its cost, its errors and its worth, JSON-able.
+
+    A batch smaller than the usual one is only timed, over a few chunks: replicas do not depend on those beside them.
+    """
+    model = weights.model
+    row: dict[str, Any] = {
+        "weights": weights.path.stem,
+        "weights_hash": weights.hash,
+        **asdict(setting),
+        "label": setting.label,
+        "atoms": "heavy, hydrogens placed" if getattr(model.config, "hydrogens", "") == "placed" else "all",
+        "clean_conditioning": bool(getattr(getattr(model.config, "approximator", None), "clean_conditioning", False)),
+    }
+    try:
+        sampler = ChunkSampler(weights, solver=setting.solver, solver_steps=setting.steps, precision=setting.precision,
+                               compile=setting.compile)  # fmt: skip
+        roller = Roller(weights, sampler, rows=setting.batch, seed=config.seed)
+        settled = -(-config.settle_ps // (sampler.n_new * weights.domain.lag_ps))
+        started = time.process_time()
+        roller.advance(max(1, int(settled)) * sampler.n_new)
+        row["first_chunks_s"] = time.process_time() - started
+        only_timed = setting.batch < USUAL_BATCH
+        total_ps = min(config.time_ps, chunk_ps(weights, sampler, setting) * config.rounds * 2) if only_timed \
+            else config.time_ps  # fmt: skip
+        parts, costs = roll_in_turns(weights, roller, sampler, setting, replace(config, time_ps=total_ps))
+    except (SurromdError, np.linalg.LinAlgError) as error:  # the latter where frames are no longer finite
+        return row | {"outcome": f"not run: {error}"}
+    frames = np.concatenate(parts, axis=1)
+    ns = 1e-3 * frames.shape[0] * frames.shape[1] * weights.domain.lag_ps
+    row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
+    if only_timed:
+        return row | {"timed_only": True}
+    errors, worth = judge_frames(frames, truth, seed=config.seed)
+    spent = ns * row["cpu_s_per_ns"]["mean"]
+    return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["mean"])
+
+
+def _is(row: dict[str, Any], setting: Setting) -> bool:
+    return all(row.get(key) == value for key, value in asdict(setting).items())
+
+
+@contextmanager
+def _threads(number: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
+    """Return what a folder holds, or an empty result. Raises InputError where it is of other references or times."""
+    path = folder / "cost_error.json"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{path} cannot be used ({error}); name another folder with --out.") from error
+    if found and any(found.get(key) != value for key, value in header.items()):
+        raise InputError(f"{path} is of other references, times or rounds; name another folder with --out.")
+    return {**header, "rows": [], **found}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("reference", help="a held-out run, or several as one: file, folder or glob")
+    parser.add_argument("replicate", help="another, as long")
+    parser.add_argument("--weights", action="append", required=True, help="name or file; repeatable")
+    parser.add_argument("--out", type=Path, default=Path("runs/cost-error"))
+    parser.add_argument("--time", default="20ns")
+    parser.add_argument("--rounds", type=int, default=CostErrorConfig.rounds)
+    parser.add_argument("--solver", action="append")
+    parser.add_argument("--steps", action="append", type=int)
+    parser.add_argument("--precision", action="append", choices=("auto", "fp32", "bf16"))
+    parser.add_argument("--batch", action="append", type=int)
+    parser.add_argument("--compile", action="store_true")
+    args = parser.parse_args()
+    result = cost_error(
+        args.reference,
+        args.replicate,
+        args.weights,
+        args.out,
+        CostErrorConfig(time_ps=parse_time_ps(args.time, "--time"), rounds=args.rounds),
+        solvers=args.solver,
+        steps=args.steps,
+        precisions=args.precision,
+        batches=args.batch,
+        compiled=args.compile,
+        report=lambda line: print(line, file=sys.stderr),  # noqa: T201
+    )
+    sys.stdout.write(markdown(result) + "\n")
+
+
+if __name__ == "__main__":
+    main()

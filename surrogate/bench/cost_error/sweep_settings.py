@@ -1,0 +1,90 @@
+"""The settings that a benchmark of run time against error goes through, and what is the same for all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+STEPS = (2, 3, 4, 6, 10, 20)
+USUAL_BATCH = 32
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to roll. `solver` None: of a model without one, for which `steps` mean nothing."""
+
+    solver: str | None
+    steps: int
+    precision: str = "auto"
+    batch: int = USUAL_BATCH
+    compile: bool = False
+
+    @property
+    def label(self) -> str:
+        words = [f"{self.solver} {self.steps}" if self.solver else "as it is"]
+        words += [self.precision] if self.precision != "auto" else []
+        words += [f"batch {self.batch}"] if self.batch != USUAL_BATCH else []
+        return ", ".join(words + (["compiled"] if self.compile else []))
+
+
+@dataclass(frozen=True)
+class CostErrorConfig:
+    """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
+    `settle_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
+
+    time_ps: float = 20_000.0
+    settle_ps: float = 100.0
+    rounds: int = 4
+    slice_ps: float = 40.0
+    threads: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0 or self.threads < 1:
+            raise InputError("times must be positive; rounds and threads at least 1.")
+
+
+def choose_settings(
+    weights: Weights,
+    *,
+    solvers: Sequence[str] | None = None,
+    steps: Sequence[int] | None = None,
+    precisions: Sequence[str] | None = None,
+    batches: Sequence[int] | None = None,
+    compiled: bool = False,
+) -> list[Setting]:
+    """Return the settings to run: all combinations of what is given. Without solvers those that take a batch at once.
+
+    Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
+    and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
+    """
+    from surrogate.models.lam_slide.flow import ADAPTIVE
+    from surrogate.models.precision import choose_precision
+    from surrogate.sampling.config import RolloutConfig
+
+    known = weights.model.solvers
+    unknown = [name for name in solvers or () if name not in known]
+    if unknown:
+        raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
+    chosen: list[str | None] = [*(solvers or [name for name in known if name not in ADAPTIVE])] or [None]
+    own = RolloutConfig.solver_steps
+    numbers = (steps or STEPS) if known else (own,)
+    found = [
+        Setting(solver, n, precision, batch)
+        for solver, n, precision, batch in product(chosen, numbers, precisions or ("auto",), batches or (USUAL_BATCH,))
+    ]
+    usual = Setting(chosen[0], own if own in numbers else max(numbers))
+    if not (precisions or batches):
+        with_bf16 = choose_precision("auto", suits=weights.model.bf16_by_default).bf16
+        found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
+        found += [replace(usual, batch=1)]
+    if compiled:
+        found += [replace(usual, compile=True)]
+    return list(dict.fromkeys(found))

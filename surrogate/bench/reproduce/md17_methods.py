@@ -1,0 +1,239 @@
+"""The methods of `surromd reproduce md17`: each is fitted to all molecules at once and forecasts any one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, Settings, beyond, n_parameters, sampled
+from surrogate.bench.reproduce.md17_views import Array, BodyFrame, LinearForecast, MoleculeView
+from surrogate.data.molecule_windows import MoleculeWindows
+
+if TYPE_CHECKING:
+    import torch
+
+    from surrogate.models.lam_slide.model import LamSlide
+
+# Name of a molecule, given frames (n, n_given, n_atoms, 3) nm, number of samples -> (K, n, n_new, n_atoms, 3) nm.
+MoleculeForecast = Callable[[str, Array, int], Array]
+_ELEMENTS = (1, 6, 7, 8)
+_HELD = 32
+_BLOCK = 250
+
+
+@dataclass(frozen=True)
+class FittedToMolecules:
+    """A method ready to forecast; `seconds` of training, `note` what goes beyond the papers."""
+
+    forecast: MoleculeForecast
+    note: str
+    seconds: float = 0.0
+    n_parameters: int = 0
+
+
+def frozen(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """The last given frame."""
+    return FittedToMolecules(lambda name, given, n: np.repeat(given[:, -1:], N_NEW, axis=1)[None], "")
+
+
+def constant_velocity(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """The step between the last two given frames, again and again."""
+    ahead = np.arange(1, N_NEW + 1)[None, :, None, None]
+    return FittedToMolecules(
+        lambda name, given, n: (given[:, -1:] + ahead * (given[:, -1:] - given[:, -2:-1]))[None], ""
+    )
+
+
+def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """Independent modes, each an autoregression over two frames (`models.baselines.NormalModes`), without its noise."""
+    import torch
+
+    from surrogate.models.baselines.model import NormalModes
+    from surrogate.models.baselines.trainer import normal_modes_of
+    from surrogate.models.interface import Molecule
+
+    models: dict[str, tuple[MoleculeWindows, NormalModes]] = {}
+    for m in molecules:
+        starts = m.every_start["train"]
+        triples = m.windows(starts[:: max(1, len(starts) // 10_000)])[:, N_GIVEN - 3 : N_GIVEN]
+        models[m.name] = m, normal_modes_of(_inside_each(m, triples)[1], N_NEW)
+
+    @torch.no_grad()
+    def forecast(name: str, given: Array, n_samples: int) -> Array:
+        m, model = models[name]
+        body, inside = _inside_each(m, given[:, -2:])
+        noise = torch.zeros(len(given), *model.noise_shape(m.n_atoms))
+        about = Molecule(torch.from_numpy(m.elements), torch.ones(m.n_atoms), torch.zeros((0, 2), dtype=torch.int64))
+        chunk = model.next_chunk(torch.from_numpy(inside).float(), about, noise)
+        return body.leave(chunk.frames_nm.double().numpy())[None]
+
+    return FittedToMolecules(forecast, "last two frames; one model a molecule")
+
+
+def linear(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """The best linear forecast from all given frames in the body frame (`LinearForecast`)."""
+    by_name = {m.name: (m, LinearForecast.fit(m)) for m in molecules}
+
+    def forecast(name: str, given: Array, n_samples: int) -> Array:
+        m, fitted = by_name[name]
+        return fitted.forecast(m, given)[None]
+
+    return FittedToMolecules(forecast, "ten frames; one model a molecule")
+
+
+def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """EGNN from the last given frame and the step to it, one model for all molecules, told of elements and bonds."""
+    import torch
+
+    from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig
+    from surrogate.models.particles.trainer import Jump, train_egnn
+
+    by_name = {m.name: m for m in molecules}
+    training = settings.training("egnn")
+    model = EgnnJump(
+        EgnnJumpConfig(n_types=len(_ELEMENTS), n_new=N_NEW, lag_ps=molecules[0].lag_ps, from_velocity=False)
+    )
+
+    def jump(m: MoleculeWindows, given: Array, truth: Array) -> Jump:
+        last = given[:, -1]
+        centre = last.mean(axis=1, keepdims=True)
+        # Lengths in units of a bond's: 0.1 nm.
+        x, v = 10.0 * (last - centre), 10.0 * (last - given[:, -2]) / m.lag_ps
+        ahead = 10.0 * (truth - (centre if truth.ndim == 3 else centre[:, None]))
+        types = torch.tensor([_ELEMENTS.index(e) for e in m.elements.tolist()]).expand(len(given), -1)
+        kinds = torch.from_numpy(m.kinds).expand(len(given), -1, -1)
+        state = [torch.from_numpy(a).float() for a in (x, v, ahead)]
+        return Jump(state[0], state[1], types, kinds, state[2])
+
+    def draw(batch: int, frame: int, generator: torch.Generator) -> Jump:
+        m = molecules[int(torch.randint(len(molecules), (1,), generator=generator))]
+        windows = _drawn(m, batch, generator, any_start=settings.any_start)
+        return jump(m, windows[:, :N_GIVEN], windows[:, N_GIVEN + frame])
+
+    held = [jump(m, w[:, :N_GIVEN], w[:, N_GIVEN:]) for m, w in _held(molecules)]
+    seconds = train_egnn(model, draw, held, training)
+
+    @torch.no_grad()
+    def forecast(name: str, given: Array, n_samples: int) -> Array:
+        m, found = by_name[name], []
+        for begin in range(0, len(given), _BLOCK):
+            block = given[begin : begin + _BLOCK]
+            j = jump(m, block, block[:, -1]).to(torch.device(settings.device))
+            ahead = model.all_frames(j.x, j.v, j.types, j.pairs).double().cpu().numpy() / 10.0
+            found.append(ahead + block[:, -1:].mean(axis=2, keepdims=True))
+        return np.concatenate(found)[None]
+
+    note = "last two frames, bonds" + beyond({"any start": settings.any_start})
+    return FittedToMolecules(forecast, note, seconds, n_parameters(model))
+
+
+def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+    """LaM-SLidE: ten given frames, one model for all molecules, told of elements."""
+    import torch
+
+    from surrogate.models.lam_slide.objectives import random_rotations
+    from surrogate.models.particles.trainer import encode_windows, train_lam_slide_on_windows
+
+    views = {
+        m.name: MoleculeView.of(
+            m, canonical=settings.canonical, linear=LinearForecast.fit(m) if settings.extrapolate else None
+        )
+        for m in molecules
+    }
+    training, device = settings.training("lam-slide"), torch.device(settings.device)
+    model = lam_slide_model(settings, large=device.type == "cuda")
+
+    def seen(m: MoleculeWindows, windows: Array) -> tuple[torch.Tensor, torch.Tensor]:
+        x = torch.from_numpy(views[m.name].to_model(windows)).float()
+        return x, torch.from_numpy(m.elements).expand(len(x), -1)
+
+    def draw(batch: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        m = molecules[int(torch.randint(len(molecules), (1,), generator=generator))]
+        x, kinds = seen(m, _drawn(m, batch, generator, any_start=settings.any_start))
+        return (x if settings.canonical else x @ random_rotations(batch, generator)[:, None].mT), kinds
+
+    held = [seen(m, windows) for m, windows in _held(molecules)]
+    seconds = train_lam_slide_on_windows(model, draw, held, training)
+    model.eval()
+
+    @torch.no_grad()
+    def forecast(name: str, given: Array, n_samples: int) -> Array:
+        view = views[name]
+        kinds, n = torch.from_numpy(view.molecule.elements).to(device), view.molecule.n_atoms
+        x = torch.from_numpy(view.given(given)).float().to(device)
+        generator, blocks = torch.Generator().manual_seed(settings.seed), []
+        for begin in range(0, len(x), _BLOCK):
+            known = encode_windows(model, x[begin : begin + _BLOCK], kinds.expand(len(x[begin : begin + _BLOCK]), -1))
+            seen_ahead = sampled(model, known, n, n_samples, settings, generator)
+            part = given[begin : begin + _BLOCK]
+            blocks.append(np.stack([view.from_model(part, sample) for sample in seen_ahead]))
+        return np.concatenate(blocks, axis=1)
+
+    switches = {"body frame": settings.canonical, "corrects the linear forecast": settings.extrapolate,
+                "any start": settings.any_start,
+                "loss on predicted frames alone": settings.predicted_only,
+                "clean conditioning frames": settings.clean_conditioning}  # fmt: skip
+    return FittedToMolecules(
+        forecast,
+        f"ten frames, elements, {settings.solver_steps} solver steps{beyond(switches)}",
+        seconds,
+        n_parameters(model),
+    )
+
+
+def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
+    """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
+    from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+    from surrogate.models.lam_slide.model import LamSlide
+
+    sizes = {"n_latents": 32, "per_token": 1, "width": 128, "layers": 6} if large else (
+        {"n_latents": 4, "per_token": 4, "width": 192, "layers": 5})  # fmt: skip
+    return LamSlide(
+        LamSlideConfig(
+            canonical=False,
+            position_scale_nm=1.0,
+            autoencoder=AutoencoderConfig(n_latents=sizes["n_latents"], latent_dim=32, n_octaves=3, type_weight=0.01),
+            approximator=ApproximatorConfig(
+                chunk_frames=N_GIVEN + N_NEW,
+                loss_on_given=not settings.predicted_only,
+                clean_conditioning=settings.clean_conditioning,
+                n_conditioning=N_GIVEN,
+                latents_per_token=sizes["per_token"],
+                width=sizes["width"],
+                n_layers=sizes["layers"],
+                position_weight=0.0,
+                distance_weight=0.0,
+            ),
+        )
+    )
+
+
+def _drawn(m: MoleculeWindows, batch: int, generator: torch.Generator, *, any_start: bool) -> Array:
+    import torch
+
+    starts = (m.every_start if any_start else m.starts)["train"]
+    return m.windows(starts[torch.randint(len(starts), (batch,), generator=generator).numpy()])
+
+
+def _held(molecules: Sequence[MoleculeWindows]) -> list[tuple[MoleculeWindows, Array]]:
+    return [(m, m.windows(m.starts["validation"][:: max(1, len(m.starts["validation"]) // _HELD)])) for m in molecules]
+
+
+def _inside_each(m: MoleculeWindows, frames: Array) -> tuple[BodyFrame, Array]:
+    """Lay every frame on the template by itself, as fitted baselines see them; return where the last one was too."""
+    flat = frames.reshape(-1, 1, m.n_atoms, 3)
+    inside = BodyFrame.of(m, flat).enter(flat).reshape(frames.shape)
+    return BodyFrame.of(m, frames), inside
+
+
+METHODS: Mapping[str, Callable[[Sequence[MoleculeWindows], Settings], FittedToMolecules]] = {
+    "frozen": frozen,
+    "constant-velocity": constant_velocity,
+    "normal-modes": normal_modes,
+    "linear": linear,
+    "egnn": egnn,
+    "lam-slide": lam_slide,
+}

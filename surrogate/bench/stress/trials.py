@@ -1,0 +1,250 @@
+"""The numerical-stability test of weights: long rollouts, odd inputs, other arithmetic, other settings, and OpenMM."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surrogate.bench.machine import machine_facts
+from surrogate.bench.stress import odd_inputs, other_arithmetic
+from surrogate.bench.stress.frame_statistics import Frames, measure_drift, measure_validity
+from surrogate.bench.stress.stress_page import write_stress
+from systems.chemistry.validity import INVALID, Geometry, check_frames
+from systems.errors import InputError, SimulationError, StorageError, SurromdError, nearest
+from systems.trajectory.codec import open_trajectory
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+SECTIONS = ("length", "invariance", "inputs", "precision", "batches", "solvers", "openmm")
+_ENERGY_FRAMES = 100
+ReportFn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class StressConfig:
+    """What to run. `frames`: lengths of the rollouts, in frames over all replicas; `guards`: under which of the guards
+    of `surromd rollout`. `chunks` of the short runs, `openmm_frames` of MD at each time step."""
+
+    frames: tuple[int, ...] = (10_000, 100_000)
+    replicas: int = 16
+    guards: tuple[str, ...] = ("flag", "repair")
+    sections: tuple[str, ...] = SECTIONS
+    chunks: int = 8
+    openmm_frames: int = 200
+    compiled: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.sections:
+            if name not in SECTIONS:
+                raise InputError(
+                    f"a stress test has no section {name!r}; known: {', '.join(SECTIONS)}."
+                    f"{nearest(name, list(SECTIONS))}"
+                )
+        if not self.frames or min(self.frames) < 10 * self.replicas:
+            raise InputError(f"rollouts need at least ten frames in each of {self.replicas} replicas.")
+
+
+QUICK = StressConfig(frames=(1_000,), replicas=4, chunks=2, openmm_frames=20, compiled=False)
+
+
+def choose_config(
+    *,
+    quick: bool = False,
+    frames: Sequence[int] | None = None,
+    replicas: int | None = None,
+    guards: Sequence[str] | None = None,
+    sections: Sequence[str] | None = None,
+    seed: int = 0,
+) -> StressConfig:
+    """Return the usual or the quick settings, with what is given in their place. Raises InputError."""
+    usual = QUICK if quick else StressConfig()
+    return replace(
+        usual,
+        frames=tuple(frames) if frames else usual.frames,
+        replicas=replicas or usual.replicas,
+        guards=tuple(guards) if guards else usual.guards,
+        sections=tuple(sections) if sections else usual.sections,
+        seed=seed,
+    )
+
+
+def stress_weights(
+    weights: str | Path, folder: Path, config: StressConfig, *, scene: str | None = None,
+    report: ReportFn = lambda name: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
+
+    Weights for many molecules are tried on `scene`, as `systems.prepare.source` reads it, or the first that they were
+    trained on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that
+    cannot be written; KeyboardInterrupt says what is kept.
+    """
+    from surrogate.data.shipped import weights_path
+    from surrogate.data.weights import load_weights
+    from surrogate.sampling.domain import fit_weights
+
+    loaded = load_weights(weights_path(weights))
+    if scene is not None:
+        from systems.prepare.source import prepare
+
+        loaded, _ = fit_weights(prepare(scene), loaded)
+    elif loaded.domain.transferable:
+        loaded, _ = fit_weights(loaded.domain.scene, loaded)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with --out.") from error
+    try:
+        return run_stress(loaded, folder, config, report=report)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{folder} keeps what was done; the same command goes on") from None
+
+
+def run_stress(weights: Weights, folder: Path, config: StressConfig, *, report: ReportFn) -> dict[str, Any]:
+    """Run the sections and return their rows, JSON-able; rollouts stay in `folder` and are resumed when run again.
+    Weights are for one molecule (`sampling.domain.fit_weights`).
+
+    Tables, plot and JSON are written anew after each section, so that what is done survives an interruption; sections
+    that an earlier run of the same weights left in `folder` stay where this one does not run them. `report` is told of
+    each section as it begins. Raises SurromdError where a rollout cannot be written.
+    """
+    result: dict[str, Any] = {
+        "weights": weights.path.name,
+        "weights_hash": weights.hash,
+        "model": weights.model.arch,
+        "domain": weights.domain.describe(),
+        "scene": weights.domain.scene.name,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine_facts(),
+        "seed": config.seed,
+    }
+    sections = _earlier_sections(folder, weights)
+    for name in (s for s in SECTIONS if s in config.sections):
+        report(name)
+        rows = _RUN[name](weights, folder, config)
+        if name == "length":
+            rows = _with_other_lengths(sections.get(name, []), rows)
+        sections[name] = rows
+        result["sections"] = {s: sections[s] for s in SECTIONS if s in sections}
+        write_stress(result, folder)
+    return result
+
+
+def _earlier_sections(folder: Path, weights: Weights) -> dict[str, list[dict[str, Any]]]:
+    try:
+        found = json.loads((folder / "stress.json").read_text(encoding="utf-8"))
+        same = found["weights_hash"] == weights.hash and found.get("scene", weights.domain.scene.name) == (
+            weights.domain.scene.name
+        )
+        return dict(found["sections"]) if same else {}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {}
+
+
+def _with_other_lengths(earlier: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the new rows among the earlier ones of another guard or length."""
+    done = {(row["guard"], row.get("asked")) for row in new}
+    rows = [row for row in earlier if (row["guard"], row.get("asked")) not in done] + new
+    return sorted(rows, key=lambda row: (row["guard"], row.get("asked", 0)))
+
+
+def _length(weights: Weights, folder: Path, config: StressConfig) -> list[dict[str, Any]]:
+    return [
+        _one_length(weights, folder, config, n_frames, guard) for guard in config.guards for n_frames in config.frames
+    ]
+
+
+def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: int, guard: str) -> dict[str, Any]:
+    from surrogate.sampling.config import RolloutConfig
+    from surrogate.sampling.runner import rollout
+
+    scene, lag_ps = weights.domain.scene, weights.domain.lag_ps
+    each = -(-n_frames // config.replicas)
+    outs = [folder / f"{guard}_{n_frames}_r{k}.h5" for k in range(config.replicas)]
+    row: dict[str, Any] = {"guard": guard, "asked": n_frames, "replicas": config.replicas}
+    try:
+        rollout(scene, weights, outs, RolloutConfig(time_ps=each * lag_ps, seed=config.seed, guard=guard), resume=True)
+    except SimulationError as error:  # stopped by the guards: what came before is judged
+        row["outcome"] = str(error)
+        if not all(path.exists() for path in outs):
+            return row
+    except SurromdError as error:
+        return row | {"outcome": str(error)}
+    geometry = Geometry.from_dict(weights.domain.geometry)
+    replicas: list[Frames] = []
+    unmarked = chunks = caught = 0
+    draw_s = check_s = help_s = 0.0
+    for path in outs:
+        with open_trajectory(path) as reader:
+            frames = reader.read()
+            flags = reader.flags
+            account, cost = reader.record["interventions"], reader.record.get("cost", {})
+        replicas.append(frames)
+        bad = (check_frames(frames, geometry) & np.uint16(INVALID)) != 0
+        unmarked += int(np.count_nonzero(bad & ((flags & np.uint16(INVALID)) == 0))) if flags is not None else len(bad)
+        chunks, caught = chunks + account["chunks"], caught + account["chunks_caught"]
+        seconds = account["seconds"]
+        draw_s, check_s = seconds.get("draw", 0.0), seconds.get("check", 0.0)
+        help_s = sum(spent for of, spent in seconds.items() if of not in ("draw", "check"))
+        row["wall_s"] = cost.get("batch_wall_s")
+    if min(map(len, replicas)) == 0:
+        return row
+    row |= measure_validity(replicas, geometry, lag_ps).to_dict()
+    row |= {
+        "invalid_unmarked": unmarked,
+        "chunks_helped_%": 100.0 * caught / max(chunks, 1),
+        "checks_%": 100.0 * check_s / max(draw_s, 1e-9),
+        "help_%": 100.0 * help_s / max(draw_s, 1e-9),
+    }
+    return row | {"drift": measure_drift(replicas, scene, geometry) | _energy_drift(weights, replicas)}
+
+
+def _energy_drift(weights: Weights, replicas: list[Frames]) -> dict[str, Any]:
+    """Mean energies of relaxed frames in kJ/mol, first and last tenth, with standard errors; empty without OpenMM."""
+    from surrogate.sampling.openmm.coupling import Coupling
+
+    try:
+        coupling = Coupling(weights)
+    except InputError as error:
+        return {"energy": f"not computed: {error}"}
+    tenth = max(1, min(map(len, replicas)) // 10)
+    out: dict[str, Any] = {}
+    try:
+        for key, part in (("first", slice(tenth)), ("last", slice(-tenth, None))):
+            pool = np.concatenate([r[part] for r in replicas])
+            energies = []
+            for frame in pool[:: max(1, len(pool) // _ENERGY_FRAMES)]:
+                try:
+                    energies.append(coupling.relax(frame).potential_kj_mol)
+                except SurromdError:  # beyond repair; the validity rows count it
+                    continue
+            if energies:
+                out[f"energy_{key}_kj_mol"] = float(np.mean(energies))
+                out[f"energy_{key}_error_kj_mol"] = float(np.std(energies) / np.sqrt(len(energies)))
+    finally:
+        coupling.close()
+    return out
+
+
+def _invariance(weights: Weights, folder: Path, config: StressConfig) -> list[dict[str, Any]]:
+    return [row for kind in ("fp32", "bf16") for row in odd_inputs.measure_invariance(weights, precision=kind, seed=1)]
+
+
+_RUN: dict[str, Callable[[Any, Path, StressConfig], list[dict[str, Any]]]] = {
+    "length": _length,
+    "invariance": _invariance,
+    "inputs": lambda w, _, c: odd_inputs.measure_odd_inputs(w, chunks=max(2, c.chunks // 2), seed=c.seed),
+    "precision": lambda w, _, c: other_arithmetic.measure_precision(w, compiled=c.compiled, seed=c.seed),
+    "batches": lambda w, _, c: other_arithmetic.measure_batches(
+        w, seed=c.seed, batches=other_arithmetic.BATCHES if c.compiled else other_arithmetic.BATCHES[:2]
+    ),
+    "solvers": lambda w, _, c: other_arithmetic.measure_solvers(w, chunks=c.chunks, seed=c.seed),
+    "openmm": lambda w, _, c: other_arithmetic.measure_openmm(w, n_frames=c.openmm_frames, seed=c.seed),
+}

@@ -1,0 +1,478 @@
+"""The command line: parsing and printing only. Every verb is one call of `surrogate.api`, imported when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from surrogate.cli.bench_verbs import bench, stress
+from surrogate.cli.options import (
+    ArchOpt,
+    Atoms,
+    AtomsOpt,
+    DeviceOpt,
+    EnergyEveryOpt,
+    EntitiesOpt,
+    FailOn,
+    ForceOpt,
+    Guard,
+    GuardOpt,
+    HydrogensOpt,
+    JsonOpt,
+    MdBetweenOpt,
+    OverwriteOpt,
+    Precision,
+    QuietOpt,
+    ResumeOpt,
+    SaveForcesOpt,
+    SaveVelocitiesOpt,
+    SceneArg,
+    SeedOpt,
+    SelectOpt,
+    Solver,
+    Stiff,
+    ValidationOpt,
+    VelocitiesOpt,
+    WantedTemperatureOpt,
+    literal,
+    spread_options,
+)
+from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
+from surrogate.cli.reproduce_verb import reproduce
+from surrogate.verbs.md_options import MDOptions, Preparation, Replicas
+from systems.errors import SurromdError
+from systems.files.outside import printable
+from systems.interrupts import interrupted_by_signals
+from systems.units import (
+    parse_temperature_k,
+    parse_time_ps,
+    parse_wall_s,
+)
+
+
+class _Group(TyperGroup):
+    """Turns whatever a verb raises into one line on stderr and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        if os.environ.get("SURROMD_DEBUG") == "1":
+            return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            _fail(f"interrupted; {stop.args[0] if stop.args else 'nothing was written'}", 130)
+        except SurromdError as error:
+            _fail(f"error: {error}", 1)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            _fail(f"error: {_os_error(error)}", 1)
+        except MemoryError:
+            _fail("error: out of memory; ask for fewer frames or replicas at once", 1)
+        except _usage_errors():
+            raise
+        except Exception as error:  # a fault of ours: one line for the user, the rest on demand
+            if "null byte" in str(error):
+                _fail("error: a path holds a NUL character, which no file's name can have", 1)
+            _fail(f"error: unexpected {type(error).__name__}: {error} (a bug; SURROMD_DEBUG=1 shows where)", 1)
+
+
+def _usage_errors() -> tuple[type[BaseException], ...]:
+    """Click's own exceptions, which end in its own messages and exit codes (typer 0.26 and newer vendor click)."""
+    usage = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+    return (usage, typer.Exit, typer.Abort)
+
+
+def _fail(message: str, code: int) -> None:
+    typer.echo(printable(" ".join(message.split())), err=True)
+    raise typer.Exit(code) from None
+
+
+def _os_error(error: OSError) -> str:
+    # h5py puts the errno into the text and leaves the attribute empty.
+    if error.errno == 28 or "No space left" in str(error) or "errno = 28" in str(error):
+        where = f" ({error.filename})" if error.filename else ""
+        return f"the disk is full{where}; free some space and run again (--resume where the verb has it)"
+    if error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Reference MD with OpenMM, learned surrogate rollouts, and a judge that compares the two.",
+    epilog="SCENE: library name, path (.pdb, .cif, .sdf, .mol, .mol2), smiles:CCO or sequence:ACE-ALA-NME. "
+    "Durations carry units: 50ns, 10ps, 2fs.",
+)
+app.add_typer(bench, name="bench")
+app.command()(stress)
+app.command()(reproduce)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the report.")] = Path(
+        "surromd-demo"
+    ),
+    seed: SeedOpt = 0,
+    quiet: QuietOpt = False,
+) -> None:
+    """The whole way on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
+    from surrogate import api
+
+    result = api.demo(out, seed=seed, quiet=quiet)
+    print_comparison(result, out / "report.html", as_json=False, quiet=quiet)
+
+
+@app.command()
+def systems(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this one.")] = None,
+    as_json: JsonOpt = False,
+) -> None:
+    """List the library of named scenes, or describe one."""
+    from surrogate import api
+
+    found = api.systems(name)
+    if as_json:
+        print_json(found)
+    elif name is None:
+        print_library(found)
+    else:
+        print_pairs(found[0])
+
+
+@app.command()
+@spread_options
+def plan(
+    scene: SceneArg,
+    *,
+    time: Annotated[str | None, typer.Option("--time", help="Estimate the wall time of a run this long.")] = None,
+    options: MDOptions,
+    as_json: JsonOpt = False,
+) -> None:
+    """What a reference run of SCENE will do, what it skips, why, and what that saves."""
+    from surrogate import api
+
+    account = api.plan(scene, time_ps=None if time is None else parse_time_ps(time, "--time"), **options)
+    if as_json:
+        print_json(account)
+    else:
+        print_pairs(account)
+
+
+@app.command()
+@spread_options
+def reference(
+    scene: SceneArg,
+    *,
+    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
+    save_every: Annotated[
+        str | None, typer.Option("--save-every", help=literal("Interval between saved frames. [default: 1ps]"))
+    ] = None,
+    options: MDOptions,
+    save_velocities: SaveVelocitiesOpt = False,
+    save_forces: SaveForcesOpt = False,
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Simulate SCENE with OpenMM and write the trajectory."""
+    from surrogate import api
+
+    written = api.reference(
+        scene,
+        out,
+        time_ps=parse_time_ps(time, "--time"),
+        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
+        save_velocities=save_velocities,
+        save_forces=save_forces,
+        seed=seed,
+        resume=resume,
+        overwrite=overwrite,
+        quiet=quiet,
+        **options,
+    )
+    print_written(written, as_json, quiet)
+
+
+@app.command()
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder, instead of the one that FILE names.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes here; one per core.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Of Dask, such as tcp://host:8786.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and start nothing.")] = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run it again to go on."""
+    from surrogate import api
+
+    result = api.campaign(file, out=out, workers=workers, scheduler=scheduler, dry_run=dry_run, quiet=quiet)
+    if as_json:
+        print_json(result)
+    elif dry_run:
+        print_pairs(result)
+    elif not quiet:
+        typer.echo(f"{result['file']}: {result['summary']}")
+    if result.get("failed"):
+        for name, reason in result["failed"].items():
+            typer.echo(f"failed: {name}: {reason}", err=True)
+        raise typer.Exit(1)
+
+
+@app.command()
+def windows(
+    references: Annotated[
+        list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
+    validation: ValidationOpt = None,
+    velocities: VelocitiesOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Turn reference trajectories into training data: one compact file."""
+    from surrogate import api
+
+    written = api.windows(
+        references, out, validation=validation, velocities=velocities, overwrite=overwrite, quiet=quiet
+    )
+    print_written([written], as_json, quiet)
+
+
+@app.command()
+def train(
+    references: Annotated[
+        list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write, .safetensors.")],
+    arch: ArchOpt = "lam-slide",
+    config: Annotated[Path | None, typer.Option("--config", help="TOML of model and training settings.")] = None,
+    budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
+    start_from: Annotated[
+        str | None, typer.Option("--from", help="Weights whose second stage is trained further: a name or a file.")
+    ] = None,
+    validation: ValidationOpt = None,
+    time_reversal: Annotated[
+        bool, typer.Option("--time-reversal", help="Show windows backwards too: right for MD in equilibrium.")
+    ] = False,
+    rare_draws: Annotated[
+        float, typer.Option("--rare-draws", help="Share of windows drawn for a rare state, weighted down by as much.")
+    ] = 0.0,
+    rare_kinds: Annotated[
+        bool, typer.Option("--rare-kinds", help="Tell the network the rare state, and learn how often each comes.")
+    ] = False,
+    hydrogens: HydrogensOpt = None,
+    entities: EntitiesOpt = None,
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Know atoms by their bonds: one model for many molecules, and unseen ones.")
+    ] = False,
+    longest_lag: Annotated[
+        str | None, typer.Option("--longest-lag", help="Learn every frame spacing up to this one, such as 1ns.")
+    ] = None,
+    device: DeviceOpt = "auto",
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Train a surrogate on reference trajectories."""
+    from surrogate import api
+
+    written = api.train(
+        references,
+        out,
+        arch=arch,
+        config=config,
+        budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
+        steps=steps,
+        start_from=start_from,
+        validation=validation,
+        time_reversal=time_reversal,
+        rare_draws=rare_draws,
+        rare_kinds=rare_kinds,
+        hydrogens=hydrogens,
+        entities=entities,
+        graph=graph,
+        longest_lag_ps=None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag"),
+        seed=seed,
+        device=device,
+        resume=resume,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+    from surrogate.training.devices import is_first_process
+
+    if is_first_process():
+        print_written([written], as_json, quiet)
+
+
+@app.command()
+@spread_options
+def rollout(
+    scene: SceneArg,
+    *,
+    weights: Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")],
+    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 100ns.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
+    save_every: Annotated[
+        str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
+    ] = None,
+    lag: Annotated[
+        str | None, typer.Option("--lag", help="Of one step, of weights for several. Default: --save-every if it fits.")
+    ] = None,
+    replicas: Replicas = 1,
+    solver: Annotated[
+        Solver | None, typer.Option("--solver", help="fitted: for 2 to 10 steps. Default: the one that suits.")
+    ] = None,
+    solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
+    precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
+    compile_: Annotated[
+        bool, typer.Option("--compile", help="Compile the network: a minute, a C++ compiler; for long rollouts.")
+    ] = False,
+    stiff: Annotated[
+        Stiff | None, typer.Option("--stiff", help="Bonds and angles. Default: imposed, where the weights know how.")
+    ] = None,
+    guard: GuardOpt = Guard.flag,
+    energy_every: EnergyEveryOpt = 0,
+    md_between: MdBetweenOpt = None,
+    select: SelectOpt = None,
+    atoms: AtomsOpt = Atoms.all,
+    force: ForceOpt = False,
+    temperature: WantedTemperatureOpt = None,
+    preparation: Preparation,
+    seed: SeedOpt = 0,
+    resume: ResumeOpt = False,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Roll SCENE forward with a trained surrogate, in chunks."""
+    from surrogate import api
+
+    written = api.rollout(
+        scene,
+        weights,
+        out,
+        time_ps=parse_time_ps(time, "--time"),
+        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
+        lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
+        replicas=replicas,
+        seed=seed,
+        solver=None if solver is None else solver.value,
+        solver_steps=solver_steps,
+        precision=precision.value,
+        compile=compile_,
+        stiff=None if stiff is None else stiff.value,
+        guard=guard.value,
+        energy_every=energy_every,
+        md_between_ps=0.0 if md_between is None else parse_time_ps(md_between, "--md-between"),
+        select=select,
+        atoms=atoms.value,
+        force=force,
+        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
+        resume=resume,
+        overwrite=overwrite,
+        quiet=quiet,
+        **preparation,
+    )
+    print_written(written, as_json, quiet)
+
+
+@app.command()
+def compare(
+    reference: Annotated[str, typer.Argument(metavar="REF", help="The truth: a file, folder, 'glob' or a,b,c.")],
+    candidates: Annotated[
+        list[str], typer.Argument(metavar="TRAJ...", help="Each argument one candidate, written alike.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; .json, .md go beside it.")] = Path(
+        "report.html"
+    ),
+    replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
+    top: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--top", help="Topology of files without one: once for all, or for REF, each TRAJ, the replicate."
+        ),
+    ] = None,
+    lag: Annotated[
+        list[str] | None,
+        typer.Option("--lag", help="Time between frames, where a file does not say; as --top. '-' leaves one out."),
+    ] = None,
+    energies: Annotated[
+        bool, typer.Option("--energies", help="Energies of every k-th frame too, by the reference's force field.")
+    ] = False,
+    show_all: Annotated[bool, typer.Option("--all", help="Print every row, not the verdict alone.")] = False,
+    fail_on: Annotated[
+        FailOn | None, typer.Option("--fail-on", help="Exit 1 when a candidate is judged so, or worse.")
+    ] = None,
+    overwrite: OverwriteOpt = False,
+    quiet: QuietOpt = False,
+    as_json: JsonOpt = False,
+) -> None:
+    """Judge trajectories against a reference: is it right, how wrong is it, what did it cost?"""
+    from surrogate import api
+
+    result = api.compare(
+        reference,
+        candidates,
+        out,
+        replicate=replicate,
+        top=None if not top else [None if x == "-" else x for x in top],
+        lag_ps=None if not lag else [None if x == "-" else parse_time_ps(x, "--lag") for x in lag],
+        energies=energies,
+        overwrite=overwrite,
+    )
+    print_comparison(result, out, as_json=as_json, quiet=quiet, show_all=show_all)
+    bad = {FailOn.different: ("different", "broken"), FailOn.broken: ("broken",)}
+    if fail_on is not None and any(j.status in bad[fail_on] for j in result.judgements):
+        raise typer.Exit(1)
+
+
+@app.command()
+def info(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's folder."),
+    ],
+    as_json: JsonOpt = False,
+) -> None:
+    """What a file is and where it came from."""
+    from surrogate import api
+
+    found = api.info(path)
+    if as_json:
+        print_json(found)
+    else:
+        print_pairs(found)
+
+
+def main() -> None:
+    """Entry point of the command `surromd`."""
+    # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when
+    # the numerical libraries load, which is later; a user's own setting stands.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    try:
+        with interrupted_by_signals():
+            app(prog_name="surromd")
+    except KeyboardInterrupt:  # outside any verb: while starting
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""What the command line prints: records, what was written, verdicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from systems.files.outside import printable
+
+if TYPE_CHECKING:
+    from surrogate.judge.comparison import Comparison, Judgement
+
+
+def print_json(value: Any) -> None:
+    """Print a value as indented JSON on stdout."""
+    import json
+
+    typer.echo(json.dumps(value, indent=2, default=str))
+
+
+def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
+    """Print a record as aligned lines; nested records are indented, lists of plain values joined."""
+    shown = {k: v for k, v in record.items() if v is not None and v != () and v != []}
+    width = max((len(k) for k in shown), default=0)
+    for key, value in shown.items():
+        margin = " " * indent
+        if isinstance(value, dict):
+            typer.echo(f"{margin}{key}")
+            print_pairs(value, indent + 2)
+        elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
+            typer.echo(f"{margin}{key}")
+            for entry in value:
+                typer.echo(f"{margin}  {_one_line(entry)}")
+        else:
+            text = ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else _plain(value)
+            typer.echo(f"{margin}{key:<{width}}  {text}")
+
+
+def _one_line(entry: Any) -> str:
+    if not isinstance(entry, dict):
+        return printable(str(entry))
+    if "what" in entry:
+        saves = f" ({entry['saves']})" if entry.get("saves") else ""
+        return f"{entry['what']}: {entry['why']}{saves}"
+    return ", ".join(f"{key} {_plain(value)}" for key, value in entry.items())
+
+
+def _plain(value: Any, digits: int = 6) -> str:
+    return f"{value:.{digits}g}" if isinstance(value, float) else printable(str(value))
+
+
+def print_library(entries: list[dict[str, Any]]) -> None:
+    """Print the named scenes in their groups, a line each, and what can be had besides."""
+    from systems.library.named_scenes import on_demand
+
+    group = ""
+    for entry in entries:
+        if entry["group"] != group:
+            typer.echo(f"{chr(10) if group else ''}{entry['group']}")
+            group = entry["group"]
+        size = f"{entry['n_atoms']:>4} atoms  {entry['formula']}"
+        typer.echo(f"  {entry['name']:<20} {size:<26} {entry['title']}")
+    typer.echo(f"{chr(10)}{on_demand()}")
+
+
+def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
+    """Say what was written: its length, what it cost, and how the run went."""
+    from surrogate import api
+
+    records = [api.info(path) for path in paths] if as_json or not quiet else []
+    if as_json:
+        print_json(records)
+    for path, record in zip(paths, records, strict=False):
+        if not as_json:
+            typer.echo(f"{path}: {record['summary']}")
+            for line in record.get("account", []):
+                typer.echo(f"  {line}")
+
+
+def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool, show_all: bool = False) -> None:
+    """Print each candidate's verdict, what is wrong with it and what it is worth; with `show_all` every row between
+    reference and replicate."""
+    if as_json:
+        print_json(result.to_dict())
+        return
+    for judgement in () if quiet else result.judgements:
+        typer.echo(f"{judgement.account.label}: {judgement.verdict}")
+        for finding in judgement.findings:
+            typer.echo(f"  - {finding}")
+        if show_all:
+            _print_rows(judgement)
+        if judgement.speed_ratio is not None:
+            typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
+        for note in judgement.notes:
+            typer.echo(f"  note: {note}")
+    for note in () if quiet else result.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"report: {report}")
+
+
+def _print_rows(judgement: Judgement) -> None:
+    typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+    for row in judgement.rows:
+        figures = (row.reference, row.candidate, row.replicate)
+        numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
+        typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")

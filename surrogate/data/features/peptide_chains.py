@@ -1,0 +1,200 @@
+"""Peptides taken apart into residues with internal coordinates (`models.chains`), and what these are in references."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import networkx as nx
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from surrogate.data.poses import fitted_atoms
+from surrogate.models.peptides.chains import (
+    RIGID,
+    STIFF,
+    TURNING,
+    ChainCode,
+    ChainFeatures,
+    ChainLayout,
+    ChainScale,
+    internal_coordinates,
+)
+from systems.chemistry.graph import backbone_torsions, bonded_graph, ring_bonds
+from systems.errors import InputError
+from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from surrogate.models.peptides.model import PeptideConfig
+
+# A length that varies by less, by rounding alone, is one that the reference holds rigid.
+RIGID_NM = 2e-4
+_LENGTH, _ANGLE, _DIHEDRAL = "length", "angle", "dihedral"
+# Where the first residue's atoms are placed from: caps (ACE), then amino acids.
+_ROOTS = (("CH3", "C", "O"), ("N", "CA", "C"))
+
+
+def chain_layout(scene: Scene) -> ChainLayout:
+    """Return how the atoms of one peptide chain follow from internal coordinates.
+
+    Residues and atom names are those of `systems.prepare.peptide.build_peptide`; a chain with other names is matched to
+    one first. Torsions are those about bonds in no ring. Raises InputError for a scene that is no single chain of amino
+    acids with at least one peptide bond.
+    """
+    graph = bonded_graph(scene)
+    if not len(backbone_torsions(scene)["omega"]) or not nx.is_connected(graph):
+        raise InputError(f"{scene.name} is no single peptide chain, which residues as tokens need.")
+    return _Builder(scene, graph).layout()
+
+
+class _Builder:
+    """Walks along the bonds of a chain, placing each atom by three before it."""
+
+    def __init__(self, scene: Scene, graph: nx.Graph) -> None:
+        self.scene, self.graph = scene, graph
+        self.ring = {frozenset(bond) for bond in ring_bonds(scene).tolist()}
+        self.residue = scene.residue_of_atom.tolist()
+        self.names = scene.atom_names
+        self.placed: list[tuple[int, int, int, int]] = []
+        self.primary: list[int] = []
+        self.residue_of: list[int] = []
+        self.keys: list[str] = []
+        self.kinds: list[int] = []
+
+    def layout(self) -> ChainLayout:
+        a, b, c = root = self._root()
+        self._add(self.residue[b], (_LENGTH, (a, b)), (_LENGTH, (c, b)), (_ANGLE, (a, b, c)))
+        before = {a: b, c: b}
+        seen, queue = set(root), [b, a, c]
+        while queue:
+            near = queue.pop(0)
+            # From the root's middle the other two stand beside an atom, not behind it.
+            next_ = before.get(near, a)
+            last = c if near == b else before.get(next_, c if near == a else a)
+            alone = near == b or frozenset((near, next_)) in self.ring
+            beyond = sorted((i for i in self.graph[near] if i not in seen), key=lambda i: self._rank(i, near))
+            first = len(self.placed)
+            for atom in beyond:
+                seen.add(atom)
+                queue.append(atom)
+                before[atom] = near
+                self._place(atom, near, next_, last, None if alone else first)
+        return ChainLayout(
+            self.scene.n_atoms, root, tuple(self.placed), tuple(self.primary), tuple(self.residue_of),
+            tuple(self.keys), tuple(self.kinds), tuple(self.scene.residue_names),
+        )  # fmt: skip
+
+    def _root(self) -> tuple[int, int, int]:
+        at = {self.names[i]: i for i in range(self.scene.n_atoms) if self.residue[i] == 0}
+        for names in _ROOTS:
+            if all(name in at for name in names):
+                return at[names[0]], at[names[1]], at[names[2]]
+        raise InputError(f"{self.scene.name} begins with {self.scene.residue_names[0]}, no cap and no amino acid.")
+
+    def _rank(self, atom: int, near: int) -> tuple[bool, bool, str]:
+        """Sorts what lies beyond a bond: on along the backbone first, then heavy atoms, then by name."""
+        onwards = {"N": ("CA", "CH3"), "CA": ("C",), "C": ("N",)}.get(self.names[near], ())
+        along = self.names[atom] in onwards and self.residue[atom] >= self.residue[near]
+        return not along, self.scene.elements[atom] == "H", self.names[atom]
+
+    def _place(self, atom: int, near: int, next_: int, last: int, first: int | None) -> None:
+        """Place an atom by three; `first`: the row whose dihedral about the same bond is the torsion, if one is."""
+        row = len(self.placed)
+        self.placed.append((atom, near, next_, last))
+        self.primary.append(row if first is None else first)
+        # Counted from the torsion, a dihedral does not depend on what the torsion is counted from.
+        origin = last if first in (None, row) else self.placed[first or 0][0]
+        # The next residue's N is placed by this one's psi.
+        owner = self.residue[near] if self.names[atom] == "N" else self.residue[atom]
+        self._add(
+            owner, (_LENGTH, (atom, near)), (_ANGLE, (atom, near, next_)), (_DIHEDRAL, (atom, near, next_, origin)),
+            turning=first == row,
+        )  # fmt: skip
+
+    def _add(self, owner: int, *coordinates: tuple[str, tuple[int, ...]], turning: bool = False) -> None:
+        for what, atoms in coordinates:
+            self.residue_of.append(owner)
+            self.kinds.append(TURNING if turning and what == _DIHEDRAL else STIFF)
+            names = [self._name(i, owner) for i in atoms]
+            if what != _DIHEDRAL and names[0] > names[-1]:
+                names.reverse()
+            self.keys.append(" ".join((self.scene.residue_names[owner], what, *names)))
+
+    def _name(self, atom: int, owner: int) -> str:
+        """Return an atom's name as its coordinate's residue sees it; a cap's methyl stands where a neighbour has CA."""
+        away = self.residue[atom] - owner
+        if away == 0:
+            return self.names[atom]
+        return f"{'CA' if self.names[atom] == 'CH3' else self.names[atom]}{away:+d}"
+
+
+def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
+    """Return what a model of peptides is told of one. Raises InputError as `chain_layout` and `settled` do."""
+    if config.scale is None:
+        raise InputError("these weights do not say how peptides' coordinates are scaled.")
+    layout = settled(chain_layout(scene), config.scale)
+    fitted = fitted_atoms(scene)
+    template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
+    return ChainFeatures(ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted)
+
+
+def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -> ChainScale:
+    """Measure stiff coordinates over frames `(n, n_atoms, 3)` nm of several peptides, each frame as much as any other.
+
+    Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots.
+    """
+    found: dict[str, list[npt.NDArray[np.float64]]] = {}
+    slots: dict[str, int] = {}
+    turning: dict[str, None] = {}
+    for layout, x in frames:
+        rows, primary = torch.tensor(layout.placed), torch.tensor(layout.primary)
+        values = internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, primary).numpy()
+        for k, (key, kind) in enumerate(zip(layout.keys, layout.kinds, strict=True)):
+            if kind == TURNING:
+                turning[key] = None
+            else:
+                found.setdefault(key, []).append(values[:, k])
+    mean, deviation = {}, {}
+    for key, parts in found.items():
+        values = np.concatenate(parts)
+        middle = float(values.mean())
+        if key.split()[1] == _DIHEDRAL:
+            middle = float(np.angle(np.exp(1j * values).mean()))
+            values = np.angle(np.exp(1j * (values - middle)))
+        mean[key], deviation[key] = middle, float(values.std())
+        if key.split()[1] == _LENGTH and deviation[key] < RIGID_NM:
+            deviation[key] = 0.0
+    taken: dict[str, int] = {}
+    # Torsions first, so that the backbone's stand in the same places for all residues.
+    for key in (*sorted(turning, key=_backbone_first), *sorted(k for k in found if deviation[k] > 0.0)):
+        residue = key.split()[0]
+        slots[key] = taken.get(residue, 0)
+        taken[residue] = slots[key] + (2 if key in turning else 1)
+    return ChainScale(mean, deviation, slots, max(taken.values(), default=0))
+
+
+def _backbone_first(key: str) -> tuple[int, str]:
+    """Sorts torsions by the atom they place: omega, phi, psi, then the others by name."""
+    atom = key.split()[2]
+    return {"CA": 0, "C": 1, "N+1": 2, "O": 2}.get(atom, 3), key
+
+
+def settled(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
+    """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data tell of."""
+    unknown = [
+        key
+        for key, kind in zip(layout.keys, layout.kinds, strict=True)
+        if (key not in scale.slots if kind == TURNING else key not in scale.mean)
+    ]
+    if unknown:
+        raise InputError(
+            f"{len(unknown)} internal coordinates occur in no training molecule, the first is {unknown[0]!r}; train on "
+            "a peptide that has this residue at such a place."
+        )
+    kinds = tuple(
+        RIGID if kind == STIFF and scale.deviation[key] == 0.0 else kind
+        for key, kind in zip(layout.keys, layout.kinds, strict=True)
+    )
+    return replace(layout, kinds=kinds)

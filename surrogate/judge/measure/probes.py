@@ -1,0 +1,347 @@
+"""What is measured beside phi, psi, bonds and validity: index arrays and names, found once per comparison.
+
+`find_probes` looks at the scene and at a sample of the reference; `measure_block` measures frames with the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.measure import hydrogen_bonds, puckers
+from surrogate.judge.measure.equal_atoms import equal_rows
+from surrogate.judge.measure.torsions import Torsion, find_torsions
+from systems.chemistry.frame_columns import bond_angle, column_blocks, squared_distance, torsion_angle
+from systems.scene import Scene
+
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.floating[Any]]
+
+# The columns of each family, `(n_frames, n_columns)`; see `Probes`.
+Family = Literal["torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers"]
+FAMILIES: tuple[Family, ...] = (
+    "torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers",
+)  # fmt: skip
+
+ATOM_CONTACT_NM = 0.45
+RESIDUE_CONTACT_NM = 0.8
+MAX_COLUMNS = 256
+_MANY_RESIDUES = 5
+_MANY_ATOMS = 100
+_FLAT_RING_NM = 0.01
+_ROUNDS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """What every frame of a comparison is measured for. Families and their columns:
+
+    "torsions" `(n, len(torsions))` rad, folded (m times the angle, on [-pi, pi]); "angles" `(n, n_angles)` rad;
+    "shape" `(n, 5)`: radius of gyration, RMSD, end-to-end distance (nm), contacts formed, share of the reference's
+    contacts kept; "deviation" `(n, n_fit)` squared distance in nm² of each fitted atom from the reference's mean
+    structure; "contacts" and "hydrogen_bonds" `(n, k)` bool; "puckers" `(n, 2 n_rings)`: amplitude nm, angle rad.
+    A frame that is not finite has NaN, and False in the families of bool.
+
+    `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
+    (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
+    reference forms in more than half of its frames. What the molecule's symmetry makes equal is chosen together.
+    `classes` `(n_atoms,)`: equal for atoms that have no identity of
+    their own, such as the hydrogens of a methyl group. `left_out` says what is not measured, and why; `whole` is False
+    where atoms of the scene are missing.
+    """
+
+    scene: Scene
+    torsions: tuple[Torsion, ...]
+    angles: IntArray
+    fit_idx: IntArray
+    mean_nm: npt.NDArray[np.float64]
+    ends: tuple[int, int] | None
+    contact_nm: float
+    all_contacts: IntArray
+    contacts: IntArray
+    native: IntArray
+    hydrogen_bonds: IntArray
+    rings: tuple[tuple[int, ...], ...]
+    classes: IntArray
+    left_out: tuple[tuple[str, str], ...] = ()
+    whole: bool = True
+
+    def labels(self, family: Family) -> list[str]:
+        """Return a name per column of a family."""
+        names, scene = self.scene.atom_names, self.scene
+        made: dict[Family, Callable[[], list[str]]] = {
+            "torsions": lambda: [t.label for t in self.torsions],
+            "angles": lambda: [_angle_label(scene, row) for row in self.angles.tolist()],
+            "shape": lambda: ["radius of gyration", "RMSD", "end-to-end distance", "contacts", "contacts kept"],
+            "deviation": lambda: [f"{names[i]} ({_residue(scene, i)})" for i in self.fit_idx.tolist()],
+            "contacts": lambda: [_pair_label(scene, row) for row in self.contacts.tolist()],
+            "hydrogen_bonds": lambda: [hydrogen_bonds.triplet_label(scene, row) for row in self.hydrogen_bonds],
+            "puckers": lambda: [
+                f"{what}, {puckers.ring_label(scene, ring)}" for ring in self.rings for what in ("amplitude", "angle")
+            ],
+        }
+        return made[family]()
+
+
+def find_probes(
+    scene: Scene, sample_nm: FloatArray, *, parent: Scene | None = None, kept: IntArray | None = None
+) -> Probes:
+    """Return what to measure on `scene`, given finite frames of the reference `(n, n_atoms, 3)` nm.
+
+    Where `scene` is what is left of a larger `parent`, its atoms `kept`, torsions and rings are found in the parent,
+    and those whose atoms are all left are measured.
+    """
+    from systems.chemistry.graph import atom_classes
+
+    whole = parent or scene
+    place = {int(atom): k for k, atom in enumerate(range(scene.n_atoms) if kept is None else kept)}
+    torsions = tuple(
+        t._replace(
+            quad=_placed(t.quad, place),
+            equal=tuple(_placed(q, place) for q in t.equal if all(i in place for i in q)),
+        )
+        for t in find_torsions(whole)
+        if all(i in place for i in t.quad)
+    )
+    rings = tuple(_placed(r, place) for r in puckers.find_rings(whole) if all(i in place for i in r))
+    left_out: list[tuple[str, str]] = []
+    angles = _thin(_angles(scene), "angles", left_out)
+    fit = _fitted_atoms(scene)
+    contacts, contact_nm = _contact_pairs(scene)
+    triplets = hydrogen_bonds.find_triplets(scene)
+    with np.errstate(invalid="ignore"):
+        blocks = [block for _, block in column_blocks(sample_nm, _widest(contacts, triplets, angles))]
+    classes = atom_classes(whole)[np.arange(scene.n_atoms) if kept is None else kept]
+    equal_contacts, equal_triplets = equal_rows(contacts, classes), equal_rows(triplets, classes)
+    in_contact = _share(lambda x: squared_distance(x, contacts) < contact_nm**2, blocks, len(contacts))
+    bonded = _share(lambda x: hydrogen_bonds.is_formed(x, triplets), blocks, len(triplets))
+    in_contact, bonded = _evened(in_contact, equal_contacts), _evened(bonded, equal_triplets)
+    amplitude = [np.mean(np.concatenate([puckers.pucker(b, r)[0] for b in blocks])) for r in rings]
+    return Probes(
+        scene=scene,
+        torsions=torsions,
+        angles=angles,
+        fit_idx=fit,
+        mean_nm=mean_structure(sample_nm[:, fit]) if len(sample_nm) else np.zeros((len(fit), 3)),
+        ends=_ends(scene),
+        contact_nm=contact_nm,
+        all_contacts=contacts,
+        contacts=contacts[_foremost(np.minimum(in_contact, 1 - in_contact), equal_contacts, "contacts", left_out)],
+        native=np.flatnonzero(in_contact > 0.5),
+        hydrogen_bonds=triplets[_foremost(bonded, equal_triplets, "hydrogen bonds", left_out)],
+        rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
+        classes=classes,
+        left_out=tuple(left_out),
+        whole=kept is None,
+    )
+
+
+def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Family, npt.NDArray[Any]]:
+    """Return every family of `Probes` for frames `(n, n_atoms, 3)` nm."""
+    from systems.chemistry.geometry import superpose
+
+    n = len(frames_nm)
+    out: dict[Family, npt.NDArray[Any]] = {
+        "torsions": np.empty((n, len(probes.torsions)), dtype=np.float32),
+        "angles": np.empty((n, len(probes.angles)), dtype=np.float32),
+        "shape": np.full((n, 5), np.nan, dtype=np.float32),
+        "deviation": np.empty((n, len(probes.fit_idx)), dtype=np.float32),
+        "contacts": np.zeros((n, len(probes.contacts)), dtype=bool),
+        "hydrogen_bonds": np.zeros((n, len(probes.hydrogen_bonds)), dtype=bool),
+        "puckers": np.empty((n, 2 * len(probes.rings)), dtype=np.float32),
+    }
+    quads = np.array([q for t in probes.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
+    of_torsion = np.repeat(np.arange(len(probes.torsions)), [len(t.equal) or 1 for t in probes.torsions])
+    masses = probes.scene.masses_da / max(float(probes.scene.masses_da.sum()), 1e-9)
+    widest = _widest(probes.all_contacts, probes.hydrogen_bonds, probes.angles)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved = superpose(frames_nm[:, probes.fit_idx], probes.mean_nm)
+        squared = ((moved - probes.mean_nm.astype(np.float32)) ** 2).sum(axis=2)
+        out["deviation"][:] = squared
+        out["shape"][:, 1] = np.sqrt(squared.mean(axis=1))
+        for start, x in column_blocks(frames_nm, widest):
+            part = slice(start, start + x.shape[2])
+            angles = torsion_angle(x, quads)
+            for k, torsion in enumerate(probes.torsions):
+                out["torsions"][part, k] = _folded(angles[of_torsion == k], torsion.fold)
+            out["angles"][part] = bond_angle(x, probes.angles).T
+            out["hydrogen_bonds"][part] = hydrogen_bonds.is_formed(x, probes.hydrogen_bonds).T
+            out["contacts"][part] = (squared_distance(x, probes.contacts) < probes.contact_nm**2).T
+            centre = np.einsum("a,xan->xn", masses, x)
+            out["shape"][part, 0] = np.sqrt(np.einsum("a,xan->n", masses, (x - centre[:, None]) ** 2))
+            if probes.ends is not None:
+                out["shape"][part, 2] = np.sqrt(squared_distance(x, np.array([probes.ends]))[0])
+            near = squared_distance(x, probes.all_contacts) < probes.contact_nm**2
+            out["shape"][part, 3] = near.sum(axis=0)
+            if len(probes.native):
+                out["shape"][part, 4] = near[probes.native].mean(axis=0)
+            for k, ring in enumerate(probes.rings):
+                out["puckers"][part, 2 * k : 2 * k + 2] = puckers.pucker(x, ring).T
+    broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
+    if broken.any():
+        for values in out.values():
+            values[broken] = False if values.dtype == bool else np.nan
+    return out
+
+
+def _folded(angles_rad: FloatArray, fold: int) -> FloatArray:
+    """Return `fold` times the torsion told from each of some equal atoms `(k, n)`, their mean direction `(n,)`."""
+    turned = fold * angles_rad
+    if len(turned) > 1:
+        return np.asarray(np.arctan2(np.sin(turned).sum(axis=0), np.cos(turned).sum(axis=0)))
+    return np.asarray(turned[0] - 2 * np.pi * np.round(turned[0] / (2 * np.pi)))
+
+
+def mean_structure(frames_nm: FloatArray) -> npt.NDArray[np.float64]:
+    """Return the mean `(n_atoms, 3)` nm of frames laid over it, found by superposing and averaging in turn.
+
+    Starts at the frame in the middle; `_ROUNDS` turns, after which flexible molecules no longer move by more than the
+    spread of their frames. Source: generalised Procrustes analysis, Gower, Psychometrika 40, 33 (1975).
+    """
+    from systems.chemistry.geometry import superpose
+
+    frames = np.asarray(frames_nm, dtype=np.float64)
+    mean: npt.NDArray[np.float64] = frames[len(frames) // 2]
+    for _ in range(_ROUNDS):
+        mean = superpose(frames, mean).mean(axis=0)
+    return mean
+
+
+def _placed(atoms: Sequence[int], place: dict[int, int]) -> Any:
+    return tuple(place[i] for i in atoms)
+
+
+def _widest(*rows: IntArray) -> int:
+    return max(1, *(len(r) for r in rows))
+
+
+def _share(
+    formed: Callable[[FloatArray], npt.NDArray[np.bool_]], blocks: Sequence[FloatArray], n: int
+) -> npt.NDArray[np.float64]:
+    total = sum(block.shape[2] for block in blocks)
+    if not total or not n:
+        return np.zeros(n)
+    return np.asarray(sum(formed(block).sum(axis=1) for block in blocks) / total, dtype=np.float64)
+
+
+def _evened(share: npt.NDArray[np.float64], groups: Sequence[npt.NDArray[np.intp]]) -> npt.NDArray[np.float64]:
+    """Return the share of each `(k,)` with that of equal ones in its place, their mean."""
+    out = share.copy()
+    for group in groups:
+        out[group] = share[group].mean()
+    return out
+
+
+def _foremost(
+    share: npt.NDArray[np.float64],
+    groups: Sequence[npt.NDArray[np.intp]],
+    what: str,
+    left_out: list[tuple[str, str]],
+) -> IntArray:
+    """Return the columns of the greatest share, at most `MAX_COLUMNS`, with all that are equal to one of them."""
+    if len(share) <= MAX_COLUMNS:
+        return np.arange(len(share))
+    chosen: list[int] = []
+    for group in sorted(groups, key=lambda g: -share[g[0]]):
+        if len(chosen) + len(group) > MAX_COLUMNS:
+            break
+        chosen += group.tolist()
+    left_out.append((f"Single {what}", f"{len(chosen)} of {len(share)} possible ones are followed one by one"))
+    return np.sort(np.array(chosen, dtype=np.int64))
+
+
+def _thin(rows: IntArray, what: str, left_out: list[tuple[str, str]]) -> IntArray:
+    if len(rows) <= MAX_COLUMNS:
+        return rows
+    left_out.append((f"All {what}", f"{MAX_COLUMNS} of {len(rows)}, evenly chosen, are measured"))
+    return rows[np.linspace(0, len(rows) - 1, MAX_COLUMNS).astype(int)]
+
+
+def _angles(scene: Scene) -> IntArray:
+    """Bonded triples i-j-k with i < k; only those of heavy atoms where there are more than can be kept."""
+    from systems.chemistry.graph import bonded_graph
+
+    graph = bonded_graph(scene)
+    rows = [(i, j, k) for j in range(scene.n_atoms) for i in sorted(graph[j]) for k in sorted(graph[j]) if i < k]
+    if len(rows) > MAX_COLUMNS:
+        rows = [row for row in rows if all(scene.elements[i] != "H" for i in row)]
+    return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+
+def _fitted_atoms(scene: Scene) -> IntArray:
+    """Heavy atoms; alpha carbons of what is large; all atoms where that leaves fewer than three."""
+    heavy = scene.heavy_idx
+    alphas = _alpha_carbons(scene)
+    if len(heavy) > _MANY_ATOMS and len(alphas) >= 3:
+        return alphas
+    return heavy if len(heavy) >= 3 else np.arange(scene.n_atoms)
+
+
+def _alpha_carbons(scene: Scene) -> IntArray:
+    """One atom per residue: CA by name, in residues that also hold another atom or are called as amino acids."""
+    found = [i for i, (name, e) in enumerate(zip(scene.atom_names, scene.elements, strict=True))
+             if name == "CA" and e == "C"]  # fmt: skip
+    return np.array(found, dtype=np.int64)
+
+
+def _contact_pairs(scene: Scene) -> tuple[IntArray, float]:
+    """Pairs that may touch, and the distance below which they do.
+
+    Chains of `_MANY_RESIDUES` or more: alpha carbons three or more residues apart, 0.8 nm. Otherwise heavy atoms more
+    than three bonds apart, 0.45 nm.
+    """
+    from systems.chemistry.graph import exclusions
+
+    alphas = _alpha_carbons(scene)
+    if len(alphas) >= _MANY_RESIDUES:
+        residue = scene.residue_of_atom[alphas]
+        chain = np.array([scene.chain_of_residue[r] for r in residue.tolist()])
+        i, j = np.triu_indices(len(alphas), k=1)
+        apart = (np.abs(residue[i] - residue[j]) >= 3) | (chain[i] != chain[j])
+        return np.stack([alphas[i[apart]], alphas[j[apart]]], axis=1), RESIDUE_CONTACT_NM
+    near = {tuple(p) for p in exclusions(scene).tolist()}
+    heavy = scene.heavy_idx.tolist()
+    rows = [(i, j) for a, i in enumerate(heavy) for j in heavy[a + 1 :] if (i, j) not in near]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2), ATOM_CONTACT_NM
+
+
+def _ends(scene: Scene) -> tuple[int, int] | None:
+    """The two heavy atoms furthest apart in bonds (the lowest such pair), None below four bonds; of chains of three
+    residues and more the first and the last alpha carbon, lest a long side chain pass for the end."""
+    import networkx as nx
+
+    from systems.chemistry.graph import bonded_graph
+
+    alphas = _alpha_carbons(scene)
+    chains = [scene.chain_of_residue[r] for r in scene.residue_of_atom[alphas].tolist()]
+    if len(alphas) >= 3 and chains.count(chains[0]) >= 3:
+        return int(alphas[0]), int(alphas[len(chains) - 1 - chains[::-1].index(chains[0])])
+    graph = bonded_graph(scene).subgraph(scene.heavy_idx.tolist())
+    best, longest = None, 3
+    for component in nx.connected_components(graph):
+        start = min(component)
+        # Twice breadth first finds the longest path of a tree, and nearly so with rings.
+        for _ in range(2):
+            lengths = nx.single_source_shortest_path_length(graph, start)
+            far = min(lengths, key=lambda i: (-lengths[i], i))
+            if lengths[far] > longest:
+                best, longest = (min(start, far), max(start, far)), lengths[far]
+            start = far
+    return best
+
+
+def _residue(scene: Scene, atom: int) -> str:
+    residue = int(scene.residue_of_atom[atom])
+    return f"{scene.residue_names[residue]} {scene.residue_ids[residue]}"
+
+
+def _angle_label(scene: Scene, row: Sequence[int]) -> str:
+    return f"{'-'.join(scene.atom_names[i] for i in row)} ({_residue(scene, row[1])})"
+
+
+def _pair_label(scene: Scene, row: Sequence[int]) -> str:
+    return " ... ".join(f"{scene.atom_names[i]} ({_residue(scene, i)})" for i in row)

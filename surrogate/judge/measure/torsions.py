@@ -1,0 +1,145 @@
+"""Every torsion a molecule can turn about beside phi and psi: omega, chi, rotatable bonds, rotors; symmetry folded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import networkx as nx
+import numpy as np
+
+from systems.scene import Scene
+
+Kind = Literal["ω", "χ", "rotatable", "rotor"]
+
+_FLAT = 0.25
+
+
+class Torsion(NamedTuple):
+    """One torsion: its four atoms, a name for people, its kind, and by how many equal positions it is folded.
+
+    A `fold` of m means that turning by 2π/m gives the same molecule (3 for methyl, 2 for phenyl): what is measured is
+    then m times the angle, which runs once round the circle while the torsion runs from one equal position to the next.
+    `equal` are the atoms from which it could as well be told, `quad` among them: the direction of the mean over them is
+    taken, so that it does not matter which of the hydrogens of a methyl group is called the first.
+    """
+
+    quad: tuple[int, int, int, int]
+    label: str
+    kind: Kind
+    fold: int
+    equal: tuple[tuple[int, int, int, int], ...] = ()
+
+
+def find_torsions(scene: Scene) -> list[Torsion]:
+    """Return omega of every peptide bond, chi of every side chain, every other rotatable bond and every rotor.
+
+    Found in the bond graph; phi and psi are left out (`structure.backbone` has them). A rotor is a group whose only
+    further atoms are hydrogens (methyl, hydroxyl, ammonium). Chi is named and its atoms chosen by IUPAC-IUB 1970, rule
+    4: from N through CA outwards, branch 1 before branch 2.
+    """
+    from systems.chemistry.graph import atom_classes, backbone_torsions, bonded_graph, rotatable_torsions
+
+    graph = bonded_graph(scene)
+    backbone = backbone_torsions(scene)
+    classes = atom_classes(scene).tolist()
+    taken = {frozenset(q[1:3]) for name in ("phi", "psi", "omega") for q in backbone[name].tolist()}
+    found = [Torsion((a, b, c, d), f"ω {_where(scene, b, c)}", "ω", 1) for a, b, c, d in backbone["omega"].tolist()]
+    side = _side_chains(graph, backbone["phi"].tolist(), backbone["psi"].tolist())
+    for quad in rotatable_torsions(scene, rotors=True).tolist():
+        if frozenset(quad[1:3]) in taken:
+            continue
+        a, b, c, d = quad
+        found.append(_named(scene, graph, classes, side, (a, b, c, d)))
+    return found
+
+
+class _Place(NamedTuple):
+    """Of an atom in a side chain: bonds from CA, the atom before it (N for CA itself)."""
+
+    depth: int
+    before: int
+
+
+def _side_chains(graph: nx.Graph, phi: Sequence[Sequence[int]], psi: Sequence[Sequence[int]]) -> dict[int, _Place]:
+    """Place of every atom outwards of an alpha carbon, reached without passing a backbone N or C."""
+    alphas = {q[2]: q[1] for q in phi} | {q[1]: q[0] for q in psi}
+    blocked = {a for q in phi for a in (q[0], q[1], q[3])} | {a for q in psi for a in (q[0], q[2], q[3])}
+    places = {alpha: _Place(0, nitrogen) for alpha, nitrogen in alphas.items()}
+    layer = sorted(places)
+    while layer:
+        reached = []
+        for atom in layer:
+            for j in sorted(graph[atom]):
+                if j not in places and j not in blocked:
+                    places[j] = _Place(places[atom].depth + 1, atom)
+                    reached.append(j)
+        layer = reached
+    return places
+
+
+def _named(
+    scene: Scene, graph: nx.Graph, classes: Sequence[int], side: dict[int, _Place], quad: tuple[int, int, int, int]
+) -> Torsion:
+    a, b, c, d = quad
+    turns = [_equal_positions(scene, graph, classes, *bond) for bond in ((b, c), (c, b))]
+    fold = math.lcm(*turns)
+
+    def equal(a: int, b: int, c: int, d: int, turns: Sequence[int]) -> tuple[tuple[int, int, int, int], ...]:
+        starts, ends = (
+            [j for j in sorted(graph[i]) if j != other] if n > 1 else [alone]
+            for i, other, alone, n in ((b, c, a, turns[0]), (c, b, d, turns[1]))
+        )
+        return tuple((i, b, c, j) for i in starts for j in ends)
+
+    heavy = [[j for j in graph[i] if j != k and scene.elements[j] != "H"] for i, k in ((b, c), (c, b))]
+    in_side = b in side and c in side and abs(side[b].depth - side[c].depth) == 1
+    if not (heavy[0] and heavy[1]):
+        return Torsion((a, b, c, d), f"rotor {_bond(scene, b, c)}", "rotor", fold, equal(*quad, turns))
+    if not in_side:
+        return Torsion((a, b, c, d), f"torsion {_bond(scene, b, c)}", "rotatable", fold, equal(*quad, turns))
+    near, far = (b, c) if side[b].depth < side[c].depth else (c, b)
+    outer = min(
+        (j for j in graph[far] if j != near and scene.elements[j] != "H"), key=lambda j: _branch(scene, classes, j)
+    )
+    residue = int(scene.residue_of_atom[near])
+    label = f"χ{side[near].depth + 1} {scene.residue_names[residue]} {scene.residue_ids[residue]}"
+    chosen = (side[near].before, near, far, outer)
+    return Torsion(chosen, label, "χ", fold, equal(*chosen, turns if near == b else turns[::-1]))
+
+
+def _branch(scene: Scene, classes: Sequence[int], atom: int) -> tuple[int, int, int]:
+    """Sorts branches: CG1 before CG2, by canonical rank where names carry no number."""
+    digits = "".join(x for x in scene.atom_names[atom] if x.isdigit())
+    return int(digits or 0), -classes[atom], atom
+
+
+def _equal_positions(scene: Scene, graph: nx.Graph, classes: Sequence[int], atom: int, other: int) -> int:
+    """How many turns about other-atom bring the far side of `atom` onto itself."""
+    far = [j for j in graph[atom] if j != other]
+    if len({classes[j] for j in far}) != 1:
+        return 1
+    if len(far) == 3:
+        return 3
+    if len(far) == 2 and _is_flat(scene, atom, [*far, other]):
+        return 2
+    return 1
+
+
+def _is_flat(scene: Scene, atom: int, near: Sequence[int]) -> bool:
+    a, b, c = (scene.positions_nm[j] - scene.positions_nm[atom] for j in near)
+    size = float(np.linalg.norm(a) * np.linalg.norm(b) * np.linalg.norm(c))
+    return abs(float(np.dot(np.cross(a, b), c))) < _FLAT * size
+
+
+def _where(scene: Scene, i: int, j: int) -> str:
+    names = []
+    for atom in (i, j):
+        residue = int(scene.residue_of_atom[atom])
+        names.append(f"{scene.residue_names[residue]} {scene.residue_ids[residue]}")
+    return names[0] if names[0] == names[1] else f"{names[0]} - {names[1]}"
+
+
+def _bond(scene: Scene, i: int, j: int) -> str:
+    return f"{scene.atom_names[i]}-{scene.atom_names[j]} ({_where(scene, i, j)})"

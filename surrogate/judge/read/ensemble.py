@@ -1,0 +1,227 @@
+"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, unseen_notes
+from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
+from surrogate.judge.read.stored_frames import StoredFrames
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.selection import part_of
+from systems.units import format_time_ps
+
+Frames = npt.NDArray[np.float32] | StoredFrames
+Flags = npt.NDArray[np.uint16]
+IntArray = npt.NDArray[np.int64]
+
+IN_MEMORY_BYTES = 128 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Frames of one candidate: one or several segments (replicas, or stretches of unbroken time).
+
+    `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
+    by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
+    `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
+    segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
+    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading.
+    Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
+    """
+
+    label: str
+    segments: Sequence[Frames]
+    lag_ps: float
+    scene: Scene
+    flags: Sequence[Flags] | None = None
+    chunk_idx: Sequence[npt.NDArray[np.int32]] | None = None
+    record: dict[str, Any] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    top: str | None = None
+    stated_lag_ps: float | None = None
+    notes: tuple[str, ...] = ()
+    kept: IntArray | None = None
+    changed: Sequence[npt.NDArray[np.bool_]] | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
+            raise InputError(f"{self.label}: the time between frames is {self.lag_ps} ps; state it with --lag 1ps.")
+        for i, segment in enumerate(self.segments):
+            if segment.ndim != 3 or segment.shape[1:] != (self.scene.n_atoms, 3):
+                raise InputError(
+                    f"{self.label}: segment {i} has shape {segment.shape}, expected (n, {self.scene.n_atoms}, 3)."
+                )
+        if self.n_frames == 0:
+            raise InputError(f"{self.label}: no frames.")
+        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx), ("changed", self.changed)):
+            if series is not None and [len(s) for s in series] != self.segment_lengths:
+                raise InputError(f"{self.label}: {name} do not match the segments in length.")
+
+    @property
+    def segment_lengths(self) -> list[int]:
+        """Frames in each segment."""
+        return [len(s) for s in self.segments]
+
+    @property
+    def n_frames(self) -> int:
+        return sum(self.segment_lengths)
+
+    @property
+    def total_ps(self) -> float:
+        """Simulated time of all segments together (frames times lag)."""
+        return self.n_frames * self.lag_ps
+
+    def strided(self, stride: int) -> Ensemble:
+        """Return every `stride`-th frame of each segment, with the lag that follows."""
+        if stride == 1:
+            return self
+        return replace(
+            self,
+            segments=[s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments],
+            flags=None if self.flags is None else [f[::stride] for f in self.flags],
+            chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
+            changed=None if self.changed is None else [c[::stride] for c in self.changed],
+            lag_ps=self.lag_ps * stride,
+            notes=(*self.notes, f"{self.label}: every {stride}th frame used, for equal save intervals."),
+        )
+
+    def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
+        """Return the same frames with `atoms` `(k,)` only, which are those of `scene`."""
+        segments = [s.restricted(atoms) if isinstance(s, StoredFrames) else s[:, atoms] for s in self.segments]
+        kept = atoms if self.kept is None else self.kept[atoms]
+        return replace(self, segments=segments, scene=scene, kept=kept)
+
+
+def load_ensemble(
+    paths: Sequence[str | Path],
+    *,
+    label: str | None = None,
+    template: Scene | None = None,
+    top: str | Path | None = None,
+    lag_ps: float | None = None,
+    in_memory_bytes: int = IN_MEMORY_BYTES,
+) -> Ensemble:
+    """Read one or several trajectory files as the replicas of one candidate.
+
+    Any format that MDTraj or MDAnalysis reads. Atoms are put in the order of `template` (matched by the bond graph
+    where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
+    those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
+    periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
+    the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
+    coordinates together are left where they are and read block by block.
+    Raises InputError (no files, nothing known of the topology, no times without `lag_ps`, replicas with different lags
+    or atoms), OutOfDomainError (another molecule) and TrajectoryError (a damaged file, uneven time).
+    """
+    if not paths:
+        raise InputError("No trajectory file was given.")
+    name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
+    segments: list[Frames] = []
+    flags: list[Flags] = []
+    chunks: list[npt.NDArray[np.int32]] = []
+    changed: list[npt.NDArray[np.bool_]] = []
+    records: list[dict[str, Any]] = []
+    lags: list[float] = []
+    notes: list[str] = []
+    kept: list[IntArray] = []
+    for path in paths:
+        opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
+        reader, template = opened.reader, opened.template
+        kept.append(opened.kept)
+        lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        notes += note
+        lags.append(lag)
+        frames = opened.frames
+        size = 12 * len(frames) * reader.n_atoms
+        if size <= in_memory_bytes:
+            in_memory_bytes -= size
+            segments += np.split(frames[:], cuts)
+            reader.close()
+        else:
+            segments += frames.split(cuts)
+        if reader.flags is not None:
+            flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
+        if reader.chunk_idx is not None:
+            chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
+        if COLUMN in reader.scalars:
+            changed += np.split(reader.scalars[COLUMN] > 0, cuts)
+        records.append(dict(reader.record))
+        if records[-1].get("completed") is False:
+            notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
+    assert template is not None
+    if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
+        raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
+    notes += unseen_notes(name, records) + intervention_notes(name, records)
+    lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
+    part = kept[0] if len(kept[0]) < template.n_atoms else None
+    return Ensemble(
+        label=name,
+        segments=segments,
+        lag_ps=lag,
+        scene=template if part is None else part_of(template, part),
+        flags=flags if len(flags) == len(segments) else None,
+        chunk_idx=chunks if len(chunks) == len(segments) else None,
+        changed=changed if len(changed) == len(segments) else None,
+        record=merged_record(records, name, notes),
+        sources=tuple(str(p) for p in paths),
+        top=None if top is None else str(top),
+        stated_lag_ps=lag_ps,
+        notes=tuple(notes),
+        kept=part,
+    )
+
+
+def on_common_atoms(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
+    """Return the ensembles on the atoms that all of them hold, and which of the first's these are (None: all).
+
+    The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
+    are left.
+    """
+    reference = ensembles[0]
+    if all(e.kept is None for e in ensembles[1:]):
+        return list(ensembles), None
+    common = np.arange(reference.scene.n_atoms)
+    for ensemble in ensembles[1:]:
+        if ensemble.kept is not None:
+            common = np.intersect1d(common, ensemble.kept)
+    if len(common) < 3:
+        raise InputError("The trajectories have fewer than three atoms in common; save more, or compare them apart.")
+    scene = part_of(reference.scene, common)
+    out = []
+    for ensemble in ensembles:
+        held = np.arange(reference.scene.n_atoms) if ensemble is reference or ensemble.kept is None else ensemble.kept
+        out.append(ensemble.restricted(np.searchsorted(held, common), scene))
+    note = f"Compared on the {len(common)} atoms that all trajectories hold, of {reference.scene.n_atoms}."
+    out[0] = replace(out[0], notes=(*out[0].notes, note))
+    return out, common
+
+
+def equal_lags(ensembles: Sequence[Ensemble]) -> list[Ensemble]:
+    """Return the ensembles at their least common save interval, thinned by whole strides.
+
+    Raises InputError when no common interval leaves 10 frames of each.
+    """
+    lags = [Fraction(float(f"{e.lag_ps:.6g}")).limit_denominator(1_000_000) for e in ensembles]
+    common = lags[0]
+    for lag in lags[1:]:
+        common = Fraction(math.lcm(common.numerator, lag.numerator), math.gcd(common.denominator, lag.denominator))
+    out = []
+    for ensemble, lag in zip(ensembles, lags, strict=True):
+        stride = int(common / lag)
+        if ensemble.n_frames // stride < 10:
+            intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in ensembles)
+            raise InputError(
+                f"Save intervals have no common multiple short enough to compare at ({intervals}); "
+                "save again at a multiple of one another, or state the interval with --lag."
+            )
+        out.append(ensemble.strided(stride))
+    return out

@@ -1,0 +1,140 @@
+"""Frames that stay in their file until they are asked for, whole molecules, in the atom order of the comparison."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryReader
+
+Frames = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
+_PIECE_FRAMES = 8192
+_NEIGHBOURS = np.array(list(itertools.product((-1, 0, 1), repeat=3)), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class BondTree:
+    """How to make molecules whole: bonds in breadth-first levels `(parents, children)`, and each molecule's atoms."""
+
+    levels: tuple[tuple[IntArray, IntArray], ...]
+    molecules: tuple[IntArray, ...]
+
+
+def bond_tree(scene: Scene) -> BondTree:
+    """Return the spanning forest of the scene's bonds, the largest molecule first."""
+    import networkx as nx
+
+    from systems.chemistry.graph import bonded_graph
+
+    graph = bonded_graph(scene)
+    molecules = sorted((np.array(sorted(c), dtype=np.int64) for c in nx.connected_components(graph)),
+                       key=lambda atoms: (-len(atoms), int(atoms[0])))  # fmt: skip
+    levels: list[tuple[list[int], list[int]]] = []
+    for atoms in molecules:
+        depth = {int(atoms[0]): 0}
+        for parent, child in nx.bfs_edges(graph, int(atoms[0])):
+            depth[child] = depth[parent] + 1
+            while len(levels) < depth[child]:
+                levels.append(([], []))
+            levels[depth[child] - 1][0].append(parent)
+            levels[depth[child] - 1][1].append(child)
+    return BondTree(
+        tuple((np.array(a, dtype=np.int64), np.array(b, dtype=np.int64)) for a, b in levels), tuple(molecules)
+    )
+
+
+def make_whole(frames_nm: Frames, cells_nm: npt.NDArray[np.floating], tree: BondTree) -> Frames:
+    """Return frames `(n, n_atoms, 3)` nm with no bond across the cell `(n, 3, 3)` nm, in a new array.
+
+    Each atom is put beside the one it is bonded to, then each molecule's centre at its image nearest to that of the
+    largest. Right for bonds shorter than half of the cell's least width.
+    """
+    x = np.array(frames_nm, dtype=np.float32)
+    cell = np.asarray(cells_nm, dtype=np.float64)
+    inverse = np.linalg.inv(cell)
+
+    def image(step: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        whole = np.round(np.einsum("nki,nij->nkj", step.astype(np.float64), inverse))
+        return np.einsum("nki,nij->nkj", whole, cell)
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        for parents, children in tree.levels:
+            x[:, children] -= image(x[:, children] - x[:, parents]).astype(np.float32)
+        home = x[:, tree.molecules[0]].mean(axis=1, keepdims=True)
+        for atoms in tree.molecules[1:]:
+            step = x[:, atoms].mean(axis=1, keepdims=True) - home
+            shift = image(step)
+            # In a skewed cell the nearest image may be one cell further than rounding says.
+            around = np.einsum("mi,nij->nmj", _NEIGHBOURS, cell)
+            nearest = (((step - shift) - around) ** 2).sum(axis=2).argmin(axis=1)
+            shift = shift + around[np.arange(len(x)), nearest][:, None]
+            x[:, atoms] -= shift.astype(np.float32)
+    return x
+
+
+class StoredFrames:
+    """Frames of one open file, an array `(n, n_atoms, 3)` float32 nm to whoever slices it.
+
+    Atoms are those of `order` (all where None), molecules made whole with `tree` (not where None). Slices read from the
+    file; `thinned` and `restricted` do not. The file is open for as long as anybody
+    refers to it.
+    """
+
+    def __init__(
+        self,
+        reader: TrajectoryReader,
+        span: range | None = None,
+        order: IntArray | None = None,
+        tree: BondTree | None = None,
+    ) -> None:
+        self._reader, self._order, self._tree = reader, order, tree
+        self._span = range(reader.n_frames) if span is None else span
+        n_atoms = reader.n_atoms if order is None else len(order)
+        self.shape = (len(self._span), n_atoms, 3)
+        self.ndim = 3
+        self.dtype = np.dtype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self._span)
+
+    def __getitem__(self, part: slice) -> Frames:
+        """Return the frames of a slice, read now. Raises TypeError for anything but a slice of positive step."""
+        if not isinstance(part, slice) or (part.step or 1) < 1:
+            raise TypeError("Stored frames are read by slices of positive step.")
+        span = self._span[part]
+        out = np.empty((len(span), *self.shape[1:]), dtype=np.float32)
+        for start in range(0, len(span), _PIECE_FRAMES):
+            piece = span[start : start + _PIECE_FRAMES]
+            frames = self._reader.read(piece.start, piece.stop, piece.step)
+            if self._tree is not None:
+                cells = self._reader.read_cells(piece.start, piece.stop, piece.step)
+                if cells is not None:
+                    frames = make_whole(frames, cells, self._tree)
+            out[start : start + len(piece)] = frames if self._order is None else frames[:, self._order]
+        return out
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        return self[:].astype(dtype or np.float32, copy=False)
+
+    def thinned(self, stride: int) -> StoredFrames:
+        """Return every `stride`-th frame, unread."""
+        return StoredFrames(self._reader, self._span[::stride], self._order, self._tree)
+
+    def restricted(self, atoms: IntArray) -> StoredFrames:
+        """Return some of the atoms `(k,)` of every frame, unread."""
+        order = atoms if self._order is None else self._order[atoms]
+        return StoredFrames(self._reader, self._span, order, self._tree)
+
+    def split(self, cuts: Sequence[int]) -> list[StoredFrames]:
+        """Return the stretches that begin at frame 0 and at each of `cuts`, unread."""
+        edges = [0, *cuts, len(self)]
+        return [StoredFrames(self._reader, self._span[a:b], self._order, self._tree)
+                for a, b in itertools.pairwise(edges)]  # fmt: skip

@@ -1,0 +1,169 @@
+"""The report: one self-contained HTML file that opens offline, and the same numbers as JSON and Markdown beside it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+from surrogate.judge.comparison import Comparison
+from surrogate.judge.report import figures
+from surrogate.judge.report.cards import cards, side_by_side
+from surrogate.judge.report.definitions import DEFINITIONS
+from surrogate.judge.report.markdown import to_markdown
+from surrogate.judge.report.pictures import albums, maps, timelines
+from surrogate.judge.report.wording import (
+    GROUP_TITLES,
+    MARKS,
+    STATUS_MARKS,
+    interval,
+    number,
+    per_day,
+    plain,
+    setting,
+    severity,
+    sort_key,
+)
+from surrogate.judge.rows.account import Account
+from surrogate.judge.rows.rows import GROUPS
+from systems.errors import InputError, StorageError
+from systems.units import format_time_ps
+
+_STYLES = ("report.css", "viewer.css")
+_SCRIPTS = ("viewer.js", "tables.js")
+
+
+class Written(NamedTuple):
+    """The files of one report."""
+
+    html: Path
+    json: Path
+    markdown: Path
+
+
+def write_report(comparison: Comparison, path: str | Path, *, command: str | None = None) -> Written:
+    """Write `path` (HTML), and the JSON and the Markdown beside it; return the three paths.
+
+    `command` is printed as the way to reproduce the report (by default one is put together from the file names).
+    All files appear whole or not at all. Raises InputError for a name that does not end in .html, StorageError when
+    they cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{target}: a report is written as .html (its JSON and Markdown go beside it).")
+    written = Written(target, target.with_suffix(".json"), target.with_suffix(".md"))
+    _check_place(*written)
+    said = command or _command(comparison, target)
+    text = json.dumps(comparison.to_dict(), indent=1, allow_nan=False, ensure_ascii=False)
+    page = render(comparison, command=said)
+    _write_together(
+        {written.json: text + "\n", written.markdown: to_markdown(comparison, command=said), written.html: page}
+    )
+    return written
+
+
+def render(comparison: Comparison, *, command: str) -> str:
+    """Return the report as HTML text."""
+    from jinja2 import DictLoader, Environment, StrictUndefined
+    from markupsafe import Markup
+
+    package = files("surrogate.judge.report.report")
+
+    def text_of(name: str) -> str:
+        return package.joinpath(name).read_text("utf-8")
+
+    environment = Environment(
+        loader=DictLoader({name: text_of(name) for name in ("report.html.j2", "macros.html.j2")}),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=number, interval=interval, time=format_time_ps, plain=plain, setting=setting, sort_key=sort_key
+    )
+    candidates = [
+        {
+            "judgement": j,
+            "anchor": f"candidate-{i + 1}",
+            "cards": cards(j),
+            "groups": [(GROUP_TITLES.get(g, g.capitalize()), [r for r in j.rows if r.group == g]) for g in GROUPS],
+            "maps": maps(j, comparison.temperature_k),
+            "albums": albums(j, comparison.temperature_k),
+            "timelines": timelines(j),
+            "bonds": sorted(j.curves.bonds, key=lambda b: -abs(b.candidate_mean - b.reference_mean)),
+            "movie": comparison.movies[i] if i < len(comparison.movies) else None,
+        }
+        for i, j in enumerate(comparison.judgements)
+    ]
+    return environment.get_template("report.html.j2").render(
+        comparison=comparison,
+        candidates=candidates,
+        side_by_side=side_by_side(comparison) if len(candidates) > 1 else [],
+        accounts=_accounts(comparison),
+        definitions=DEFINITIONS,
+        group_titles=GROUP_TITLES,
+        marks=MARKS,
+        status_marks=STATUS_MARKS,
+        severity=severity,
+        command=command,
+        map_max=figures.MAP_MAX_KJ,
+        embed=lambda value: Markup(_embed(value)),
+        style=Markup("\n".join(text_of(name) for name in _STYLES)),
+        script=Markup("\n".join(text_of(name) for name in _SCRIPTS)),
+    )
+
+
+def _embed(value: object) -> str:
+    """Return JSON that may stand inside a script element: nothing in it can end that element or start another."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c").replace("&", "\\u0026")
+
+
+def _accounts(comparison: Comparison) -> list[tuple[str, Account, str]]:
+    """Every trajectory with its role and its speed in words."""
+    listed = [("Reference", comparison.reference)]
+    listed += [("Candidate", j.account) for j in comparison.judgements]
+    if comparison.replicate is not None:
+        listed.append(("Replicate", comparison.replicate))
+    return [(role, a, per_day(a.ns_per_day)) for role, a in listed]
+
+
+def _command(comparison: Comparison, target: Path) -> str:
+    """The command line that makes this report again, as far as the file names tell."""
+    accounts = [comparison.reference, *(j.account for j in comparison.judgements)]
+    words = ["surromd", "compare", *(",".join(a.sources) or a.label for a in accounts)]
+    if comparison.replicate is not None:
+        words += ["--replicate", ",".join(comparison.replicate.sources) or comparison.replicate.label]
+    if comparison.reference.top is not None:
+        words += ["--top", comparison.reference.top]
+    if comparison.reference.stated_lag_ps is not None:
+        words += ["--lag", format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+    return shlex.join([*words, "-o", target.name])
+
+
+def _check_place(*paths: Path) -> None:
+    """Fail before anything is drawn where it is plain that nothing can be written."""
+    for path in paths:
+        if not path.parent.is_dir():
+            raise StorageError(f"Cannot write {path}: its folder does not exist; choose another place with -o.")
+        if path.is_dir():
+            raise StorageError(f"Cannot write {path}: it is a folder; choose another name with -o.")
+
+
+def _write_together(texts: dict[Path, str]) -> None:
+    """Write all files under other names first, so that a full disk leaves neither one nor half a file."""
+    partial = {path: path.with_name(f".{path.name}.partial") for path in texts}
+    try:
+        for path, text in texts.items():
+            partial[path].write_text(text, "utf-8")
+        for path in texts:
+            partial[path].replace(path)
+    except OSError as error:
+        raise StorageError(
+            f"Cannot write {error.filename or 'the report'}: {error.strerror or error}; choose another place with -o."
+        ) from error
+    finally:
+        for leftover in partial.values():
+            leftover.unlink(missing_ok=True)

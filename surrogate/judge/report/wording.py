@@ -1,0 +1,99 @@
+"""Numbers as people read them: shared by the HTML page, the Markdown and the cards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from surrogate.judge.measure.statistics import Estimate
+from surrogate.judge.rows.rows import Row
+
+MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?", "imposed": "="}
+STATUS_MARKS = {"indistinguishable": "✓", "close": "≈", "different": "✗", "broken": "‼", "undecided": "?"}
+GROUP_TITLES = {
+    "validity": "Validity of frames",
+    "structure": "Structure",
+    "populations": "Populations",
+    "distributions": "Distributions",
+    "kinetics": "Kinetics",
+    "forecast": "Forecast",
+    "experiment": "To lay beside experiment",
+    "energies": "Energies",
+}
+_SEVERITY = ("agrees", "imposed", "undecided", "close", "differs", "fails")
+_UNITS = {"_per_ps": "/ps", "_k": "K", "_ps": "ps", "_da": "Da", "_nm": "nm", "_s": "s"}
+
+
+def number(estimate: Estimate | None) -> str:
+    """Return the value, with as many digits as its error leaves meaningful (one more than the first uncertain one)."""
+    if estimate is None:
+        return "–"
+    value, error = estimate.value, estimate.error
+    if not math.isfinite(value):
+        return "not defined"
+    if math.isfinite(error) and error > 0:
+        return _rounded(value, _decimals(abs(value), error))
+    return f"{value:.4g}"
+
+
+def _decimals(size: float, error: float) -> int:
+    return min(max(1 - math.floor(math.log10(error)), 0), 4 if size < 10 else 3)
+
+
+def _rounded(value: float, decimals: int) -> str:
+    """Return the value with so many decimals, or with two digits where it would read as zero."""
+    shown = f"{value:.{decimals}f}"
+    return f"{value:.2g}" if value and not float(shown) else shown
+
+
+def interval(estimate: Estimate | None) -> str:
+    """Return the 95 % interval in brackets, or an empty string."""
+    if estimate is None or not (math.isfinite(estimate.low) and math.isfinite(estimate.high)):
+        return ""
+    if estimate.low == estimate.high:
+        return ""
+    low, high, error = estimate.low, estimate.high, estimate.error
+    if not (math.isfinite(error) and error > 0):
+        return f"[{low:.4g}, {high:.4g}]"
+    decimals = _decimals(max(abs(low), abs(high)), error)
+    if f"{low:.{decimals}f}" == f"{high:.{decimals}f}":
+        return f"[{low:.2g}, {high:.2g}]"
+    return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
+
+
+def plain(estimate: Estimate | None) -> str:
+    """Return a ratio with two or three digits."""
+    if estimate is None or not math.isfinite(estimate.value):
+        return "–"
+    return f"{estimate.value:.2f}" if estimate.value < 10 else f"{estimate.value:.3g}"
+
+
+def sort_key(estimate: Estimate | None) -> str:
+    """Return the number that a table sorts by; empty where there is none."""
+    return "" if estimate is None or not math.isfinite(estimate.value) else f"{estimate.value:.9g}"
+
+
+def setting(key: str, value: object) -> str:
+    """Return an entry of a record for people: ('temperature_k', 300.0) -> 'temperature 300 K'."""
+    shown = f"{value:g}" if isinstance(value, float) else str(value)
+    for ending, unit in _UNITS.items():
+        if key.endswith(ending):
+            return f"{key.removesuffix(ending).replace('_', ' ')} {shown} {unit}"
+    return f"{key.replace('_', ' ')} {shown}"
+
+
+def per_day(ns_per_day: float | None) -> str:
+    """Return a speed, or that it is not recorded."""
+    if ns_per_day is None:
+        return "not recorded"
+    return f"{ns_per_day / 1000:.3g} µs/day" if ns_per_day >= 1000 else f"{ns_per_day:.3g} ns/day"
+
+
+def severity(row: Row) -> int:
+    """Return how bad a row's word is, 0 for 'agrees'."""
+    return _SEVERITY.index(row.verdict)
+
+
+def worst(rows: Sequence[Row]) -> Row | None:
+    """Return the row with the worst word, among equals the one with the greatest value; None for no rows."""
+    return max(rows, key=lambda r: (severity(r), r.candidate.value), default=None)

@@ -1,0 +1,324 @@
+"""One line of the judge's table, and what all lines of one comparison are computed from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.measure import distributions
+from surrogate.judge.measure.statistics import (
+    Blocks,
+    Estimate,
+    bootstrap_weights,
+    difference_p,
+    estimate,
+    permutation_p,
+    pooled,
+)
+from surrogate.judge.measure.structure import Backbone, Features
+from systems.chemistry.validity import Geometry
+from systems.scene import Scene
+
+FloatArray = npt.NDArray[np.float64]
+Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
+Kind = Literal["share", "distance", "observable"]
+Word = Literal["agrees", "close", "differs", "fails", "undecided", "imposed"]
+
+# A replicate this unlikely to be of one simulation with the reference does not speak for it.
+UNLIKE_BELOW = 1e-3
+# Histograms drawn at a time, as numbers: a hundred MB or so.
+_DRAWN_VALUES = 4e6
+
+GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributions", "kinetics")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of a comparison. `tica_lag_ps` and `lags_ps` are rounded to whole frames, which the rows then name.
+
+    `peptide_recipe`: whether the published recipe is followed too (its 10 states take most of the time of a short
+    comparison, and no verdict rests on it).
+    """
+
+    tica_lag_ps: float = 10.0
+    lags_ps: tuple[float, ...] = (1.0, 10.0, 50.0)
+    n_bootstrap: int = 400
+    n_permutations: int = 1000
+    seed: int = 0
+    significance: float = 0.05
+    peptide_recipe: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """One metric of one candidate, between the reference and its replicate.
+
+    `kind` says how it is judged: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
+    floor; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is the part of
+    frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against reference
+    and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows.
+    """
+
+    key: str
+    group: Group
+    metric: str
+    unit: str
+    kind: Kind
+    reference: Estimate | None
+    candidate: Estimate
+    replicate: Estimate | None
+    ratio: Estimate | None
+    p_value: float
+    p_replicate: float
+    tolerance: float
+    tolerance_text: str
+    statement: str
+    divergence: tuple[float, float] | None = None
+    p_corrected: float = math.nan
+    verdict: Word = "undecided"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; what is not finite becomes None."""
+        out: dict[str, Any] = {}
+        for key, value in vars(self).items():
+            if isinstance(value, Estimate):
+                out[key] = value.to_dict()
+            elif isinstance(value, float):
+                out[key] = value if math.isfinite(value) else None
+            elif isinstance(value, tuple):
+                out[key] = [x if math.isfinite(x) else None for x in value]
+            else:
+                out[key] = value
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`.
+
+    Tests use all blocks. What depends on the length itself (a histogram's distance, the floor) uses the first `n_equal`
+    blocks alone, which are as long as those of the other trajectories.
+    """
+
+    features: Features
+    blocks: Blocks
+    weights: FloatArray
+    n_equal: int
+    equal_weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Trio:
+    """Reference, candidate and replicate at equal lag and equal frame count, and what they are measured with."""
+
+    scene: Scene
+    torsions: Backbone
+    geometry: Geometry
+    reference: Sample
+    candidate: Sample
+    replicate: Sample
+    options: Options
+    temperature_k: float = 300.0
+
+    @property
+    def compared_ps(self) -> float:
+        """The equal length, ps."""
+        return min(s.features.total_ps for s in self.samples)
+
+    @property
+    def samples(self) -> tuple[Sample, Sample, Sample]:
+        """Reference, candidate, replicate."""
+        return self.reference, self.candidate, self.replicate
+
+
+def make_sample(
+    features: Features, blocks: Blocks, options: Options, stream: int, n_equal_frames: int | None = None
+) -> Sample:
+    """Return a sample with its own stream of bootstrap draws, so that adding a candidate changes no other number.
+
+    `n_equal_frames`: the length that all trajectories of the comparison have; None for the whole.
+    """
+    rng = np.random.default_rng([options.seed, stream])
+    n = blocks.n_blocks
+    if n_equal_frames is not None and n_equal_frames < features.n_frames:
+        n = max(min(round(n * n_equal_frames / features.n_frames), n), 1)
+    weights = bootstrap_weights(blocks.n_blocks, options.n_bootstrap, rng)
+    equal = weights if n == blocks.n_blocks else bootstrap_weights(n, options.n_bootstrap, rng)
+    return Sample(features, blocks, weights, n, equal)
+
+
+def by_group(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with those of one group together, in the order of `GROUPS`; within a group as they came."""
+    return sorted(rows, key=lambda row: GROUPS.index(row.group))
+
+
+def distance_row(
+    trio: Trio,
+    counts: Sequence[FloatArray],
+    *,
+    key: str,
+    group: Group,
+    metric: str,
+    statement: Callable[[float], str],
+    strata: Sequence[npt.NDArray[np.int64]] | None = None,
+) -> Row:
+    """Return the row of a Jensen-Shannon distance from histograms per block of (reference, candidate, replicate).
+
+    `counts`: three arrays `(n_blocks, n_bins)`, or `(n_blocks, n_series, n_bins)` whose distances are averaged.
+    `statement(ratio)` words the deviation. Distances are those of equal lengths; the p-values are block permutation
+    tests of everything there is. A replicate that differs from the reference does not speak for it: the candidate is
+    then tested against the reference alone. `strata`: the kind of each block of the three; only blocks of one kind are
+    exchanged.
+    """
+    ref, cand, rep = (c.reshape(len(c), -1, c.shape[-1]) for c in counts)
+    # Bins that nobody visits add nothing to any distance.
+    visited = sum(c.sum((0, 1)) for c in (ref, cand, rep)) > 0
+    ref, cand, rep = ref[..., visited], cand[..., visited], rep[..., visited]
+    n_series, n_bins = ref.shape[1:]
+
+    def mean_distance(p: FloatArray, q: FloatArray) -> FloatArray:
+        shape = (len(p), n_series, n_bins)
+        return np.asarray(distributions.distance(p.reshape(shape), q.reshape(shape)).mean(-1))
+
+    flat = [c.reshape(len(c), -1) for c in (ref, cand, rep)]
+    equal = [c[: s.n_equal] for s, c in zip(trio.samples, flat, strict=True)]
+    sums = [c.sum(0)[None] for c in equal]
+    to_candidate, to_replicate = float(mean_distance(sums[0], sums[1])[0]), float(mean_distance(sums[0], sums[2])[0])
+    draws_candidate, draws_replicate = drawn_distances(trio, equal, mean_distance)
+    n_blocks = min(len(c) for c in equal)
+    ratio = Estimate(math.nan)
+    if to_replicate > 0:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = estimate(to_candidate / to_replicate, draws_candidate / draws_replicate, n_blocks, log=True)
+    p, p_replicate = permutation_pair(trio, flat, mean_distance, 99, strata)
+    return Row(
+        key=key,
+        group=group,
+        metric=metric,
+        unit="",
+        kind="distance",
+        reference=None,
+        candidate=_distance_estimate(to_candidate, draws_candidate, n_blocks),
+        replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
+        ratio=ratio,
+        p_value=p if math.isfinite(to_candidate) else math.nan,
+        p_replicate=p_replicate,
+        tolerance=2.0,
+        tolerance_text="≤ 2 × replicate",
+        statement=statement(ratio.value) if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
+        divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
+    )
+
+
+Distance = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def drawn_distances(trio: Trio, equal: Sequence[FloatArray], distance: Distance) -> tuple[FloatArray, FloatArray]:
+    """Return bootstrap draws `(n_draws,)` of the distances of candidate and replicate to the reference.
+
+    `equal`: sums over the equally long parts of (reference, candidate, replicate), `(n_blocks, n_sums)`.
+    """
+    found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    n_draws = trio.options.n_bootstrap
+    batch = max(1, int(_DRAWN_VALUES // max(equal[0].shape[1], 1)))
+    for start in range(0, n_draws, batch):
+        ref, cand, rep = (s.equal_weights[start : start + batch] @ c for s, c in zip(trio.samples, equal, strict=True))
+        found[0].append(distance(ref, cand))
+        found[1].append(distance(ref, rep))
+    return np.concatenate(found[0]), np.concatenate(found[1])
+
+
+def permutation_pair(
+    trio: Trio,
+    flat: Sequence[FloatArray],
+    distance: Distance,
+    stream: int,
+    strata: Sequence[npt.NDArray[np.int64]] | None = None,
+) -> tuple[float, float]:
+    """Return the p-values of the candidate and of the replicate by block permutation; see `distance_row`.
+
+    `flat`: sums over all blocks of (reference, candidate, replicate), `(n_blocks, n_sums)`.
+    """
+    ref, cand, rep = flat
+    n = trio.options.n_permutations
+    rng = np.random.default_rng([trio.options.seed, stream])
+    kinds = [np.zeros(len(c), dtype=np.int64) for c in flat] if strata is None else strata
+    of_replicate = permutation_p(ref, rep, distance, rng, n, np.concatenate([kinds[0], kinds[2]]))
+    truth = [0] if of_replicate < UNLIKE_BELOW else [0, 2]
+    p = permutation_p(
+        np.concatenate([flat[k] for k in truth]),
+        cand,
+        distance,
+        rng,
+        n,
+        np.concatenate([*(kinds[k] for k in truth), kinds[1]]),
+    )
+    return p, of_replicate
+
+
+def truth_of(reference: Estimate, replicate: Estimate, *, log: bool = False) -> Estimate:
+    """Return what a candidate is tested against: reference and replicate together, or the reference alone where the
+    replicate is not known or differs from it."""
+    if not math.isfinite(replicate.value) or difference_p(replicate, reference, log=log) < UNLIKE_BELOW:
+        return reference
+    return pooled(reference, replicate, log=log)
+
+
+def _distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
+    """Intervals are made for the squared distance (a divergence adds up its noise) and then rooted, at least 0."""
+    squared = estimate(value**2, draws**2, n_blocks)
+    low, high = (math.sqrt(max(x, 0.0)) if math.isfinite(x) else math.nan for x in (squared.low, squared.high))
+    error = (high - low) / (2 * 1.96)
+    return Estimate(value, low, high, error, error / value if value > 0 else math.nan, n_blocks)
+
+
+def observable_row(
+    trio: Trio,
+    values: Sequence[float],
+    draws: Sequence[FloatArray],
+    *,
+    key: str,
+    group: Group,
+    metric: str,
+    unit: str,
+    tolerance: float,
+    tolerance_text: str,
+    statement: Callable[[float, float], str],
+    log: bool = False,
+    resolution: float = 0.0,
+) -> Row:
+    """Return the row of a number that each trajectory has by itself.
+
+    `values` and bootstrap `draws` are of (reference, candidate, replicate). With `log` it is a positive, skewed number
+    and `tolerance` is relative; else absolute. A difference below `resolution` is not a physical one (rounding of
+    files, tolerance of constraint solvers) and never significant. `statement(candidate, reference)` words the
+    deviation.
+    """
+    made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, trio.samples, strict=True)]
+    ref, cand, rep = made
+    both = truth_of(ref, rep, log=log)
+    ratio = Estimate(math.nan)
+    if ref.value > 2.0 * ref.error:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = estimate(cand.value / ref.value, draws[1] / draws[0], min(ref.n_blocks, cand.n_blocks), log=log)
+    return Row(
+        key=key,
+        group=group,
+        metric=metric,
+        unit=unit,
+        kind="observable",
+        reference=ref,
+        candidate=cand,
+        replicate=rep,
+        ratio=ratio,
+        p_value=1.0 if abs(cand.value - ref.value) < resolution else difference_p(cand, both, log=log),
+        p_replicate=1.0 if abs(rep.value - ref.value) < resolution else difference_p(rep, ref, log=log),
+        tolerance=tolerance * ref.value if log else tolerance,
+        tolerance_text=tolerance_text,
+        statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric}: it does not move",
+    )

@@ -1,0 +1,130 @@
+"""Rows of Wasserstein distances of bond lengths and bond angles: how far, in Å or degrees, the values have to move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, equal_rows, evenly
+from surrogate.judge.measure.statistics import Blocks, Estimate, estimate
+from surrogate.judge.rows.block_means import family_of
+from surrogate.judge.rows.charts import Chart
+from surrogate.judge.rows.rows import Row, Trio, drawn_distances, permutation_pair
+
+FloatArray = npt.NDArray[np.float64]
+Segments = Sequence[npt.NDArray[Any]]
+
+_BINS = 100
+
+
+def wasserstein_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str]]]:
+    """Return the rows of bond lengths (Å) and bond angles (degrees): means over all of them, equal ones pooled."""
+    probes = trio.reference.features.probes
+    if probes is None:
+        return [], [], []
+    rows = []
+    pairs = np.asarray(trio.geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
+    if len(pairs):
+        lengths = [s.features.bonds_nm for s in trio.samples]
+        groups = evenly(equal_rows(pairs, probes.classes), MOST_HISTOGRAMS)
+        rows.append(_row(trio, lengths, groups, "bond_wasserstein", "Bond lengths", "Å", 10.0, 0.5, 0.01, 0.001))
+    if len(probes.angles):
+        angles = [family_of(s, "angles") for s in trio.samples]
+        groups = evenly(equal_rows(probes.angles, probes.classes), MOST_HISTOGRAMS)
+        rows.append(
+            _row(trio, angles, groups, "angle_wasserstein", "Bond angles", "°", 180.0 / math.pi, 30.0, 1.0, 0.05)
+        )
+    return rows, [], []
+
+
+def _row(
+    trio: Trio,
+    measured: Sequence[Segments],
+    groups: Sequence[npt.NDArray[np.intp]],
+    key: str,
+    name: str,
+    unit: str,
+    scale: float,
+    furthest: float,
+    tolerance: float,
+    resolution: float,
+) -> Row:
+    """`scale`: from the unit measured in to `unit`, which is that of the rest. Values further than `furthest` from the
+    reference's mean count as that far; a distance below `resolution` is that of rounding."""
+    edges = np.stack([_edges([x[:, g] for x in measured[0]], measured, g, furthest / scale) for g in groups])
+    widths = scale * np.diff(edges, axis=1)[:, 0]
+    counts = [binned(v, groups, edges, s.blocks) for v, s in zip(measured, trio.samples, strict=True)]
+    flat = [c.reshape(len(c), -1) for c in counts]
+
+    def distance(p: FloatArray, q: FloatArray) -> FloatArray:
+        shape = (len(p), len(groups), _BINS)
+        return wasserstein(p.reshape(shape), q.reshape(shape), widths).mean(axis=-1)
+
+    equal = [c[: s.n_equal] for s, c in zip(trio.samples, flat, strict=True)]
+    total = [c.sum(0)[None] for c in equal]
+    drawn = drawn_distances(trio, equal, distance)
+    n_blocks = min(map(len, equal))
+    made: list[Estimate] = []
+    for k in (1, 2):
+        found = estimate(float(distance(total[0], total[k])[0]), drawn[k - 1], n_blocks)
+        made.append(replace(found, low=max(found.low, 0.0)))
+    candidate, replicate = made
+    tested = permutation_pair(trio, flat, distance, 98)
+    p_values = [p if of.value > resolution else 1.0 for p, of in zip(tested, made, strict=True)]
+    low = name[0].lower() + name[1:]
+    return Row(
+        key=key,
+        group="structure",
+        metric=f"{name}, mean Wasserstein distance",
+        unit=unit,
+        kind="distance",
+        reference=None,
+        candidate=candidate,
+        replicate=replicate,
+        ratio=None,
+        p_value=p_values[0] if math.isfinite(candidate.value) else math.nan,
+        p_replicate=p_values[1],
+        tolerance=tolerance,
+        tolerance_text=f"≤ {tolerance:g} {unit}",
+        statement=f"{low} are {candidate.value:.2g} {unit} off on average (Wasserstein)",
+    )
+
+
+def _edges(own: Segments, measured: Sequence[Segments], group: npt.NDArray[np.intp], furthest: float) -> FloatArray:
+    """Bin edges from the least to the greatest value of all three, at most `furthest` from the reference's mean."""
+    values = [x[np.isfinite(x)] for v in measured for x in (np.concatenate([s[:, group].ravel() for s in v]),)]
+    own_values = np.concatenate([x[np.isfinite(x)] for x in own])
+    centre = float(own_values.mean()) if len(own_values) else 0.0
+    low = max(min((float(x.min()) for x in values if len(x)), default=0.0), centre - furthest)
+    high = min(max((float(x.max()) for x in values if len(x)), default=0.0), centre + furthest)
+    return np.linspace(low, max(high, low + 1e-6), _BINS + 1)
+
+
+def binned(segments: Segments, groups: Sequence[npt.NDArray[np.intp]], edges: FloatArray, blocks: Blocks) -> FloatArray:
+    """Return histograms per block `(n_blocks, n_groups, n_bins)`; what lies outside is counted in the end bins."""
+    n_bins = edges.shape[1] - 1
+    out = np.zeros((blocks.n_blocks, len(groups), n_bins))
+    for k, group in enumerate(groups):
+        low, width = edges[k, 0], (edges[k, -1] - edges[k, 0]) / n_bins
+        for piece in blocks.pieces:
+            part = segments[piece.segment][piece.start : piece.stop][:, group].ravel()
+            part = part[~np.isnan(part)]
+            index = np.clip((part - low) / width, 0, n_bins - 1).astype(np.int64)
+            out[piece.block, k] += np.bincount(index, minlength=n_bins)
+    return out
+
+
+def wasserstein(counts_p: FloatArray, counts_q: FloatArray, widths: FloatArray) -> FloatArray:
+    """Return the first Wasserstein distance along the last axis of histograms `(..., n_groups, n_bins)` of one grid.
+
+    The area between the two cumulative distributions, in the unit of `widths` `(n_groups,)`; NaN where one is empty.
+    Source: Vallender, Theory Probab. Appl. 18, 784 (1974).
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        p, q = (c.cumsum(axis=-1) / c.sum(axis=-1, keepdims=True) for c in (counts_p, counts_q))
+        return np.asarray(np.abs(p - q).sum(axis=-1) * widths)

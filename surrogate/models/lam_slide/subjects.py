@@ -1,0 +1,112 @@
+"""One molecule's frames as LaM-SLidE's two stages are shown them: frames, windows, latents, and the molecule itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from surrogate.data.descriptions import describe
+from surrogate.data.frames import TrainingFrames
+from surrogate.models.interface import Molecule
+from surrogate.models.lam_slide.codes.atom_tags import Atoms
+from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.objectives import random_rotations
+
+_HELD_FRAMES = 2048
+_BLOCK = 8192
+
+
+@dataclass(eq=False)
+class Subject:
+    """Frames of one molecule and what the model is told of it. `latents` (n_frames, n_latents, dim): those of all
+    frames, once stage one is over, where poses stay and memory suffices."""
+
+    frames: TrainingFrames
+    molecule: Molecule
+    latents: Tensor | None = None
+
+    @staticmethod
+    def of(frames: TrainingFrames, model: LamSlide) -> Subject:
+        return Subject(frames, describe(model, frames.scene).to(model.latent_mean.device))
+
+    @property
+    def n_atoms(self) -> int:
+        return self.molecule.n_atoms
+
+    def poses(self, model: LamSlide, rows: int, generator: torch.Generator) -> Tensor | None:
+        """Return a rotation `(rows, 3, 3)` for each window, uniform; None where poses stay as they are."""
+        turned = model.config.atoms.turn if model.config.graph else not model.canonical
+        return random_rotations(rows, generator) if turned else None
+
+    def seen(self, model: LamSlide, x: Tensor, turns: Tensor | None) -> tuple[Tensor, Atoms | None]:
+        """Return frames `(b, ..., n_atoms, 3)` turned, on the model's device, and atoms in the same poses."""
+        device = self.molecule.elements.device
+        if turns is not None:
+            x = torch.einsum("bij,b...nj->b...ni", turns, x)
+            turns = turns.to(device)
+        return x.to(device), model.atoms_of(self.molecule, turns)
+
+    @torch.no_grad()
+    def reconstruction_error_nm(self, model: LamSlide) -> float:
+        """Return the root mean square error of held-out frames that went through the autoencoder."""
+        held = self.frames.window_starts(1, validation=True)
+        held = held[np.linspace(0, len(held) - 1, min(_HELD_FRAMES, len(held))).astype(int)]
+        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(held)), None)
+        error = model.decode(model.encode(x, self.molecule.elements, atoms), self.n_atoms, atoms) - x
+        return float(error.square().sum(-1).mean().sqrt())
+
+    @torch.no_grad()
+    def encode(self, model: LamSlide, idx: npt.NDArray[np.int64]) -> Tensor:
+        """Return the latents `(len(idx), n_latents, dim)` of frames `(n,)` as they are posed."""
+        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(idx)), None)
+        return model.encode(x, self.molecule.elements, atoms)
+
+    def keep_latents(self, model: LamSlide) -> None:
+        """Encode every frame once."""
+        parts = [
+            self.encode(model, np.arange(start, min(start + _BLOCK, self.frames.n_frames))).cpu()
+            for start in range(0, self.frames.n_frames, _BLOCK)
+        ]
+        self.latents = torch.cat(parts).to(self.molecule.elements.device)
+
+    def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> tuple[Tensor, Atoms | None]:
+        """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), and what else the flow is told
+        of the molecule, in each window's pose."""
+        if self.latents is not None:
+            return self.latents[idx.to(self.latents.device)], model.atoms_of(self.molecule)
+        turns = self.poses(model, len(idx), generator)
+        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
+        with torch.no_grad():
+            return model.encode(x, self.molecule.elements, atoms), atoms
+
+
+def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
+    """Return which subject a batch is of, each as likely; a single one costs no random number."""
+    if len(subjects) == 1:
+        return 0
+    return int(torch.randint(len(subjects), (1,), generator=generator))
+
+
+@torch.no_grad()
+def normalise_latents(model: LamSlide, subjects: Sequence[Subject], seed: int, n_frames: int = 20_000) -> None:
+    """Measure the latents' means and common scale on training frames, as many of each molecule, and set them. Latents
+    that are atoms have no mean: the template is there already."""
+    model.latent_mean.zero_()
+    model.latent_scale.fill_(1.0)
+    rng, found = np.random.default_rng(seed), []
+    for subject in subjects:
+        starts = subject.frames.window_starts(1, validation=False)
+        idx = rng.choice(len(starts), size=min(n_frames // len(subjects), len(starts)), replace=False)
+        found.append(subject.encode(model, starts[np.sort(idx)]))
+    if model.config.latents_are_atoms:
+        z = torch.cat([latents.flatten() for latents in found])
+        model.latent_scale.copy_(z.square().mean().sqrt())
+        return
+    z = torch.cat(found)
+    model.latent_mean.copy_(z.mean(0))
+    model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())

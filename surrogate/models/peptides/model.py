@@ -1,0 +1,290 @@
+"""LaM-SLidE for peptides of any sequence: residues as entities, coded exactly, and a flow over residues and time.
+
+An entity's identifier is its residue's type, its neighbours' types and its place in the chain; its code are the
+internal coordinates of `models.chains`, so that no first stage is trained and nothing of an unseen sequence is lost.
+The flow runs on innovations: of each coordinate at time t after the frame that is given, what its correlation with
+that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a chunk
+has its own time, so that one model serves all spacings.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from surrogate.models.interface import Chunk, Molecule, Surrogate
+from surrogate.models.lam_slide import flow
+from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
+from surrogate.models.peptides.chains import ChainScale
+from surrogate.models.settings import build
+from systems.chemistry.geometry import superpose
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.models.peptides.chains import ChainFeatures
+
+# Before the first residue, and after the last.
+ENDS = ("<", ">")
+# Residues further apart along the chain are alike far.
+_FAR = 6
+_LAGS_PER_DECADE = 8
+_MOST_CORRELATED = 0.995
+_LONGEST_WAVE = 4.0
+
+
+@dataclass(frozen=True)
+class PeptideConfig:
+    """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
+    shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
+    to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
+    beside a stiff one. Flow times are logit-normal, as elsewhere."""
+
+    width: int = 256
+    n_layers: int = 6
+    n_heads: int = 4
+    chunk_frames: int = 16
+    shortest_ps: float = 1.0
+    longest_ps: float = 1000.0
+    innovation: bool = True
+    conditioning_noise: float = 0.03
+    turning_weight: float = 4.0
+    tau_location: float = 0.5
+    tau_scale: float = 1.4
+    types: tuple[str, ...] = ()
+    scale: ChainScale | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> PeptideConfig:
+        """Raises InputError for an unknown key, naming the nearest."""
+        return build(PeptideConfig, record)
+
+    @property
+    def lags_ps(self) -> Tensor:
+        """The times at which correlations are kept."""
+        decades = math.log10(self.longest_ps / self.shortest_ps)
+        n = max(2, round(_LAGS_PER_DECADE * decades) + 1)
+        return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
+
+    def places(self, residues: tuple[str, ...]) -> Tensor:
+        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after.
+
+        Raises InputError for a type that training did not see.
+        """
+        known = {name: k for k, name in enumerate((*ENDS, *self.types))}
+        for name in residues:
+            if name not in known:
+                raise InputError(
+                    f"residue {name} is none that these weights were trained on ({', '.join(self.types)})."
+                )
+        row = [known[name] for name in (ENDS[0], *residues, ENDS[1])]
+        return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
+
+
+class TypedLinear(nn.Module):
+    """A linear map that all residue types share, and to it each type's own, which begins at zero."""
+
+    def __init__(self, n_in: int, n_out: int, n_types: int, *, zero: bool = False) -> None:
+        super().__init__()
+        self.shared = nn.Linear(n_in, n_out)
+        self.own = nn.Parameter(torch.zeros(n_types, n_in, n_out))
+        if zero:
+            nn.init.zeros_(self.shared.weight)
+            nn.init.zeros_(self.shared.bias)
+
+    def forward(self, x: Tensor, types: Tensor) -> Tensor:
+        """`x` (b, t, r, n_in), `types` (r,) -> (b, t, r, n_out)."""
+        own = torch.einsum("btri,rio->btro", x, self.own[types].to(x.dtype))
+        return self.shared(x) + own
+
+
+class PeptideLayer(nn.Module):
+    """One block over the residues of a frame, one over the frames of a residue (Algorithm 5)."""
+
+    def __init__(self, width: int, n_heads: int) -> None:
+        super().__init__()
+        self.spatial = ParallelBlock(width, n_heads)
+        self.temporal = ParallelBlock(width, n_heads)
+        self.of_distance = nn.Embedding(2 * _FAR + 1, n_heads)
+
+    def forward(self, h: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor], apart: Tensor) -> Tensor:
+        """`h` (b, r, t, width); `apart` (r, r): places in the chain, one less the other, as rows of `of_distance`."""
+        bias = self.of_distance(apart).permute(2, 0, 1)
+        h = self.spatial(h.transpose(1, 2), modulation[:, :3], None, bias=bias)[0].transpose(1, 2)
+        return self.temporal(h, modulation[:, 3:], rope)[0]
+
+
+class PeptideFlow(nn.Module):
+    """Data prediction: noisy innovations of a chunk, flow time, the given frame, each frame's time -> innovations."""
+
+    waves: Tensor
+
+    def __init__(self, config: PeptideConfig, n_slots: int) -> None:
+        super().__init__()
+        c, n_types = config, len(config.types) + len(ENDS)
+        self.config = config
+        self.of_noisy = TypedLinear(n_slots, c.width, n_types)
+        self.of_known = TypedLinear(n_slots, c.width, n_types)
+        self.of_type = nn.ModuleList(nn.Embedding(n_types, c.width) for _ in range(3))
+        self.of_given = nn.Parameter(torch.randn(c.width) * 0.02)
+        n_waves = 16
+        self.register_buffer("waves", math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
+        self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
+        self.embed_tau = TimeEmbedding(c.width)
+        self.layers = nn.ModuleList(PeptideLayer(c.width, c.n_heads) for _ in range(c.n_layers))
+        self.modulation = nn.Linear(c.width, 6 * c.width)
+        self.final_modulation = nn.Linear(c.width, 2 * c.width)
+        self.final = TypedLinear(c.width, n_slots, n_types, zero=True)
+        for module in (self.modulation, self.final_modulation):
+            nn.init.zeros_(module.weight)
+            nn.init.zeros_(module.bias)
+
+    def forward(self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor) -> Tensor:
+        """`o` (b, t, r, slots), `tau` (b,), `known` (b, r, slots), `times_ps` (b, t), `places` (r, 3) -> like `o`."""
+        skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
+        return skip * o + out * self._network(o * scale_in, tau, known, times_ps, places)
+
+    def _network(self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor) -> Tensor:
+        types = places[:, 0]
+        of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
+        given = self.of_known(known[:, None], types) + self.of_given
+        h = torch.cat([given, self.of_noisy(o, types) + self._of_times(times_ps)[:, :, None]], dim=1) + of_type
+        time = F.silu(self.embed_tau(tau))
+        modulation = self.modulation(time).unflatten(-1, (6, -1))
+        angles = rotary_angles(h.shape[1], self.config.width // self.config.n_heads).to(h.device)
+        place = torch.arange(len(types), device=h.device)
+        apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
+        h = h.transpose(1, 2)
+        for layer in self.layers:
+            h = layer(h, modulation, (angles.cos(), angles.sin()), apart)
+        shift, scale = self.final_modulation(time)[:, None, None, :].chunk(2, dim=-1)
+        h = F.layer_norm(h.transpose(1, 2)[:, 1:], h.shape[-1:]) * (1.0 + scale) + shift
+        found: Tensor = self.final(h, types)
+        return found.float()
+
+    def _of_times(self, times_ps: Tensor) -> Tensor:
+        with torch.autocast(times_ps.device.type, enabled=False):
+            angles = times_ps.float().clamp(min=1e-3).log10()[..., None] * self.waves
+            return self.of_time(torch.cat([angles.sin(), angles.cos()], dim=-1))
+
+
+class PeptideSlide(Surrogate):
+    """The flow between frames of a peptide, behind the contract of `surrogate.models.interface`.
+
+    `token_mean`, `token_scale` (types, slots): what makes a coordinate's numbers centred and of unit variance;
+    `correlation` (types, lags, slots): with the same coordinate of an earlier frame, at the configuration's lags.
+    """
+
+    arch: ClassVar[str] = "lam-slide-peptides"
+    solvers = flow.solvers_for("linear")
+    float32_layers: tuple[str, ...] = ("flow.of_time",)
+    config: PeptideConfig
+    token_mean: Tensor
+    token_scale: Tensor
+    correlation: Tensor
+
+    def __init__(self, config: PeptideConfig) -> None:
+        super().__init__()
+        if config.scale is None or not config.types:
+            raise InputError("a model of peptides needs the scale of their coordinates and their residue types.")
+        self.config = config
+        n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
+        self.flow = PeptideFlow(config, n_slots)
+        self.lag_ps = config.shortest_ps
+        self.register_buffer("token_mean", torch.zeros(n_types, n_slots))
+        self.register_buffer("token_scale", torch.ones(n_types, n_slots))
+        self.register_buffer("correlation", torch.zeros(n_types, len(config.lags_ps), n_slots))
+
+    @property
+    def canonical(self) -> bool:
+        return True
+
+    @property
+    def knows_chains(self) -> bool:
+        """See `Surrogate.knows_chains`."""
+        return True
+
+    @property
+    def n_conditioning(self) -> int:
+        return 1
+
+    @property
+    def n_new(self) -> int:
+        assert self.lag_ps is not None
+        return max(1, min(self.config.chunk_frames, int(self.config.longest_ps / self.lag_ps * (1 + 1e-6))))
+
+    def at_lag(self, lag_ps: float) -> PeptideSlide:
+        """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError outside its range."""
+        c = self.config
+        if not c.shortest_ps * (1 - 1e-6) <= lag_ps <= c.longest_ps * (1 + 1e-6):
+            raise InputError(f"a lag of {lag_ps:g} ps is none that this model was trained for.")
+        model = copy.copy(self)
+        model.lag_ps = lag_ps
+        return model
+
+    def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> Tensor:
+        """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places."""
+        types = chain.places[:, 0]
+        tokens = chain.code.encode(frames_nm)
+        return torch.where(chain.code.filled, (tokens - self.token_mean[types]) / self.token_scale[types], 0.0)
+
+    def frames_of(self, numbers: Tensor, chain: ChainFeatures) -> Tensor:
+        """The inverse of `normalised`, each frame laid on the template by heavy atoms."""
+        types = chain.places[:, 0]
+        frames = chain.code.decode(numbers.float() * self.token_scale[types] + self.token_mean[types])
+        flat = frames.flatten(0, -3).double().cpu().numpy()
+        laid = superpose(flat, chain.template_nm, idx=chain.fitted)
+        return torch.from_numpy(laid).float().reshape(frames.shape).to(frames.device)
+
+    def correlation_at(self, times_ps: Tensor, types: Tensor) -> Tensor:
+        """Return the correlations `(b, t, r, slots)` with the given frame, linear in log t between the lags kept."""
+        if not self.config.innovation:
+            return self.correlation.new_zeros(*times_ps.shape, len(types), self.correlation.shape[-1])
+        lags = self.config.lags_ps.to(times_ps.device).log()
+        at = times_ps.float().log().clamp(float(lags[0]), float(lags[-1]))
+        right = torch.searchsorted(lags, at).clamp(1, len(lags) - 1)
+        share = ((at - lags[right - 1]) / (lags[right] - lags[right - 1]))[..., None, None]
+        table = self.correlation[types].transpose(0, 1)  # (lags, r, slots)
+        return (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
+
+    def innovations(self, later: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+        """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `known` (b, r, slots) -> innovations."""
+        rho = self.correlation_at(times_ps, types)
+        return (later - rho * known[:, None]) / (1.0 - rho.square()).sqrt()
+
+    def from_innovations(self, y: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
+        """The inverse of `innovations`."""
+        rho = self.correlation_at(times_ps, types)
+        return rho * known[:, None] + (1.0 - rho.square()).sqrt() * y
+
+    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
+        # At least as many numbers as a frame has coordinates that vary.
+        return (self.n_new, n_atoms, 4)
+
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
+                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
+        """See `Surrogate.next_chunk`. Velocities play no part. Raises InputError for a molecule not told as a chain."""
+        chain = molecule.chain
+        if chain is None:
+            raise InputError("this model knows peptides by residues; make molecules by `data.descriptions.describe`.")
+        types, filled = chain.places[:, 0], chain.code.filled
+        known = self.normalised(last_frames_nm[:, -1], chain)
+        assert self.lag_ps is not None
+        ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=known.device)
+        times = ahead.expand(len(known), -1).float()
+        drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
+        drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
+
+        def predict(o: Tensor, tau: Tensor) -> Tensor:
+            return torch.where(filled, self.flow(o, tau, known, times, chain.places), 0.0)
+
+        y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
+        return Chunk(self.frames_of(self.from_innovations(y, known, times, types), chain))

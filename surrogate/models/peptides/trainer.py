@@ -1,0 +1,289 @@
+"""Train the model of peptides (`models.lam_slide.peptides`) on runs of many sequences: one flow, no first stage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
+from surrogate.data.frames import TrainingFrames
+from surrogate.data.weights import save_weights
+from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.objectives import TAU_MAX
+from surrogate.models.lam_slide.subjects import pick
+from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.provenance import provenance_of, training_domain
+from systems.errors import InputError
+
+_MEASURED_FRAMES = 4000
+_MEASURED_PAIRS = 4000
+_HELD_WINDOWS = 128
+# Flow times and noise of validation are the same each time.
+_HELD_SEED = 0
+# Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
+_EVEN_SHARE = 0.5
+# Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
+_LEAST_SCALE = 0.05
+
+
+@dataclass(frozen=True)
+class PeptideTraining:
+    """Optimisation (AdamW, EMA 0.999), in seconds of training or steps."""
+
+    budget_s: float | None = None
+    steps: int | None = None
+    batch: int = 64
+    learning_rate: float = 1e-3
+    seed: int = 0
+    bf16: bool = True
+    device: str = "cpu"
+    time_reversal: bool = False
+    validate_every_s: float = 120.0
+
+
+@dataclass(eq=False)
+class PeptideSubject:
+    """One sequence's frames, what the model is told of it, and the stretches that windows may be taken from."""
+
+    frames: TrainingFrames
+    chain: ChainFeatures
+
+    def windows(
+        self, n: int, config: PeptideConfig, generator: torch.Generator, *, validation: bool = False,
+        time_reversal: bool = False,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Draw windows: frames `(n, 1 + chunk_frames)` and the times `(n, chunk_frames)` ps after the first.
+
+        Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
+        longer than the configuration's, and all frames of a window are of one stretch.
+        """
+        lag = self.frames.lag_ps
+        ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
+        longest = min(int(config.longest_ps / lag), int((ranges[:, 1] - ranges[:, 0]).max()) - 1)
+        if longest < config.chunk_frames:
+            raise InputError(
+                f"{self.frames.scene.name}: runs hold no window of {config.chunk_frames} frames; run longer."
+            )
+        t = config.chunk_frames
+        even = torch.rand(n, 1, generator=generator) < _EVEN_SHARE
+        top = float(np.log(longest / t))
+        stride = torch.exp(torch.rand(n, 1, generator=generator) * top).round().clamp(1, longest // t)
+        drawn = torch.exp(torch.rand(n, t, generator=generator) * float(np.log(longest))).round().long()
+        drawn = torch.stack([_distinct(row, longest) for row in drawn.sort(dim=1).values])
+        ahead = torch.where(even, (stride * torch.arange(1, t + 1)).long(), drawn)
+        first = torch.empty(n, dtype=torch.int64)
+        place = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
+        for k, span in enumerate(ahead[:, -1].tolist()):
+            rooms = np.maximum(ranges[:, 1] - ranges[:, 0] - span, 0)
+            at = int(place[k] * rooms.sum())
+            which = int(np.searchsorted(np.cumsum(rooms), at, side="right"))
+            first[k] = int(ranges[which, 0]) + at - int(rooms[:which].sum())
+        idx = torch.cat([first[:, None], first[:, None] + ahead], dim=1)
+        if time_reversal:
+            backwards = torch.rand(n, 1, generator=generator) < 0.5
+            idx = torch.where(backwards, 2 * first[:, None] + ahead[:, -1:] - idx, idx)
+        return idx, ahead.float() * lag
+
+    def numbers(self, model: PeptideSlide, idx: Tensor) -> Tensor:
+        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames."""
+        frames = torch.from_numpy(self.frames.positions_nm(idx.numpy())).to(model.token_mean.device)
+        return model.normalised(frames, self.chain)
+
+
+def _distinct(ahead: Tensor, longest: int) -> Tensor:
+    """Return ascending whole numbers from 1 to `longest`, each once, near those given (ascending)."""
+    found = ahead.clone()
+    for k in range(1, len(found)):
+        found[k] = max(int(found[k]), int(found[k - 1]) + 1)
+    surplus = int(found[-1]) - longest
+    if surplus > 0:
+        top = torch.arange(longest - len(found) + 1, longest + 1)
+        found = torch.minimum(found, top)
+    return found
+
+
+def train_peptides(
+    sets: Sequence[TrainingFrames],
+    out: str | Path,
+    config: PeptideConfig,
+    training: PeptideTraining,
+    *,
+    unseen: Sequence[TrainingFrames] = (),
+    resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> Path:
+    """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves.
+
+    `unseen`: sequences held out whole, whose loss the curves show. Every frame of `sets` outside the split is trained
+    on; windows start anywhere. Raises InputError for scenes that are no chains, SimulationError when training diverges.
+    """
+    out = Path(out)
+    torch.manual_seed(training.seed)
+    config = _with_scale(config, sets)
+    device = torch.device(training.device)
+    model = PeptideSlide(config).to(device)
+    subjects, held_out = (
+        [PeptideSubject(f, chain_features(f.scene, config).to(device)) for f in some] for some in (sets, unseen)
+    )
+    normalise(model, subjects, training.seed)
+    stage = StageConfig(
+        "flow", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
+        bf16=training.bf16, validate_every_s=training.validate_every_s,
+    )  # fmt: skip
+    held = [
+        (name, subject, *subject.windows(_HELD_WINDOWS, config, torch.Generator().manual_seed(_HELD_SEED),
+                                         validation=name == "validation"))
+        for name, some in (("validation", subjects), ("unseen", held_out)) for subject in some
+    ]  # fmt: skip
+
+    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        subject = subjects[pick(subjects, generator)]
+        idx, times = subject.windows(training.batch, config, generator, time_reversal=training.time_reversal)
+        return peptide_loss(model, subject.chain, subject.numbers(model, idx), times.to(device), generator)
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        found: dict[str, list[float]] = {}
+        for name, subject, idx, times in held:
+            generator = torch.Generator().manual_seed(_HELD_SEED)
+            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
+                _, terms = peptide_loss(
+                    model, subject.chain, subject.numbers(model, idx), times.to(device), generator, noisy=False
+                )
+            for key, value in terms.items():
+                found.setdefault(f"{name}_{key}", []).append(float(value))
+        return {key: float(np.mean(values)) for key, values in found.items()}
+
+    domains = [training_domain(f, strides=_strides(config, f)) for f in sets]
+    domain = replace(domains[0], further=tuple(domains[1:]), transferable=True)
+
+    def write(spent_s: float) -> None:
+        settings: dict[str, Any] = {"seed": training.seed, "flow_s": round(spent_s, 1)}
+        save_weights(out, model, domain, provenance_of(sets[0], settings, None, sets[1:]))
+
+    state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")
+    if not resume:
+        for path in (state, log):
+            path.unlink(missing_ok=True)
+    spent = run_stage(model.flow, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
+                      device=device, progress=progress, on_save=write)  # fmt: skip
+    write(spent)
+    state.unlink(missing_ok=True)
+    return out
+
+
+def _strides(config: PeptideConfig, frames: TrainingFrames) -> tuple[int, ...]:
+    """Return the lags in frames at which jumps are measured, as far as the runs reach."""
+    most = max(high - low for low, high in frames.split.ranges(frames.starts, validation=False)) - 1
+    whole = (config.lags_ps / frames.lag_ps).round().long().clamp(1, most)
+    return tuple(sorted(set(whole.tolist())))
+
+
+def _with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> PeptideConfig:
+    if config.scale is not None:
+        return config
+    layouts = [chain_layout(frames.scene) for frames in sets]
+    share = max(200, _MEASURED_FRAMES // len(sets))
+    scale = chain_scale((layout, _some(frames, share)) for layout, frames in zip(layouts, sets, strict=True))
+    return replace(config, scale=scale, types=tuple(sorted({name for layout in layouts for name in layout.types})))
+
+
+def _some(frames: TrainingFrames, n: int) -> npt.NDArray[np.float32]:
+    starts = frames.window_starts(1, validation=False)
+    return frames.positions_nm(starts[np.linspace(0, len(starts) - 1, min(n, len(starts))).astype(int)])
+
+
+@torch.no_grad()
+def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int) -> None:
+    """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them.
+
+    A torsion's cosine and sine share one scale, the root of their mean variance, and one correlation.
+    """
+    rng = np.random.default_rng(seed)
+    lags = model.config.lags_ps
+    n_types, n_slots = model.token_mean.shape
+    sums = torch.zeros(3, n_types, n_slots, dtype=torch.float64)
+    for subject in subjects:
+        tokens = subject.chain.code.encode(
+            torch.from_numpy(_some(subject.frames, _MEASURED_FRAMES // len(subjects) + 100))
+        )
+        for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+            for power in range(3):
+                sums[power, kind] += tokens[:, r].double().pow(power).sum(0)
+    mean = sums[1] / sums[0].clamp(min=1)
+    variance = (sums[2] / sums[0].clamp(min=1) - mean.square()).clamp(min=0)
+    pairs = [_pairs(subject, n_slots) for subject in subjects]
+    for subject, (cosine, places) in zip(subjects, pairs, strict=True):
+        for r, slot in zip(cosine.tolist(), places.tolist(), strict=True):
+            kind = int(subject.chain.places[r, 0])
+            variance[kind, slot : slot + 2] = variance[kind, slot : slot + 2].mean()
+    scale = variance.sqrt().clamp(min=_LEAST_SCALE)
+    model.token_mean.copy_(mean)
+    model.token_scale.copy_(scale)
+    products = torch.zeros(3, n_types, len(lags), n_slots, dtype=torch.float64)
+    for subject in subjects:
+        for k, lag in enumerate((lags / subject.frames.lag_ps).round().long().clamp(min=1).tolist()):
+            try:
+                starts = subject.frames.window_starts(lag + 1, validation=False)
+            except InputError:
+                continue
+            first = torch.from_numpy(rng.choice(starts, size=min(_MEASURED_PAIRS // len(subjects) + 100, len(starts))))
+            both = subject.numbers(model, torch.stack([first, first + lag])).double()
+            for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
+                x, y = both[0, :, r], both[1, :, r]
+                for what, value in enumerate((x * y, x * x, y * y)):
+                    products[what, kind, k] += value.sum(0)
+    for subject, (cosine, places) in zip(subjects, pairs, strict=True):
+        done: set[tuple[int, int]] = set()
+        for r, slot in zip(cosine.tolist(), places.tolist(), strict=True):
+            kind = int(subject.chain.places[r, 0])
+            if (kind, slot) not in done:
+                done.add((kind, slot))
+                products[:, kind, :, slot : slot + 2] = products[:, kind, :, slot : slot + 2].mean(-1, keepdim=True)
+    found = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-12)
+    model.correlation.copy_(found.clamp(0.0, 1.0))
+
+
+def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
+    """Return residue and first slot of each torsion's two numbers."""
+    at = subject.chain.code.turning_at
+    return at // n_slots, at % n_slots
+
+
+def peptide_loss(
+    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, times_ps: Tensor, generator: torch.Generator, *,
+    noisy: bool = True,
+) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+    """Flow matching on the innovations of windows: `numbers` (b, 1 + t, r, slots), the first frame given.
+
+    The error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the given
+    frame is disturbed as in training. Returns the loss and its parts, of torsions' numbers and of stiff ones.
+    """
+    c, filled = model.config, chain.code.filled
+    known, later = numbers[:, 0], numbers[:, 1:]
+    if noisy:
+        known = known + c.conditioning_noise * filled * torch.randn(known.shape, generator=generator).to(known.device)
+    target = model.innovations(later, known, times_ps, chain.places[:, 0])
+    draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
+    tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
+    noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
+    alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
+    found = model.flow(alpha * target + sigma * noise, tau, known, times_ps, chain.places)
+    weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
+    error = (found - target).square() * weight
+    turning = torch.zeros_like(filled).flatten()
+    turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
+    turning = turning.reshape(filled.shape)
+    of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
+    share = c.turning_weight * turning.sum() / (c.turning_weight * turning.sum() + (filled & ~turning).sum())
+    loss = share * of_turning + (1 - share) * of_stiff
+    return loss, {"flow": loss.detach(), "turning": of_turning.detach(), "stiff": of_stiff.detach()}

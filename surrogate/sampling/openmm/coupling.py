@@ -1,0 +1,132 @@
+"""OpenMM beside a rollout: frames relaxed, energies, and real MD from a frame, under the conditions of training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.geometry import superposition
+from systems.chemistry.limits import WIDENING
+from systems.errors import InputError, SurromdError
+from systems.units import whole_steps
+
+if TYPE_CHECKING:
+    from md_reference.run.frame_relaxation import Relaxed
+    from surrogate.data.weights import Weights
+
+FloatArray = npt.NDArray[np.floating[Any]]
+
+# The reference that energies are measured against: long enough for fast motion, short enough to be made on the spot.
+_SETTLE_PS = 10.0
+_SAMPLE_PS = 0.5
+_SAMPLES = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Real MD: frames `(n_frames, n_atoms, 3)` nm and velocities `(n_atoms, 3)` nm/ps at the last, laid on the frame
+    that they start from, as the frames of a rollout are."""
+
+    frames_nm: FloatArray
+    velocities_nm_ps: FloatArray
+
+
+class Coupling:
+    """The truth that a surrogate was trained on, ready to help it. Atoms in the model's order. Close when done.
+
+    Raises InputError when the weights do not say which force field they were trained with, or OpenMM cannot build it.
+    """
+
+    def __init__(self, weights: Weights, *, platform: str = "auto") -> None:
+        from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+        from md_reference.run.frame_relaxation import Relaxer
+
+        self._scene, self._conditions = weights.domain.scene, weights.domain.conditions
+        self._platform, self._lag_ps = platform, weights.domain.lag_ps
+        needed = ("force_field", "solvent", "temperature_k", "timestep_ps")
+        missing = [key for key in needed if self._conditions.get(key) is None]
+        if missing:
+            raise InputError(
+                f"{_cannot(weights)}: they do not say which {' and '.join(missing)} they were trained with."
+            )
+        try:
+            self._spec = resolve(self._scene, ForceFieldSpec.of(self._conditions))
+            self._system = build_system(self._scene, self._spec)
+            self._relaxer = Relaxer(self._scene, self._system, platform=platform, born=self._spec.is_born)
+        except SurromdError as error:
+            raise InputError(f"{_cannot(weights)}: {error}") from error
+        self._steps_per_frame = whole_steps(
+            self._lag_ps, self._conditions["timestep_ps"], "the weights' frame spacing in MD time steps"
+        )
+        self._fit = self._scene.heavy_idx if len(self._scene.heavy_idx) >= 3 else np.arange(self._scene.n_atoms)
+
+    def relax(self, frame_nm: FloatArray) -> Relaxed:
+        """Return a frame `(n_atoms, 3)` nm with its stiff bonds at rest and all else held near where it was.
+
+        Raises SimulationError for frames that are beyond repair.
+        """
+        return self._relaxer.relax(frame_nm)
+
+    @cached_property
+    def energy_limit_kj_mol(self) -> float:
+        """The highest energy of a relaxed frame that passes: 1.5 times as far above the mean as MD goes in 150 frames.
+
+        Measured on MD of 85 ps from the training template, made when it is first asked for.
+        """
+        with self._engine(seed=0) as engine:
+            engine.set_positions(self.relax(self._scene.positions_nm).positions_nm)
+            engine.thermalise()
+            engine.step(round(_SETTLE_PS / self._conditions["timestep_ps"]))
+            energies = np.empty(_SAMPLES)
+            for k in range(_SAMPLES):
+                engine.step(round(_SAMPLE_PS / self._conditions["timestep_ps"]))
+                energies[k] = self.relax(engine.positions()).potential_kj_mol
+        return float(energies.mean() + WIDENING * (energies.max() - energies.mean()))
+
+    def simulate(self, start_nm: FloatArray, n_frames: int, *, seed: int) -> Segment:
+        """Run MD from a frame `(n_atoms, 3)` nm: relaxed first, velocities drawn anew, frames at the weights' spacing.
+
+        The same start and seed give the same frames, whatever was simulated before. Raises SimulationError when the
+        start is beyond repair or the system blows up.
+        """
+        start = np.asarray(start_nm, dtype=np.float64)
+        frames = np.empty((n_frames, *start.shape))
+        with self._engine(seed=seed) as engine:
+            engine.set_positions(self.relax(start).positions_nm)
+            engine.thermalise()
+            for k in range(n_frames):
+                engine.step(self._steps_per_frame)
+                state = engine.state(velocities=True)
+                frames[k] = state.positions_nm
+        rotation, translation = superposition(frames, start, idx=self._fit)
+        laid = np.einsum("tij,tnj->tni", rotation, frames) + translation[:, None, :]
+        velocities = np.asarray(state.velocities_nm_ps)
+        # What the molecule does as a whole is no part of a rollout.
+        velocities = velocities - self._scene.masses_da @ velocities / self._scene.masses_da.sum()
+        return Segment(laid, velocities @ rotation[-1].T)
+
+    def _engine(self, *, seed: int) -> Any:
+        from md_reference.run.engine import Engine
+
+        return Engine(
+            self._scene,
+            self._spec,
+            temperature_k=self._conditions["temperature_k"],
+            friction_per_ps=self._conditions.get("friction_per_ps") or 1.0,
+            timestep_ps=self._conditions["timestep_ps"],
+            seed=seed,
+            platform=self._platform,
+            system=self._system,
+        )
+
+    def close(self) -> None:
+        """Free OpenMM's Contexts."""
+        self._relaxer.close()
+
+
+def _cannot(weights: Weights) -> str:
+    return f"{weights.path.name} cannot be coupled to OpenMM (--guard flag and resample need no coupling)"

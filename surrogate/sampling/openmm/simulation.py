@@ -1,0 +1,302 @@
+"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context, checkpoints."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.sampling.domain import fit_weights
+from surrogate.sampling.openmm.openmm_state import SurrogateState
+from surrogate.sampling.rollout_checkpoint import UNREADABLE
+from systems.errors import InputError, SimulationError
+from systems.files.outside import UNREADABLE, arrays_in
+from systems.files.schema import parsed
+from systems.scene import Scene
+from systems.units import Quantity, quantity
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+# positions (n_atoms, 3) nm -> potential energy in kJ/mol
+EnergyFn = Callable[[npt.NDArray[np.float64]], float]
+
+
+class Simulation:
+    """A learned simulator that OpenMM's and MDTraj's reporters take for `openmm.app.Simulation`.
+
+    One step is one frame of the weights, `integrator.getStepSize()` apart (1 ps, say). `currentStep` may be set.
+    Frames are those that `rollout` writes for the same seed, replica 0, in the scene's atom order and pose. What a
+    surrogate does not have (kinetic energy, temperature, forces, a box) raises SimulationError where it is asked for
+    and is never zero; the potential energy is what `energy_fn` says, and raises without one. Reporters that ask for
+    such things by default must be told not to: `HDF5Reporter(file, 10, cell=False, potentialEnergy=False,
+    kineticEnergy=False, temperature=False)`.
+
+    `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
+    `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
+    the time of a step, of weights that were trained for several. `stiff`: as `rollout` takes it.
+    Raises OutOfDomainError, InputError, WeightsError.
+    """
+
+    def __init__(
+        self,
+        scene: str | Path | Scene,
+        weights: str | Path | Weights,
+        *,
+        seed: int = 0,
+        solver_steps: int = 10,
+        solver: str | None = None,
+        precision: str = "auto",
+        energy_fn: EnergyFn | None = None,
+        force: bool = False,
+        lag_ps: Quantity | None = None,
+        stiff: str | None = None,
+    ) -> None:
+        import openmm
+        from openmm import unit
+
+        scene, weights = _given(scene, weights)
+        weights, match = fit_weights(scene, weights, force=force, lag_ps=quantity("lag_ps", lag_ps))
+        self.scene, self.weights, self.deviations = scene, weights, match.deviations
+        self.energy_fn = energy_fn
+        self.topology = scene.to_openmm_topology()
+        self.system = openmm.System()
+        for mass in scene.masses_da.tolist():
+            self.system.addParticle(mass * unit.dalton)
+        self.reporters: list[Any] = []
+        self.currentStep = 0
+        self._sampler = ChunkSampler(
+            weights, solver_steps=solver_steps, solver=solver, precision=precision, stiff=stiff
+        )
+        self._seed = seed
+        self._order, self._back = match.order, np.argsort(match.order)
+        self._last: npt.NDArray[np.float32]
+        self._velocities: npt.NDArray[np.float32] | None
+        self._pending: npt.NDArray[np.float32]
+        self._chunks = 0  # drawn since the start, which the seed of the next one counts from
+        self._frames = 0  # behind us, counted apart from `currentStep`, which the user may set
+        self._begin(scene.positions_nm)
+        self.integrator = SurrogateIntegrator(self)
+        self.context = SurrogateContext(self)
+
+    @property
+    def lag_ps(self) -> float:
+        """Simulated time of one step in ps."""
+        return self.weights.domain.lag_ps
+
+    @property
+    def positions_nm(self) -> npt.NDArray[np.float32]:
+        """The frame we stand at, `(n_atoms, 3)` nm, in the scene's atom order and place."""
+        frame: npt.NDArray[np.float32] = self._current[self._back] + self._centre.astype(np.float32)
+        return frame
+
+    def step(self, steps: int) -> None:
+        """Advance `steps` frames; reporters are called when they are due, as OpenMM does.
+
+        Raises SimulationError when the model's frames are no longer finite.
+        """
+        end = self.currentStep + int(steps)
+        while self.currentStep < end:
+            asked = [_described(reporter.describeNextReport(self)) for reporter in self.reporters]
+            due = [wanted["steps"] for wanted in asked if wanted["steps"] > 0]
+            ahead = min([end - self.currentStep, *due])
+            self._advance(ahead)
+            for reporter, wanted in zip(self.reporters, asked, strict=True):
+                if wanted["steps"] == ahead:
+                    reporter.report(self, self._state(frozenset(wanted["include"])))
+
+    def saveCheckpoint(self, file: str | Path | BinaryIO) -> None:
+        """Write where the simulation stands to a path or a binary file, all random numbers to come included."""
+        header = {
+            "settings": self._settings(),
+            "current_step": self.currentStep,
+            "chunks": self._chunks,
+            "frames": self._frames,
+        }
+        arrays = {"last": self._last, "current": self._current, "pending": self._pending, "centre": self._centre}
+        if self._velocities is not None:
+            arrays["velocities"] = self._velocities
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
+        if isinstance(file, str | Path):
+            from systems.files.whole_file import create_whole
+
+            create_whole(Path(file), buffer.getvalue())
+        else:
+            file.write(buffer.getvalue())
+
+    def loadCheckpoint(self, file: str | Path | BinaryIO) -> None:
+        """Go back to where a checkpoint was saved; what follows is the same bit for bit.
+
+        Raises InputError when it is damaged, or of another scene, other weights or settings; nothing changes then.
+        """
+        name = str(file) if isinstance(file, str | Path) else "the checkpoint"
+        try:
+            arrays = arrays_in(file)
+            header = parsed(str(arrays.pop("header")))
+            settings, counts = header["settings"], [int(header[k]) for k in ("current_step", "chunks", "frames")]
+            last, current, pending, centre = (arrays[key] for key in ("last", "current", "pending", "centre"))
+        except UNREADABLE as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{name} cannot be read as a checkpoint ({reason}); take another.") from error
+        for key, value in self._settings().items():
+            if settings.get(key) != value:
+                raise InputError(f"{name} was saved with {key} = {settings.get(key)!r}, not {value!r}.")
+        self._last, self._current, self._pending, self._centre = last, current, pending, centre
+        self._velocities = arrays.get("velocities")
+        self.currentStep, self._chunks, self._frames = counts
+
+    def minimizeEnergy(self, *args: Any, **options: Any) -> None:
+        """Raise SimulationError: a surrogate has no energy to minimise."""
+        raise SimulationError("a surrogate has no energy to minimise; prepare the scene, or minimise it with OpenMM.")
+
+    def _settings(self) -> dict[str, Any]:
+        lag_ps = self.weights.model.lag_ps
+        return ({} if lag_ps is None else {"lag_ps": lag_ps}) | {
+            "imposed": list(self._sampler.imposed) or None,
+            "weights_hash": self.weights.hash,
+            "topology_hash": self.scene.topology_hash,
+            "seed": self._seed,
+            "solver": self._sampler.solver,
+            "solver_steps": self._sampler.solver_steps,
+            "precision": self._sampler.precision.name,
+        }
+
+    def _begin(self, positions_nm: npt.ArrayLike) -> None:
+        """Start from positions `(n_atoms, 3)` nm in the scene's order; what was drawn ahead is dropped."""
+        start = np.asarray(positions_nm, dtype=np.float64)
+        if start.shape != (self.scene.n_atoms, 3) or not np.isfinite(start).all():
+            raise InputError(f"positions must be {self.scene.n_atoms} x 3 finite numbers, not {start.shape}.")
+        # About the centre, as `rollout` has them: a molecule far from the origin keeps its digits.
+        self._centre = start.mean(axis=0)
+        self._current = (start - self._centre).astype(np.float32)[self._order]
+        self._last = np.repeat(self._current[None], self._sampler.n_conditioning, axis=0)
+        self._velocities = None
+        self._pending = np.empty((0, self.scene.n_atoms, 3), dtype=np.float32)
+
+    def _advance(self, n_frames: int) -> None:
+        left = n_frames
+        while left > 0:
+            if not len(self._pending):
+                self._draw()
+            taken = min(left, len(self._pending))
+            self._current, self._pending = self._pending[taken - 1], self._pending[taken:]
+            self.currentStep += taken
+            self._frames += taken
+            left -= taken
+
+    def _draw(self) -> None:
+        given = None if self._velocities is None else self._velocities[None]
+        drawn = self._sampler.draw(self._last[None], [noise_seed(self._seed, 0, self._chunks)], given)
+        frames = drawn.frames_nm[0].astype(np.float32)
+        if not np.isfinite(frames).all():
+            raise SimulationError(
+                f"the model's frames are no longer finite after {self._frames * self.lag_ps:g} ps; try precision "
+                "'fp32' or other weights."
+            )
+        self._pending = frames
+        self._last = frames[-self._sampler.n_conditioning :]
+        ends = drawn.velocities_nm_ps
+        self._velocities = None if ends is None else ends[0].astype(np.float32)
+        self._chunks += 1
+
+    def _state(self, include: frozenset[str]) -> SurrogateState:
+        return SurrogateState(
+            positions_nm=self.positions_nm,
+            time_ps=self._frames * self.lag_ps,
+            step=self.currentStep,
+            include=include,
+            energy_fn=self.energy_fn,
+        )
+
+
+class SurrogateIntegrator:
+    """What reporters ask an OpenMM integrator for."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    def getStepSize(self) -> Any:
+        """Return the time between two frames, with its unit."""
+        from openmm import unit
+
+        return self._simulation.lag_ps * unit.picoseconds
+
+    def step(self, steps: int) -> None:
+        """Advance without reporters, as OpenMM's integrators do."""
+        self._simulation._advance(int(steps))
+
+
+class SurrogateContext:
+    """What reporters and scripts ask an OpenMM context for."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    def getState(self, **wanted: Any) -> SurrogateState:
+        """Return a snapshot with what is asked for: `positions=True`, `energy=True` (or OpenMM's older `getPositions`).
+
+        Raises InputError for an unknown property; what a surrogate lacks raises when the state is asked for it.
+        """
+        include = set()
+        for key, value in wanted.items():
+            name = key.removeprefix("get").lower()
+            if name not in _PROPERTIES:
+                raise InputError(f"getState() knows no {key!r}; known: {', '.join(sorted(_PROPERTIES))}.")
+            if value:
+                include.add(name)
+        return self._simulation._state(frozenset(include))
+
+    def getIntegrator(self) -> SurrogateIntegrator:
+        return self._simulation.integrator
+
+    def getSystem(self) -> Any:
+        return self._simulation.system
+
+    def getTime(self) -> Any:
+        return self.getState().getTime()
+
+    def getStepCount(self) -> int:
+        return self._simulation.currentStep
+
+    def setPositions(self, positions: Any) -> None:
+        """Start anew from positions `(n_atoms, 3)`, in nm where they have no unit; what was drawn ahead is dropped."""
+        from openmm import unit
+
+        if unit.is_quantity(positions):
+            positions = positions.value_in_unit(unit.nanometer)
+        self._simulation._begin(np.array([tuple(row) for row in positions], dtype=np.float64))
+
+
+# `groups`, `enforcePeriodicBox` and the like change nothing where there are no forces and no box.
+_PROPERTIES = {
+    "positions", "velocities", "forces", "energy", "parameters", "parameterderivatives", "integratorparameters",
+    "enforceperiodicbox", "groups",
+}  # fmt: skip
+
+
+def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
+    if isinstance(scene, str | Path):
+        from systems.prepare.source import prepare
+
+        scene = prepare(str(scene))
+    if isinstance(weights, str | Path):
+        from surrogate.data.shipped import weights_path
+        from surrogate.data.weights import load_weights
+
+        weights = load_weights(weights_path(weights))
+    return scene, weights
+
+
+def _described(report: Any) -> dict[str, Any]:
+    """Return what a reporter's `describeNextReport` says as a dictionary; OpenMM's older tuples too."""
+    if isinstance(report, dict):
+        return report
+    names = ("positions", "velocities", "forces", "energy")
+    return {"steps": report[0], "include": [name for name, asked in zip(names, report[1:5], strict=True) if asked]}

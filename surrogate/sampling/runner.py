@@ -1,0 +1,276 @@
+"""Rollouts in chunks to any length: replicas in one batch, frames checked as they are made, streamed, resumable."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.config import GUARDS, RolloutConfig
+from surrogate.sampling.domain import fit_weights
+from surrogate.sampling.guards import Guard
+from surrogate.sampling.interventions import Chunk, Interventions, none_through
+from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
+from surrogate.sampling.rollout_account import Clock, Tally
+from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
+from surrogate.sampling.rollout_plan import Plan, settle_plan
+from systems.errors import InputError, SimulationError
+from systems.files.outside import check_disk
+from systems.interrupts import deferred_interrupt
+from systems.scene import Scene
+from systems.selection import part_of
+from systems.trajectory.base import TrajectoryWriter
+from systems.trajectory.checkpoint import (
+    FLUSH_SHARE,
+    CheckpointFile,
+    checkpoint_path,
+    last_supported,
+    new_header,
+    read_checkpoints,
+    writer_at,
+)
+from systems.trajectory.claim import claimed_outputs
+from systems.trajectory.codec import open_trajectory
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+
+__all__ = ["GUARDS", "RolloutConfig", "rollout"]
+
+# (frames done, frames in all, account of speed and interventions) of one replica -> None
+ProgressFn = Callable[[int, int, str], None]
+# A line about the run as a whole -> None
+AnnounceFn = Callable[[str], None]
+
+
+def rollout(
+    scene: Scene,
+    weights: Weights,
+    outs: Sequence[Path],
+    config: RolloutConfig,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: ProgressFn | None = None,
+    announce: AnnounceFn | None = None,
+    flush_every_s: float = 3.0,
+) -> list[Path]:
+    """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
+
+    Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
+    marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.limits) against the
+    training reference, and what was done about it (column `intervention`, `account.MARKS`); the record's
+    `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
+    replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
+    and SIGTERM stop between two chunks, with everything on disk: KeyboardInterrupt. Memory that does not suffice for
+    all replicas at once halves the batch. `announce` is told how the scene leaves what was trained on.
+    Raises OutOfDomainError, InputError, StorageError; SimulationError when the guard cannot bring a chunk through
+    (under 'flag' and 'off' the chunk is in the file, marked; else what came before).
+    """
+    weights, match = fit_weights(
+        scene,
+        weights,
+        temperature_k=config.temperature_k,
+        force=config.force,
+        lag_ps=config.lag_ps,
+        save_every_ps=config.save_every_ps,
+    )
+    if announce is not None:
+        for line in match.remarks(weights.path.name):
+            announce(line)
+    state_path = checkpoint_path(outs[0])
+    precision = config.precision
+    if resume and precision == "auto" and state_path.exists():
+        # A rollout that goes on keeps it, whatever another processor would choose.
+        precision = "bf16" if read_checkpoints(state_path)[0][0]["settings"]["bf16"] else "fp32"
+    sampler = ChunkSampler(
+        weights,
+        solver_steps=config.solver_steps,
+        solver=config.solver,
+        precision=precision,
+        compile=config.compile,
+        stiff=config.stiff,
+    )
+    plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
+    checks = Guard(weights.domain)
+    check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
+
+    with ExitStack() as stack:
+        asked_to_stop = stack.enter_context(deferred_interrupt())
+        stack.enter_context(claimed_outputs(outs, may_exist=resume or overwrite))
+        if resume and not state_path.exists() and any(path.exists() for path in outs):
+            return _already_complete(outs, plan)
+        kept = last_supported(state_path, outs) if resume and state_path.exists() else None
+        state = _start(plan, sampler, len(outs)) if kept is None else progress_of(state_path, kept, plan.settings)
+        header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
+        checkpoint = CheckpointFile(state_path, kept)
+        if plan.n_frames < header.get("n_frames_wanted", 0):
+            raise InputError(
+                f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
+                "as much time or more, or write to another file."
+            )
+        header |= {"settings": plan.settings, "n_frames_wanted": plan.n_frames}
+        sampler.batch, sampler.drawn, sampler.evaluations = state.batch, state.drawn, state.evaluations
+        clock = Clock(state.seconds)
+        coupling = None
+        if config.needs_openmm:
+            coupling = Coupling(weights)
+            stack.callback(coupling.close)
+        engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
+                               plan.n_between)  # fmt: skip
+
+        def save() -> None:
+            header["progress"], arrays = packed_progress(state)
+            checkpoint.write(header, arrays)
+
+        if not state.steps:
+            # Before there are files, so that a rollout killed at any later moment can be gone on with.
+            save()
+        writers = _open_writers(stack, plan, sampler, checks, outs, header, resumed=kept is not None)
+        buffers: list[list[_Block]] = [[] for _ in outs]
+        started = time.monotonic() - state.wall_s
+        flushed_at, flushed_s = time.monotonic(), 0.0
+        speed = Speed(state.steps, time.monotonic())
+
+        def flush() -> None:
+            nonlocal flushed_at, flushed_s
+            began = time.monotonic()
+            for writer, buffer in zip(writers, buffers, strict=True):
+                _flush(writer, buffer)
+            header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
+            # Of a last chunk frames may be left out: no longer rollout could go on from its end.
+            if state.steps < plan.n_steps:
+                save()
+            flushed_at = time.monotonic()
+            flushed_s = flushed_at - began
+
+        while state.steps < plan.n_steps:
+            chunk = engine.advance(
+                state.last_frames, state.velocities, state.tallies, chunk=state.chunks, step=state.steps
+            )
+            state.wall_s = time.monotonic() - started
+            if chunk.failure is None and config.guard == "flag":
+                at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps
+                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end, may_jump=weights.model.leaps)
+            if chunk.failure is not None:
+                if config.guard in ("off", "flag"):
+                    _buffer(plan, state, chunk, buffers)
+                flush()
+                close_account(plan, state, checks, sampler, writers, completed=False)
+                state_path.unlink(missing_ok=True)
+                raise SimulationError(why_stopped(plan, state, chunk, outs))
+            _buffer(plan, state, chunk, buffers)
+            _move_on(state, chunk, sampler)
+            complete, stopping = state.steps >= plan.n_steps, asked_to_stop()
+            pause_s = max(flush_every_s, FLUSH_SHARE * flushed_s if flush_every_s else 0.0)
+            if complete or stopping or time.monotonic() - flushed_at > pause_s:
+                flush()
+            if progress is not None:
+                done = min(state.steps // plan.stride, plan.n_frames)
+                progress(done, plan.n_frames, speed.describe(plan, state, len(outs)))
+            if stopping and not complete:
+                raise KeyboardInterrupt
+        state.wall_s = time.monotonic() - started
+        close_account(plan, state, checks, sampler, writers, completed=True)
+        for writer in writers:
+            writer.close()
+        state_path.unlink(missing_ok=True)
+    return list(outs)
+
+
+def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int) -> Progress:
+    positions = plan.scene.positions_nm - plan.scene.positions_nm.mean(axis=0)
+    start = positions.astype(np.float32)[plan.match.order]
+    frames = np.broadcast_to(start, (n_replicas, sampler.n_conditioning, *start.shape)).copy()
+    return Progress(frames, tallies=[Tally() for _ in range(n_replicas)])
+
+
+def _move_on(state: Progress, chunk: Chunk, sampler: ChunkSampler) -> None:
+    n_conditioning = state.last_frames.shape[1]
+    history = np.concatenate([state.last_frames, chunk.frames_nm], axis=1)
+    state.last_frames = history[:, -n_conditioning:].copy()
+    if chunk.velocities_nm_ps is not None:
+        state.velocities = chunk.velocities_nm_ps.astype(np.float32)
+    state.steps += chunk.frames_nm.shape[1]
+    state.chunks += 1
+    state.batch, state.drawn, state.evaluations = sampler.batch, sampler.drawn, sampler.evaluations
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Frames of one replica, ready to be written."""
+
+    frames: npt.NDArray[np.float32]
+    times: npt.NDArray[np.float64]
+    flags: npt.NDArray[np.uint16]
+    chunk_idx: npt.NDArray[np.int32]
+    marks: npt.NDArray[np.uint8]
+    energies: npt.NDArray[np.float64]
+
+
+def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[_Block]]) -> None:
+    """Put by the frames of a chunk that are kept, in the scene's atom order and place."""
+    steps = state.steps + 1 + np.arange(chunk.frames_nm.shape[1])
+    keep = np.flatnonzero((steps % plan.stride == 0) & (steps <= plan.n_steps))
+    atoms = np.argsort(plan.match.order)[plan.kept_atoms]
+    shift = plan.shift_nm.astype(np.float32)
+    for row, buffer in enumerate(buffers):
+        buffer.append(
+            _Block(
+                frames=chunk.frames_nm[row, keep][:, atoms].astype(np.float32) + shift,
+                times=(steps[keep] * plan.weights.domain.lag_ps).astype(np.float64),
+                flags=chunk.flags[row, keep],
+                chunk_idx=np.full(len(keep), state.chunks, dtype=np.int32),
+                marks=chunk.marks[row, keep],
+                energies=chunk.energies_kj_mol[row, keep],
+            )
+        )
+
+
+def _flush(writer: TrajectoryWriter, buffer: list[_Block]) -> None:
+    if not buffer:
+        return
+    joined = {name: np.concatenate([getattr(b, name) for b in buffer]) for name in vars(buffer[0])}
+    scalars = {"intervention": joined["marks"]}
+    if not np.isnan(joined["energies"]).all():
+        scalars["relaxed_energy_kj_mol"] = joined["energies"]
+    writer.append(
+        joined["frames"], joined["times"], flags=joined["flags"], chunk_idx=joined["chunk_idx"], scalars=scalars
+    )
+    buffer.clear()
+
+
+def _open_writers(stack: ExitStack, plan: Plan, sampler: ChunkSampler, checks: Guard, outs: Sequence[Path],
+                  header: dict[str, Any], *, resumed: bool) -> list[TrajectoryWriter]:  # fmt: skip
+    scene = plan.scene if len(plan.kept_atoms) == plan.scene.n_atoms else part_of(plan.scene, plan.kept_atoms)
+    writers = []
+    for k, path in enumerate(outs):
+        record = new_record(plan, sampler, checks, replica=k)
+        writers.append(stack.enter_context(writer_at(path, scene, record, header, k, resumed=resumed)))
+    return writers
+
+
+def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:
+    wanted = {"weights_hash": plan.weights.hash, "seed": plan.config.seed, "save_every_ps": plan.save_every_ps}
+    for path in outs:
+        with open_trajectory(path) as reader:
+            if not reader.record.get("completed") or reader.n_frames != plan.n_frames:
+                raise InputError(
+                    f"{path} holds {reader.n_frames} of {plan.n_frames} frames but its checkpoint is gone; start again "
+                    "with --overwrite, or keep it under another name."
+                )
+            for key, value in wanted.items():
+                if reader.record.get(key) != value:
+                    raise InputError(
+                        f"{path} is complete, but of {key} = {reader.record.get(key)!r}, not {value!r}; take another "
+                        "name, or --overwrite."
+                    )
+    return list(outs)

@@ -1,0 +1,117 @@
+"""The judge as a verb: files in, a comparison and its report out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from systems.errors import InputError
+from systems.units import Quantity, quantity
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surrogate.judge.comparison import Comparison
+    from systems.scene import Scene
+
+
+def compare(
+    reference: Trajectories,
+    candidates: PathLike | Sequence[Trajectories],
+    out_html: PathLike | None = None,
+    *,
+    replicate: Trajectories | None = None,
+    top: PathLike | Sequence[PathLike | None] | None = None,
+    lag_ps: Quantity | Sequence[Quantity | None] | None = None,
+    labels: str | Sequence[str] | None = None,
+    energies: bool = False,
+    overwrite: bool = False,
+) -> Comparison:
+    """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
+
+    The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
+    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
+    `candidates` is one candidate, and a sequence holds one each. `top`: topology for
+    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
+    stands for all, or there is one for the reference, each candidate and the replicate in this order, None where the
+    file says it itself. `energies`: judge the potential energy of every k-th frame too, by the force field that the
+    reference's file names. A report that is there stays unless `overwrite`.
+    Raises InputError, TrajectoryError, OutOfDomainError.
+    """
+    from surrogate.judge.comparison import compare as judge
+    from surrogate.judge.read.ensemble import load_ensemble
+
+    if isinstance(candidates, str | Path):
+        candidates = [candidates]
+    labels = [labels] if isinstance(labels, str) else labels
+    if not candidates:
+        raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
+    if labels is not None and len(labels) != len(candidates):
+        raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
+    if out_html is not None:
+        page = Path(out_html)
+        check_outputs([page], [".html"], overwrite=overwrite)
+        check_outputs([page.with_suffix(".json"), page.with_suffix(".md")], [".json", ".md"], overwrite=overwrite)
+    n = 1 + len(candidates) + (replicate is not None)
+    tops = _one_each("top", top, n)
+    lags = [None if x is None else quantity("lag_ps", x) for x in _one_each("lag_ps", lag_ps, n)]
+    truth = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
+    others = [
+        load_ensemble(
+            find_trajectories(candidate),
+            label=labels[k] if labels else None,
+            template=truth.scene,
+            top=tops[1 + k],
+            lag_ps=lags[1 + k],
+        )
+        for k, candidate in enumerate(candidates)
+    ]
+    floor = None
+    if replicate is not None:
+        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=tops[-1], lag_ps=lags[-1])
+    energy_fn = _relaxed_energy(truth.scene, truth.record) if energies else None
+    result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
+    if out_html is not None:
+        from surrogate.judge.report.report import write_report
+
+        write_report(result, Path(out_html))
+    return result
+
+
+def _one_each(name: str, given: Any, n: int) -> list[Any]:
+    """Return what is said of each of `n` trajectories, one value standing for all. Raises InputError."""
+    if given is None or isinstance(given, str | Path | float | int):
+        return [given] * n
+    values = list(given)
+    if len(values) == 1:
+        return values * n
+    if len(values) != n:
+        raise InputError(
+            f"{len(values)} values of {name} for {n} trajectories: give one for all, or one for the reference, each "
+            "candidate and the replicate, in this order."
+        )
+    return values
+
+
+def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
+    """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
+    from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+    from md_reference.run.frame_relaxation import Relaxer
+    from systems.errors import SimulationError
+
+    if record.get("force_field") is None or record.get("solvent") is None:
+        raise InputError("--energies: the reference's file does not say with which force field it was made.")
+    spec = resolve(scene, ForceFieldSpec.of(record))
+    relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
+
+    def energy(positions_nm: npt.NDArray[np.float64]) -> float:
+        try:
+            return relaxer.relax(positions_nm).potential_kj_mol
+        except SimulationError:
+            return math.inf
+
+    return energy

@@ -1,0 +1,157 @@
+"""What a file is and where it came from: trajectories, windows and weights, told apart by what they hold."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError
+from systems.units import format_time_ps
+
+UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
+
+
+def describe_file(path: Path) -> dict[str, Any]:
+    """Return a JSON-able record of a file; `summary` is one line about it.
+
+    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() == ".safetensors":
+        return _weights(path)
+    from surrogate.data.frames import is_windows
+
+    if path.suffix.lower() in (".h5", ".hdf5") and is_windows(path):
+        return _windows(path)
+    return _trajectory(path)
+
+
+def _trajectory(path: Path) -> dict[str, Any]:
+    import numpy as np
+
+    from md_reference.run.run_summary import summary_lines
+    from systems.chemistry.validity import INVALID
+    from systems.trajectory.codec import open_trajectory
+
+    with open_trajectory(path) as reader:
+        times, flags, scene, record = reader.time_ps, reader.flags, reader.scene, dict(reader.record)
+        n_frames, n_atoms = reader.n_frames, reader.n_atoms
+    lag_ps = float(np.median(np.diff(times))) if n_frames > 1 else None
+    span = "" if lag_ps is None else f", {format_time_ps(n_frames * lag_ps)} at {format_time_ps(lag_ps)}"
+    cost = record.get("cost") or {}
+    wall = f", {cost['wall_s']:.3g} s" if "wall_s" in cost else ""
+    unfinished = " (unfinished)" if record.get("completed") is False else ""
+    return {
+        "file": str(path),
+        "type": record.get("kind", "foreign") + " trajectory",
+        "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
+        "account": [
+            *summary_lines(record.get("summary") or {}),
+            *training_lines(record),
+            *precision_lines(record),
+            *intervention_lines(record),
+        ],
+        "scene": None if scene is None else scene.name,
+        "formula": None if scene is None else scene.formula,
+        "topology_hash": None if scene is None else scene.topology_hash,
+        "n_frames": n_frames,
+        "n_atoms": n_atoms,
+        "first_ps": float(times[0]) if n_frames else None,
+        "last_ps": float(times[-1]) if n_frames else None,
+        "save_every_ps": lag_ps,
+        "invalid_frames": None if flags is None else int(np.count_nonzero(flags & INVALID)),
+        "size_mb": path.stat().st_size / 1e6,
+        "record": record,
+    }
+
+
+def precision_lines(record: dict[str, Any]) -> list[str]:
+    """Return the precision in which a rollout's network was evaluated, and why; nothing of other files."""
+    reason = record.get("precision_reason")
+    return [] if reason is None else [f"network in {record['precision']}: {reason}"]
+
+
+def training_lines(record: dict[str, Any]) -> list[str]:
+    """Return how the molecule of a rollout stands to what its weights were trained on, where it is not of it."""
+    lines = [UNSEEN] if record.get("unseen_molecule") else []
+    beyond = record.get("out_of_domain") or []
+    return [*lines, *(f"outside the training domain (--force): {d['what']}: {d['reason']}" for d in beyond)]
+
+
+def _percent(share: float) -> str:
+    """Return such as '0.12 %', '7.4 %', '62 %', '100 %'; the last of nothing less than all."""
+    percent = 100.0 * share
+    if 99.0 <= percent < 100.0:
+        return f"{math.floor(10.0 * percent) / 10.0:g} %"
+    return f"{percent:.2g} %" if percent < 99.0 else f"{percent:.0f} %"
+
+
+def intervention_lines(record: dict[str, Any]) -> list[str]:
+    """Return what a rollout's guards caught and did, and what that cost; nothing of other files."""
+    account = record.get("interventions")
+    if not isinstance(account, dict):
+        return []
+    helped, chunks = account["chunks_caught"], account["chunks"]
+    line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
+    if helped:
+        reasons = sorted(account["reasons"].items(), key=lambda r: -r[1])
+        line += f" ({_percent(helped / chunks)}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
+    lines = [line]
+    if account["frames"]:
+        done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
+        extra = {name: value for name, value in account["seconds"].items() if name != "draw"}
+        shares = ", ".join(f"{name} {_percent(v / account['seconds']['draw'])}" for name, v in extra.items())
+        lines += [
+            f"frames that are not the surrogate's first draw: {done}",
+            f"cost beside drawing chunks: {shares}",
+            *(f"bias: {why}" for why in account["bias"]),
+        ]
+    return lines
+
+
+def _windows(path: Path) -> dict[str, Any]:
+    from surrogate.data.frames import load_frames
+
+    frames = load_frames(path)
+    return {
+        "file": str(path),
+        "type": "windows",
+        "summary": f"{frames.n_frames} frames of {frames.scene.name}, {format_time_ps(frames.total_ps)} at "
+        f"{format_time_ps(frames.lag_ps)}, from {len(frames.sources)} trajectories",
+        "scene": frames.scene.name,
+        "formula": frames.scene.formula,
+        "n_frames": frames.n_frames,
+        "n_atoms": frames.scene.n_atoms,
+        "save_every_ps": frames.lag_ps,
+        "canonical": frames.canonical,
+        "conditions": frames.conditions,
+        "sources": [source["file"] for source in frames.sources],
+        "size_mb": path.stat().st_size / 1e6,
+    }
+
+
+def _weights(path: Path) -> dict[str, Any]:
+    from surrogate.data.weights import load_weights
+
+    weights = load_weights(path)
+    n_parameters = sum(p.numel() for p in weights.model.parameters())
+    return {
+        "file": str(path),
+        "type": "weights",
+        "summary": f"{n_parameters / 1e6:.2f} M parameters for {weights.domain.describe()}",
+        "hash": weights.hash,
+        "parameters": n_parameters,
+        "scene": weights.domain.scene.name,
+        "formula": weights.domain.scene.formula,
+        "molecules": [f"{d.scene.name} ({d.scene.formula})" for d in weights.domain.members],
+        "covers_unseen_molecules": weights.domain.transferable,
+        "lag_ps": weights.domain.lag_ps,
+        "longest_lag_ps": weights.domain.longest_lag_ps,
+        "conditions": weights.domain.conditions,
+        **({} if weights.stiff is None else {"imposed": list(weights.stiff.imposed)}),
+        "config": weights.model.config.to_dict(),
+        "provenance": weights.provenance,
+        "size_mb": path.stat().st_size / 1e6,
+    }

@@ -1,0 +1,167 @@
+"""Reference MD as verbs: `plan` says what a run will do, `reference` does it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Unpack
+
+from surrogate.progress import progress_bar
+from surrogate.verbs.md_options import MDOptions, takes
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
+from surrogate.verbs.scene_listing import prepare_scene, tell
+from systems.units import Quantity, quantity
+
+if TYPE_CHECKING:
+    from md_reference.run.simulate import MDConfig
+    from systems.scene import Scene
+
+
+@takes(MDOptions)
+def plan(scene: str | Path | Scene, *, time_ps: Quantity | None = None, **options: Unpack[MDOptions]) -> dict[str, Any]:
+    """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
+
+    `options`: those of `reference` (surrogate.verbs.md_options.MDOptions). Steps are timed for about a second; with
+    `time_ps` the wall time of a run of that length is estimated. Raises what `reference` raises for settings that
+    cannot be.
+    """
+    from md_reference.run.plan import make_plan
+
+    time_ps = quantity("time_ps", time_ps)
+    molecule = prepare_scene(scene, options, quiet=False)
+    molecule, config, protocol = _settle(
+        molecule, options, time_ps=1.0 if time_ps is None else time_ps, seed=0, quiet=True
+    )
+    found = make_plan(
+        molecule,
+        config.force,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
+        platform=options["platform"],
+        replicas=options["replicas"],
+        time_ps=time_ps,
+        equilibrate_ps=config.equilibrate_ps,
+        ensemble=config.ensemble,
+        pressure_bar=config.pressure_bar,
+    ).to_dict()
+    return found | ({"protocol": protocol} if protocol else {})
+
+
+@takes(MDOptions)
+def reference(
+    scene: str | Path | Scene,
+    out: str | Path,
+    *,
+    time_ps: Quantity,
+    save_every_ps: Quantity | None = None,
+    save_velocities: bool = False,
+    save_forces: bool = False,
+    seed: int = 0,
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+    **options: Unpack[MDOptions],
+) -> list[Path]:
+    """Simulate a scene with OpenMM and return the trajectories written; each record ends with a `summary` of its run.
+
+    `options` are those of surrogate.verbs.md_options.MDOptions, listed in this function's signature.
+
+    `ensemble`: 'nvt' (Langevin middle integrator), 'nve' (velocity Verlet) or 'npt' (Monte Carlo barostat at
+    `pressure_bar`; periodic scenes only). `save_velocities` (nm/ps) and `save_forces` (kJ/mol/nm) need an .h5.
+
+    `force_field`, `solvent`: see `md_reference.forces.forcefield.ForceFieldSpec`; `level='gfn2-xtb'` is that force
+    field. Explicit solvents ('tip3p', 'opc') put a scene that has no periodic cell into one: water to `padding_nm` (1
+    nm) on each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
+
+    `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
+    `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name:
+    `systems.library.protocols`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
+    4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
+    for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
+    `systems.prepare.source.prepare`. `resume` goes on from the checkpoint beside `out`.
+    Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
+    """
+    from md_reference.run.replicas import replica_paths, simulate_replicas
+
+    time_ps, save_every_ps = quantity("time_ps", time_ps), quantity("save_every_ps", save_every_ps)
+    replicas = options["replicas"]
+    outs = replica_paths(Path(out), replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
+    molecule = prepare_scene(scene, options, quiet=quiet)
+    molecule, config, protocol = _settle(
+        molecule, options, time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, quiet=quiet
+    )
+    _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
+    if protocol and not quiet:
+        tell(molecule.name, protocol)
+    label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
+    with (
+        accounted_outputs(outs, resumable="the same command with --resume goes on"),
+        progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
+    ):
+
+        def preparing(share: float) -> None:
+            if progress is not None:
+                progress(round(1000 * share), 1000, "equilibrating" if share else "minimising")
+
+        return simulate_replicas(
+            molecule,
+            replace(
+                config,
+                save_velocities=save_velocities or config.save_velocities,
+                save_forces=save_forces or config.save_forces,
+            ),
+            outs,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            preparing=preparing,
+            announce=None if quiet else lambda line: tell(molecule.name, line),
+        )
+
+
+def _settle(
+    scene: Scene,
+    options: MDOptions,
+    *,
+    time_ps: float,
+    save_every_ps: float | None = None,
+    seed: int,
+    quiet: bool,
+) -> tuple[Scene, MDConfig, str]:
+    """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
+
+    Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
+    """
+    from md_reference.campaign.run_options import to_config
+    from md_reference.forces.forcefield import ForceFieldSpec, at_level, resolve
+    from md_reference.forces.solvation import require_molecules, solvate_if_asked
+    from md_reference.run.config import MDConfig
+    from md_reference.run.defaults import settle
+    from md_reference.run.integrators import check_ensemble
+
+    given = {**options, "force_field": at_level(options["level"], options["force_field"])}
+    given |= {"save_every_ps": save_every_ps}
+    settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
+    asked = {name: value for name, value in given.items() if name in settings_of_a_run and value is not None}
+    if options["hydrogen_mass_da"] != "default":
+        asked["hydrogen_mass_da"] = options["hydrogen_mass_da"]
+    settings, protocol = settle(scene, asked, options["protocol"])
+    config = to_config(settings | {"time_ps": time_ps}, seed=seed)
+    config = replace(config, force=resolve(scene, config.force))
+    if options["keep_water"]:
+        require_molecules(config.force)
+    dry = scene
+    padding_nm, salt_molar = (
+        quantity("padding_nm", options["padding_nm"]),
+        quantity("ionic_strength_molar", options["ionic_strength_molar"]),
+    )
+    scene = solvate_if_asked(scene, config.force, padding_nm, salt_molar, seed=seed)
+    config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
+    if not quiet:
+        if scene is not dry:
+            tell(scene.name, scene.provenance["repairs"][-1])
+        for warning in config.force.warnings:
+            tell(scene.name, f"warning: {warning}")
+    return scene, config, protocol

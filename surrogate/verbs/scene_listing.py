@@ -1,0 +1,93 @@
+"""Scenes: what the library holds, and what is made of the name or file that a user gives."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from surrogate.verbs.md_options import Preparation
+    from systems.scene import Scene
+
+
+def systems(name: str | None = None) -> list[dict[str, Any]]:
+    """Return what the library holds: one record per named scene, or the one asked for, with its protocols and atoms.
+
+    Raises UnknownNameError (with the nearest name).
+    """
+    from systems.library import named_scenes
+
+    if name is not None:
+        return [_describe(name, whole=True)]
+    groups = named_scenes.groups()
+    return [_describe(each, whole=False) | {"group": group} for group in groups for each in groups[group]]
+
+
+def _describe(name: str, *, whole: bool) -> dict[str, Any]:
+    from systems.library import named_scenes
+
+    scene = named_scenes.load(name)
+    record: dict[str, Any] = {
+        "name": name,
+        "title": named_scenes.describe(name),
+        "n_atoms": scene.n_atoms,
+        "formula": scene.formula,
+    }
+    if whole:
+        from systems.chemistry.graph import backbone_torsions
+        from systems.library.protocols import find_protocol
+
+        record |= {
+            "n_bonds": len(scene.bonds),
+            "residues": list(scene.residue_names),
+            "atoms": list(scene.atom_names),
+            "mass_da": float(scene.masses_da.sum()),
+            "charge_e": int(scene.formal_charges.sum()),
+            "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
+            "topology_hash": scene.topology_hash,
+            "molecule_key": scene.molecule_key,
+            "protocols": {each: _written(find_protocol(each).settings) for each in named_scenes.protocols(name)},
+        }
+        if scene.interactions is not None:
+            record |= {
+                "law": scene.interactions,
+                "settings": _written(named_scenes.own_settings(name)),
+                "source": named_scenes.source_of_settings(name),
+            }
+    return record
+
+
+def _written(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings as they are printed."""
+    return {key: "natural" if value is None else value for key, value in settings.items()}
+
+
+def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
+    """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr.
+
+    Raises what `systems.prepare.source.prepare` raises.
+    """
+    if not isinstance(scene, str | Path):
+        return scene
+    scene = str(scene)
+    from systems.prepare.source import prepare
+
+    prepared = prepare(
+        scene,
+        ph=options["ph"],
+        keep_ligand=options["keep_ligand"],
+        drop_ligand=options["drop_ligand"],
+        drop_water=options["drop_water"],
+        keep_water=options["keep_water"],
+        cap_breaks=options["cap_breaks"],
+    )
+    if not quiet:
+        for line in prepared.provenance.get("repairs", []):
+            tell(scene, line)
+    return prepared
+
+
+def tell(name: str, line: str) -> None:
+    """Say a line about a scene on stderr."""
+    sys.stderr.write(f"{name}: {line}\n")

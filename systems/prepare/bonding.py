@@ -1,0 +1,351 @@
+"""Bonds of a structure file: from residue templates, CONECT records or distances; and what is missing from it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.components import component, known_template
+from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
+from systems.chemistry.residues import ResidueTemplate, canonical_heavy_name, template_for
+from systems.errors import PreparationError
+from systems.files.outside import check_density
+from systems.prepare.missing_atoms import note_missing
+from systems.prepare.modified_residues import listed
+from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.structure import atom_label
+
+_PEPTIDE_NM = 0.20
+_DISULFIDE_NM = 0.25
+_HYDROGEN_NM = 0.16
+_AMINE_NM = 0.16
+_AMIDE_NM = 0.145
+_PHOSPHATE_NM = 0.175
+_THIOETHER_NM = 0.19
+_GLYCOSIDE_NM = 0.155
+_TOLERANCE_NM = 0.04
+_COINCIDENT_NM = 0.03
+_CONECT_SLACK_NM = 0.1
+
+
+@dataclass
+class Residue:
+    """All atoms of one residue, wherever they stand in the file. `heavy` is empty when the names fit no template."""
+
+    key: tuple[str, str, str]
+    atoms: list[int]
+    template: ResidueTemplate | None
+    heavy: dict[str, int] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+    lacks_hydrogens: bool = False
+
+    @property
+    def label(self) -> str:
+        return f"{self.key[2]} {self.key[0]}{self.key[1]}"
+
+
+@dataclass
+class Bonding:
+    """Bonds `(n_bonds, 2)`, the residues in the order of the file, and an account of where bonds came from.
+
+    `peptide_bonds` are the pairs (C, N) that join standard residues.
+    """
+
+    bonds: npt.NDArray[np.int64]
+    residues: list[Residue]
+    notes: list[str]
+    peptide_bonds: set[tuple[int, int]]
+
+    @property
+    def neighbours(self) -> list[list[int]]:
+        """Of each atom the atoms that it is bonded to."""
+        near: list[list[int]] = [[] for _ in range(sum(len(r.atoms) for r in self.residues))]
+        for i, j in self.bonds.tolist():
+            near[i].append(j)
+            near[j].append(i)
+        return near
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no residue that is known by its name lacks an atom."""
+        return not any(r.missing or r.lacks_hydrogens for r in self.residues)
+
+
+def find_bonds(
+    atoms: Sequence[AtomRecord], conect: Sequence[tuple[int, int]], chain_ends: Collection[int] = ()
+) -> Bonding:
+    """Return the bonds of these atoms.
+
+    Standard residues take heavy-atom bonds from their template, hydrogens go to the nearest heavy atom, peptide and
+    disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
+    distances within 0.04 nm of the sum of covalent radii if not; to other residues only the bonds that link polymers.
+    Monatomic ions have no bonds by distance, and metal ions none at all. Peptide bonds across one of the `chain_ends`
+    (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide and hydrogens far from
+    everything.
+    """
+    from scipy.spatial import cKDTree
+
+    x = np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0
+    tree = cKDTree(x)
+    check_density(tree, 0.35, "the structure")
+    near = tree.query_pairs(0.35, output_type="ndarray").reshape(-1, 2)
+    length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d < _COINCIDENT_NM:
+            raise PreparationError(
+                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} stand on one point ({d * 10:.2f} Å apart); "
+                "remove one of them."
+            )
+    residues = _residues(atoms)
+    ions = {i for r in residues if are_ions([atoms[i] for i in r.atoms]) for i in r.atoms}
+    of_atom = {i: r for r in residues for i in r.atoms}
+    bonds: set[tuple[int, int]] = set()
+    notes: list[str] = []
+    for residue in residues:
+        if residue.heavy and residue.template is not None:
+            names = [*residue.template.bonds, *([("C", "OXT")] if "OXT" in residue.heavy else [])]
+            bonds |= {_pair(residue.heavy[a], residue.heavy[b]) for a, b in names if {a, b} <= set(residue.heavy)}
+    peptide = _peptide_bonds(near, length, of_atom)
+    bonds |= {_pair(c, n) for c, n in peptide}
+    bonds |= _accepted_conect(atoms, x, conect, of_atom, {i for i in ions if is_metal(atoms[i].element)}, notes)
+    free = _free_atoms(residues, bonds, notes)
+    _note_bonds_across_ends(peptide, of_atom, chain_ends, notes)
+    bonds |= _bonds_by_distance(atoms, near, length, free, ions, bonds, notes)
+    bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
+    bonds |= _disulfides(atoms, near, length, bonds, of_atom)
+    bonds |= _links_of_components(atoms, near, length, of_atom, ions)
+    bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
+    note_missing(residues, atoms, bonded)
+    return Bonding(bonded, residues, notes, peptide)
+
+
+def are_ions(atoms: Sequence[AtomRecord]) -> bool:
+    """Whether the atoms of a residue are monatomic ions: one, or several of one name under one number."""
+    return is_lone_ion(atoms[0].element) and len({a.name for a in atoms}) == 1
+
+
+def _pair(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i < j else (j, i)
+
+
+def _residues(atoms: Sequence[AtomRecord]) -> list[Residue]:
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for i, atom in enumerate(atoms):
+        groups.setdefault(atom.residue_key, []).append(i)
+    residues = []
+    for key, members in groups.items():
+        residue = Residue(key, members, known_template(key[2]))
+        if residue.template is not None:
+            heavy: dict[str, int] = {}
+            fits = True
+            found = component(key[2]) if template_for(key[2]) is None else None
+            element = {} if found is None else dict(zip(found.heavy, found.elements, strict=True))
+            for i in members:
+                if atoms[i].element != "H":
+                    name = canonical_heavy_name(residue.template, atoms[i].name)
+                    fits = fits and name is not None and name not in heavy
+                    fits = fits and element.get(name or "", (name or " ")[0]) == atoms[i].element
+                    heavy[name or ""] = i
+            if fits:
+                residue.heavy = heavy
+            elif template_for(key[2]) is None:
+                residue.template = None  # another molecule under the name of a component
+        residues.append(residue)
+    return residues
+
+
+def _peptide_bonds(
+    near: npt.NDArray[np.int64], length: npt.NDArray[np.float64], of_atom: dict[int, Residue]
+) -> set[tuple[int, int]]:
+    best: dict[int, tuple[float, int]] = {}
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d >= _PEPTIDE_NM or of_atom[i] is of_atom[j]:
+            continue
+        for c, n in ((i, j), (j, i)):
+            is_carbonyl = of_atom[c].heavy.get("C") == c and "O" in of_atom[c].heavy
+            if is_carbonyl and of_atom[n].heavy.get("N") == n and d < best.get(c, (1.0, 0))[0]:
+                best[c] = (d, n)
+    return {(c, n) for c, (_, n) in best.items()}
+
+
+def _accepted_conect(
+    atoms: Sequence[AtomRecord],
+    x: npt.NDArray[np.float64],
+    conect: Sequence[tuple[int, int]],
+    of_atom: dict[int, Residue],
+    metals: set[int],
+    notes: list[str],
+) -> set[tuple[int, int]]:
+    """CONECT pairs, but those that span impossible distances, those to metal ions (which coordinate and do not bond),
+    and those inside standard residues (templates know)."""
+    accepted = set()
+    too_long = to_metals = 0
+    for i, j in conect:
+        if of_atom[i] is of_atom[j] and of_atom[i].heavy:
+            continue
+        if {i, j} & metals:
+            to_metals += 1
+            continue
+        limit = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _CONECT_SLACK_NM
+        if float(np.linalg.norm(x[i] - x[j])) > limit:
+            too_long += 1
+        else:
+            accepted.add(_pair(i, j))
+    if too_long:
+        notes.append(f"{too_long} CONECT bonds are impossibly long and are ignored")
+    if to_metals:
+        notes.append(f"{to_metals} CONECT bonds to metal ions are ignored: ions coordinate")
+    return accepted
+
+
+def _free_atoms(residues: list[Residue], bonds: set[tuple[int, int]], notes: list[str]) -> set[int]:
+    """Atoms whose bonds must come from distances."""
+    bonded = {i for pair in bonds for i in pair}
+    free: set[int] = set()
+    for residue in residues:
+        if residue.heavy:
+            continue
+        if len(residue.atoms) > 1 and all(i in bonded for i in residue.atoms):
+            notes.append(f"{residue.label}: bonds from CONECT records")
+        else:
+            free |= set(residue.atoms)
+            if len(residue.atoms) > 1:
+                notes.append(f"{residue.label}: bonds from distances")
+    return free
+
+
+def _bonds_by_distance(
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    free: set[int],
+    ions: set[int],
+    known: set[tuple[int, int]],
+    notes: list[str],
+) -> set[tuple[int, int]]:
+    """Bonds of the free atoms: within a residue whatever is near enough, to other residues what links polymers; and
+    amides of side chains."""
+    found = set()
+    apart, amides = [], []
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if d < _AMIDE_NM and not {i, j} & free and (i, j) not in known and _are_amide(atoms[i], atoms[j]):
+            found.add((i, j))
+            amides.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+        if (i in free or j in free) and not {i, j} & ions and "H" not in (atoms[i].element, atoms[j].element):
+            reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
+            if d >= reach:
+                continue
+            if atoms[i].residue_key == atoms[j].residue_key or _links_residues(atoms[i], atoms[j], d):
+                found.add((i, j))
+            elif (i, j) not in known:
+                apart.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+    if amides:
+        notes.append(f"side chains bonded by distance: {listed(amides)}")
+    if apart:
+        notes.append(f"near and not bonded, as no CONECT or LINK record says so: {listed(apart, 3)}")
+    return found
+
+
+def _are_amide(first: AtomRecord, second: AtomRecord) -> bool:
+    return first.residue_key != second.residue_key and {first.element, second.element} == {"C", "N"}
+
+
+def _links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
+    """Whether a distance between residues is one of the bonds that link them in polymers: amides, disulfides,
+    thioethers, the phosphates of nucleic acids, and sugars at their anomeric carbons."""
+    a, b = sorted((first, second), key=lambda atom: atom.element)
+    pair = (a.element, b.element)
+    if pair == ("C", "N"):
+        return length_nm < (_PEPTIDE_NM if (a.name, b.name) == ("C", "N") else _AMINE_NM)
+    if pair == ("S", "S"):
+        return length_nm < _DISULFIDE_NM
+    if pair == ("C", "S"):
+        return length_nm < _THIOETHER_NM
+    if pair == ("O", "P"):
+        return length_nm < _PHOSPHATE_NM
+    return pair == ("C", "O") and a.name in ("C1", "C2") and length_nm < _GLYCOSIDE_NM
+
+
+def _note_bonds_across_ends(
+    peptide: set[tuple[int, int]], of_atom: dict[int, Residue], chain_ends: Collection[int], notes: list[str]
+) -> None:
+    across = [
+        f"{of_atom[c].label} - {of_atom[n].label}"
+        for c, n in sorted(peptide)
+        if any(min(c, n) <= end < max(c, n) for end in chain_ends if of_atom.get(end) in (of_atom[c], of_atom[n]))
+    ]
+    if across:
+        notes.append(f"peptide bonds across the end of a chain (TER): {listed(across)}")
+
+
+def _hydrogen_bonds_to_parents(
+    atoms: Sequence[AtomRecord],
+    x: npt.NDArray[np.float64],
+    bonds: set[tuple[int, int]],
+    of_atom: dict[int, Residue],
+    free: set[int],
+    ions: set[int],
+) -> set[tuple[int, int]]:
+    """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing."""
+    from scipy.spatial import cKDTree
+
+    bonded = {i for pair in bonds for i in pair}
+    heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in ions], dtype=np.int64)
+    tree = cKDTree(x[heavy]) if len(heavy) else None
+    found = set()
+    for i, atom in enumerate(atoms):
+        if atom.element != "H" or i in bonded:
+            continue
+        own = np.array([j for j in of_atom[i].atoms if atoms[j].element != "H"], dtype=np.int64)
+        parent, distance = -1, np.inf
+        if i not in free and len(own):
+            gaps = np.linalg.norm(x[own] - x[i], axis=1)
+            parent, distance = int(own[gaps.argmin()]), float(gaps.min())
+        if distance > _HYDROGEN_NM and tree is not None:
+            gap, k = tree.query(x[i])
+            parent, distance = int(heavy[k]), float(gap)
+        if distance > _HYDROGEN_NM:
+            nearest = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
+            raise PreparationError(f"Hydrogen {atom_label(atom)} is {nearest}; correct or remove it.")
+        found.add(_pair(i, parent))
+    return found
+
+
+def _links_of_components(
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    of_atom: dict[int, Residue],
+    ions: set[int],
+) -> set[tuple[int, int]]:
+    """Bonds that link polymers, between two residues of which one is a component of the dictionary."""
+    found = set()
+    for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
+        if of_atom[i] is of_atom[j] or {i, j} & ions or "H" in (atoms[i].element, atoms[j].element):
+            continue
+        if not any(of_atom[k].heavy and template_for(of_atom[k].key[2]) is None for k in (i, j)):
+            continue
+        if _links_residues(atoms[i], atoms[j], d):
+            found.add((i, j))
+    return found
+
+
+def _disulfides(
+    atoms: Sequence[AtomRecord],
+    near: npt.NDArray[np.int64],
+    length: npt.NDArray[np.float64],
+    bonds: set[tuple[int, int]],
+    of_atom: dict[int, Residue],
+) -> set[tuple[int, int]]:
+    degree: dict[int, int] = {}
+    for pair in bonds:
+        for i in pair:
+            degree[i] = degree.get(i, 0) + 1
+    return {
+        (i, j)
+        for (i, j), d in zip(near.tolist(), length.tolist(), strict=True)
+        if d < _DISULFIDE_NM and all(of_atom[k].heavy.get("SG") == k and degree.get(k, 0) == 1 for k in (i, j))
+    }

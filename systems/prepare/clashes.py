@@ -1,0 +1,55 @@
+"""Atoms that are close and not bonded: noted, or refused where no energy would mean anything."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.errors import PreparationError
+from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.structure import atom_label
+
+# Heavy atoms, a heavy atom and a hydrogen, hydrogens. No minimisation can be trusted to part atoms nearer than the
+# first; it does part those up to the second, which models have before any refinement.
+_IMPOSSIBLE_ANGSTROM = (1.0, 0.9, 0.7)
+_CLOSE_ANGSTROM = (1.5, 1.1, 0.9)
+
+
+def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[str]:
+    """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart.
+
+    Raises PreparationError for atoms that stand in each other.
+    """
+    from scipy.spatial import cKDTree
+
+    neighbours: dict[int, set[int]] = {}
+    for i, j in bonds.tolist():
+        neighbours.setdefault(i, set()).add(j)
+        neighbours.setdefault(j, set()).add(i)
+    x = np.array([a.position_angstrom for a in atoms])
+    found = []
+    for i, j in cKDTree(x).query_pairs(max(_CLOSE_ANGSTROM)):
+        gap = float(np.linalg.norm(x[i] - x[j]))
+        kind = sum(atoms[k].element == "H" for k in (i, j))
+        if gap < _CLOSE_ANGSTROM[kind] and not _is_near(neighbours, i, j):
+            found.append((gap - _IMPOSSIBLE_ANGSTROM[kind], gap, i, j))
+    if not found:
+        return []
+    margin, gap, i, j = min(found)
+    more = f", and {len(found) - 1} pairs more are close" if len(found) > 1 else ""
+    what = f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart and not bonded{more}"
+    if margin < 0:
+        raise PreparationError(
+            f"{what}: atoms stand in each other; model them again, or minimise the structure with the program that "
+            "made it."
+        )
+    return [f"{what}; minimising has to part them"]
+
+
+def _is_near(neighbours: dict[int, set[int]], i: int, j: int, n_bonds: int = 3) -> bool:
+    reached = {i}
+    for _ in range(n_bonds):
+        reached |= {b for a in reached for b in neighbours.get(a, ())}
+    return j in reached

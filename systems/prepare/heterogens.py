@@ -1,0 +1,129 @@
+"""What stands beside the molecules of a structure file: waters, ions and ligands, kept or left out."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from itertools import groupby
+
+import networkx as nx
+import numpy as np
+
+from systems.chemistry.residues import is_water_name, template_for
+from systems.errors import PreparationError
+from systems.prepare.bonding import Bonding, are_ions
+from systems.prepare.modified_residues import listed
+from systems.prepare.read.pdb_records import AtomRecord
+
+_WATER_BOND_ANGSTROM = 1.3
+_BOUND_ANGSTROM = 3.0
+
+
+def is_water(atoms: Sequence[AtomRecord]) -> bool:
+    """Whether the atoms of a residue are one or more waters: told by elements and distances, never by name alone.
+
+    Each oxygen has two hydrogens of its own within 1.3 Å; where hydrogens are left out (all, or one of two), the
+    residue's name must be one of water's.
+    """
+    oxygens = [a.position_angstrom for a in atoms if a.element == "O"]
+    hydrogens = [a.position_angstrom for a in atoms if a.element == "H"]
+    if not oxygens or len(oxygens) + len(hydrogens) < len(atoms):
+        return False
+    if len(hydrogens) < 2 * len(oxygens):
+        return is_water_name(atoms[0].residue_name) and (not hydrogens or len(oxygens) == 1)
+    if len(oxygens) == 1:  # of a box of water, each
+        return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < _WATER_BOND_ANGSTROM for h in hydrogens)
+    from scipy.spatial import cKDTree
+
+    gaps, owners = cKDTree(oxygens).query(hydrogens)
+    return bool((gaps < _WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
+
+
+def settle_solvent(
+    atoms: Sequence[AtomRecord], kept: Sequence[int], *, keep_water: bool, keep_ions: bool, notes: list[str]
+) -> tuple[list[int], list[int]]:
+    """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out.
+
+    Left out are waters unless `keep_water`, and free ions unless `keep_ions`: monatomic, no N, O or S of anything else
+    within 3 Å. Of a file that holds nothing else, all stays.
+    """
+    runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
+    water = [run for run in runs if is_water([atoms[i] for i in run])]
+    ions = [[i] for run in runs if are_ions([atoms[i] for i in run]) for i in run]
+    wet = {i for run in water for i in run}
+    apart = wet | {i for run in ions for i in run}
+    solute = [i for i in kept if i not in apart]
+    if not solute:
+        return list(kept), []
+    n_waters = sum(atoms[i].element == "O" for i in wet)
+    waters = [f"{n_waters} water molecule{'s' if n_waters > 1 else ''}"] if n_waters and not keep_water else []
+    free = set() if keep_ions else _free(atoms, [run[0] for run in ions], solute)
+    count = Counter(atoms[i].residue_name for i in kept if i in free)
+    names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
+    gone = [*waters, *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else [])]
+    if gone:
+        notes.append(f"{' and '.join(gone)} left out")
+    return [i for i in kept if i not in wet and i not in free], sorted(wet) if keep_water else []
+
+
+def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:
+    """Those of the ions that no N, O or S of the solute holds."""
+    from scipy.spatial import cKDTree
+
+    donors = [atoms[i].position_angstrom for i in solute if atoms[i].element in ("N", "O", "S")]
+    if not ions or not donors:
+        return set(ions)
+    gap, _ = cKDTree(np.array(donors)).query(np.array([atoms[i].position_angstrom for i in ions]))
+    return {i for i, d in zip(ions, np.atleast_1d(gap).tolist(), strict=True) if d > _BOUND_ANGSTROM}
+
+
+def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
+    """Indices of atoms in molecules without any standard residue, beside at least one; none where all are such."""
+    chains = [r for r in bonding.residues if r.template is not None and not r.template.is_saccharide]
+    standard = {i for r in chains for i in r.atoms}
+    if not standard:
+        return []
+    graph = nx.Graph(bonding.bonds.tolist())
+    graph.add_nodes_from(range(len(atoms)))
+    found: set[int] = set()
+    for component in nx.connected_components(graph):
+        if not component & standard:
+            found |= component
+    for residue in bonding.residues:  # a hydrogen-less or oddly bonded ligand can fall apart: whole residues only
+        if not set(residue.atoms) <= found:
+            found -= set(residue.atoms)
+    return sorted(found)
+
+
+def settle_ligands(
+    atoms: Sequence[AtomRecord], ligands: Sequence[int], *, keep: bool, drop: bool, notes: list[str]
+) -> bool:
+    """Whether the ligands stay. Raises PreparationError when neither keeping nor dropping was asked for."""
+    if not ligands:
+        return True
+    residues = list(dict.fromkeys(atoms[i].residue_key for i in ligands))
+    names = listed([f"{name} {chain}{number}" for chain, number, name in residues])
+    if keep:
+        notes.append(f"kept beside the peptide: {names}")
+        return True
+    if not drop:
+        raise PreparationError(
+            f"beside the peptide it holds {names}; add --keep-ligand to simulate them, too, or --drop-ligand to leave "
+            "them out."
+        )
+    notes.append(f"left out, as asked (--drop-ligand): {names}")
+    return False
+
+
+def refuse_bare_ligands(atoms: Sequence[AtomRecord], ligands: Sequence[int]) -> None:
+    """A ligand with carbon and no hydrogen is one whose hydrogens the file leaves out. Raises PreparationError."""
+    by_residue: dict[tuple[str, str, str], set[str]] = {}
+    for i in ligands:
+        by_residue.setdefault(atoms[i].residue_key, set()).add(atoms[i].element)
+    for (chain, number, name), elements in by_residue.items():
+        if ("C" in elements and "H" not in elements) or (elements == {"O"} and template_for(name) is None):
+            raise PreparationError(
+                f"{name} {chain}{number} has no hydrogens, which a ligand must bring; add them (its SDF from the "
+                "Protein Data Bank has them), or leave it out with --drop-ligand."
+            )

@@ -1,0 +1,224 @@
+"""Peptides built from a sequence: extended, L, every peptide bond trans."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.geometry import signed_volumes, superposition, torsion
+from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
+from systems.errors import PreparationError, nearest
+from systems.prepare.modified_residues import D_RESIDUES
+from systems.prepare.protonation import protonation_account
+from systems.prepare.read.pdb_records import read_structure
+from systems.prepare.repair import fixed_random_numbers, records_from_openmm
+from systems.prepare.structure import scene_from_records
+from systems.scene import Scene
+
+_PROTONATED = {"HID": "HIS", "HIE": "HIS", "HIP": "HIS", "ASH": "ASP", "GLH": "GLU", "LYN": "LYS"}
+_PHI_DEG, _PSI_DEG, _PROLINE_PHI_DEG = -140.0, 140.0, -70.0
+_LONGEST = 200
+# Lengths in nm and angles in degrees: Engh and Huber, Acta Cryst. A47, 392 (1991).
+_N_CA, _CA_C, _C_N, _C_O = 0.1458, 0.1525, 0.1329, 0.1231
+_N_CA_C, _CA_C_N, _C_N_CA, _CA_C_O = 111.2, 116.2, 121.7, 120.8
+
+Vector = npt.NDArray[np.float64]
+
+
+def parse_sequence(text: str) -> list[str]:
+    """Return three-letter residue names of `ACE-ALA-NME`, or of one-letter code (`SDFS`).
+
+    A single known three-letter name is one residue. Raises PreparationError for unknown residues and misplaced caps.
+    """
+    allowed = [*amino_acid_names(), *_PROTONATED, "ACE", "NME"]
+    word = text.strip().upper()
+    if not word:
+        raise PreparationError("The sequence is empty; write it like sequence:ACE-ALA-NME or sequence:SDFS.")
+    names = [n.strip() for n in word.split("-")] if "-" in word or word in allowed else None
+    _refuse_d_residues(text, names)
+    if names is None:
+        unknown = sorted({c for c in word if c not in ONE_LETTER})
+        if unknown:
+            raise PreparationError(
+                f"Sequence {text!r}: {', '.join(map(repr, unknown))} is no one-letter amino acid; "
+                "write three-letter names with dashes, as in ACE-ALA-NME."
+            )
+        names = [ONE_LETTER[c] for c in word]
+    names = ["NME" if n == "NMA" else n for n in names]
+    for k, name in enumerate(names):
+        if name not in allowed:
+            raise PreparationError(
+                f"Sequence {text!r}: unknown residue {name!r}.{nearest(name, allowed)} "
+                "Known: the twenty amino acids, HID HIE HIP ASH GLH LYN, and the caps ACE and NME."
+            )
+        if (name == "ACE" and k != 0) or (name == "NME" and k != len(names) - 1):
+            raise PreparationError(f"Sequence {text!r}: the cap {name} stands inside; ACE goes first, NME last.")
+    if len(names) < 2 and names[0] in ("ACE", "NME"):
+        raise PreparationError(f"Sequence {text!r} is a cap alone; add an amino acid, as in ACE-ALA-NME.")
+    if len(names) > _LONGEST:
+        raise PreparationError(
+            f"Sequence of {len(names)} residues; chains are built up to {_LONGEST}, give a PDB file."
+        )
+    return names
+
+
+def _refuse_d_residues(text: str, names: list[str] | None) -> None:
+    """D-residues by name (DAL), by prefix (D-ALA) or as a lower-case letter among capitals (SdFS)."""
+    if names is None:
+        written = text.strip()
+        found = "" if written.isupper() or written.islower() else next(c for c in written if c.islower())
+    else:
+        known = {*ONE_LETTER.values(), *_PROTONATED}
+        found = next((f"D-{b}" for a, b in pairwise(names) if a == "D" and b in known), "")
+        found = found or next((n for n in names if n in D_RESIDUES), "")
+    if found:
+        raise PreparationError(
+            f"Sequence {text!r}: {found!r} is a D-residue; sequences are built of L-residues alone, give a PDB file or "
+            "a SMILES string."
+        )
+
+
+def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
+    """Return an extended peptide, relaxed in ff14SB without charges; uncapped ends are charged.
+
+    Raises PreparationError for an unknown residue, or if a residue came out other than L or a peptide bond not trans.
+    """
+    from openmm import Platform, app, unit
+
+    names = parse_sequence(text)
+    topology, positions_nm = _heavy_atoms(names)
+    variants = [name if name in _PROTONATED else None for name in names]
+    reference = Platform.getPlatformByName("Reference")
+    with fixed_random_numbers():
+        modeller = app.Modeller(topology, positions_nm * unit.nanometer)
+        modeller.addHydrogens(pH=ph, variants=variants, platform=reference)
+    relaxed_nm = _relaxed(modeller)
+    keys = [("A", str(k), name) for k, name in enumerate(names, start=1)]
+    records, bonds = records_from_openmm(modeller.topology, relaxed_nm, keys)
+    labels = [f"{name} {number}" for _, number, name in keys]
+    account = protonation_account(labels, keys, variants, records, ph)
+    scene = scene_from_records(
+        records,
+        bonds,
+        name="-".join(names),
+        provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": account},
+    )
+    _verify(scene)
+    return scene
+
+
+def _heavy_atoms(names: list[str]) -> tuple[Any, Vector]:
+    from openmm import app
+
+    topology = app.Topology()
+    chain = topology.addChain("A")
+    positions: list[Vector] = []
+    previous: dict[str, Any] = {}
+    at: dict[str, Vector] = {}
+    psi = _PSI_DEG
+    for k, name in enumerate(names):
+        template = template_for(name)
+        assert template is not None  # parse_sequence let it through
+        residue = topology.addResidue(template.name, chain, str(k + 1))
+        phi = _PROLINE_PHI_DEG if template.name == "PRO" else _PHI_DEG
+        at = _place(template.name, at, phi, psi)
+        if k == len(names) - 1 and template.is_amino_acid:
+            at["OXT"] = _extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi)
+        at |= {"O": _extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi + 180.0)} if template.is_amino_acid else {}
+        atoms = {}
+        for atom in (*template.heavy, *(["OXT"] if "OXT" in at else [])):
+            atoms[atom] = topology.addAtom(atom, app.Element.getBySymbol(atom[0]), residue)
+            positions.append(at[atom])
+        for a, b in (*template.bonds, *([("C", "OXT")] if "OXT" in atoms else [])):
+            topology.addBond(atoms[a], atoms[b])
+        if previous:
+            topology.addBond(previous["C"], atoms["N"])
+        previous = atoms
+    return topology, np.array(positions)
+
+
+def _place(name: str, before: dict[str, Vector], phi: float, psi: float) -> dict[str, Vector]:
+    """Heavy atoms of one residue, joined to the one before by a trans peptide bond."""
+    if name == "ACE":
+        at = {"CH3": np.zeros(3), "C": np.array([_CA_C, 0.0, 0.0])}
+        plane = np.array([0.0, 1.0, 0.0])
+        at["O"] = _extend(plane, at["CH3"], at["C"], _C_O, _CA_C_O, 0.0)
+        return at
+    if not before:
+        at = {"N": np.zeros(3), "CA": np.array([_N_CA, 0.0, 0.0])}
+        at["C"] = _extend(np.array([0.0, 1.0, 0.0]), at["N"], at["CA"], _CA_C, _N_CA_C, 180.0)
+    else:
+        alpha = before.get("CH3", before.get("CA"))
+        assert alpha is not None
+        c, o = before["C"], before["O"]
+        away = _extend(o, alpha, c, _C_N, _CA_C_N, 180.0)  # planar carbonyl: N opposite to O
+        at = {"N": away}
+        at["CA"] = _extend(alpha, c, away, _N_CA, _C_N_CA, 180.0)
+        if name == "NME":
+            return {"N": at["N"], "C": at["CA"]}
+        at["C"] = _extend(c, away, at["CA"], _CA_C, _N_CA_C, phi)
+    shape = _residue_shape(name)
+    backbone = ("N", "CA", "C")
+    target = np.array([at[a] for a in backbone])
+    rotation, translation = superposition(np.array([[shape[a] for a in backbone]]), target)
+    side = {a: rotation[0] @ x + translation[0] for a, x in shape.items() if a not in (*backbone, "O", "OXT")}
+    return at | side
+
+
+def _residue_shape(name: str) -> dict[str, Vector]:
+    """Heavy atoms of PDBFixer's template of a residue, nm."""
+    path = Path(str(files("pdbfixer") / "templates" / f"{name}.pdb"))
+    return {a.name: np.array(a.position_angstrom) / 10.0 for a in read_structure(path).atoms if a.element != "H"}
+
+
+def _extend(a: Vector, b: Vector, c: Vector, length: float, angle_deg: float, torsion_deg: float) -> Vector:
+    """The point at `length` from c, at `angle_deg` to b and `torsion_deg` about b-c to a."""
+    angle, twist = np.radians(angle_deg), np.radians(torsion_deg)
+    axis = (c - b) / np.linalg.norm(c - b)
+    normal = np.cross(b - a, axis)
+    normal = normal / np.linalg.norm(normal)
+    inward = np.cross(normal, axis)
+    out: Vector = c + length * (
+        -np.cos(angle) * axis + np.sin(angle) * (np.cos(twist) * inward + np.sin(twist) * normal)
+    )
+    return out
+
+
+def _relaxed(modeller: Any) -> Vector:
+    """Minimise in ff14SB without charges: in vacuum these pull charged groups together and twist peptide bonds."""
+    from openmm import Context, LocalEnergyMinimizer, NonbondedForce, Platform, VerletIntegrator, app, unit
+
+    system = app.ForceField("amber14/protein.ff14SB.xml").createSystem(
+        modeller.topology, nonbondedMethod=app.NoCutoff, removeCMMotion=False
+    )
+    for force in system.getForces():
+        if isinstance(force, NonbondedForce):
+            for k in range(force.getNumParticles()):
+                force.setParticleParameters(k, 0.0, *force.getParticleParameters(k)[1:])
+            for k in range(force.getNumExceptions()):
+                i, j, _, *rest = force.getExceptionParameters(k)
+                force.setExceptionParameters(k, i, j, 0.0, *rest)
+    context = Context(system, VerletIntegrator(0.001), Platform.getPlatformByName("Reference"))
+    context.setPositions(modeller.positions)
+    LocalEnergyMinimizer.minimize(context, 10.0, 500)
+    positions = context.getState(positions=True).getPositions(asNumpy=True)
+    return np.array(positions.value_in_unit(unit.nanometer), dtype=np.float64)
+
+
+def _verify(scene: Scene) -> None:
+    from systems.chemistry.graph import backbone_torsions
+
+    index = {(int(r), n): i for i, (r, n) in enumerate(zip(scene.residue_of_atom, scene.atom_names, strict=True))}
+    for k, name in enumerate(scene.residue_names):
+        if (k, "CB") in index:
+            row = [index[k, a] for a in ("CA", "N", "C", "CB")]
+            if not signed_volumes(scene.positions_nm, [row])[0] > 0:
+                raise PreparationError(f"{scene.name}: residue {name} {k + 1} was not built as L; give a PDB file.")
+    omega = torsion(scene.positions_nm, backbone_torsions(scene)["omega"])
+    if (np.abs(omega) < np.radians(150)).any():
+        raise PreparationError(f"{scene.name}: a peptide bond was not built trans; give a PDB file.")

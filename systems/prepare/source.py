@@ -1,0 +1,294 @@
+"""A Scene from what the user names: a library system, a structure file, a SMILES string or a peptide sequence."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from systems.chemistry.residues import template_for
+from systems.errors import InputError, PreparationError
+from systems.prepare.bonding import Bonding, Residue, find_bonds
+from systems.prepare.clashes import check_contacts
+from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
+from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
+from systems.prepare.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
+from systems.prepare.modified_residues import describe_residue, standardise
+from systems.prepare.read.mmcif_file import is_component
+from systems.prepare.read.mol_file import SUFFIXES, suffix_of
+from systems.prepare.read.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
+from systems.prepare.read.peptide_mol2 import is_peptide_mol2, read_peptide_mol2
+from systems.prepare.structure import scene_from_records
+from systems.prepare.waters import complete_waters
+from systems.scene import Scene
+
+_FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
+_OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
+_COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
+
+
+def prepare(
+    spec: str,
+    *,
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    drop_water: bool = False,
+    keep_water: bool = False,
+    cap_breaks: bool = False,
+) -> Scene:
+    """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
+    `sequence:ACE-ALA-NME`.
+
+    Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
+    line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
+    missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
+    them free ions, which no N, O or S of the rest holds, unless `keep_ligand`. Other ions and ligands beside a peptide
+    are refused until one says what becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
+    with the caps NME and ACE.
+    Raises UnknownNameError, InputError or PreparationError, each in one line.
+    """
+    from systems.library import named_scenes
+
+    if not 0.0 <= ph <= 14.0:
+        raise InputError(f"pH {ph:g} lies outside 0 to 14.")
+    if keep_ligand and drop_ligand:
+        raise InputError("--keep-ligand and --drop-ligand exclude each other; choose one.")
+    if keep_water and drop_water:
+        raise InputError("--keep-water and --drop-water exclude each other; choose one.")
+    text = str(spec).strip()
+    kind, _, rest = text.partition(":")
+    if kind.lower() == "sequence":
+        from systems.prepare.peptide import build_peptide
+
+        return build_peptide(rest, ph=ph)
+    if kind.lower() == "smiles":
+        from systems.prepare.molecule import scene_from_smiles
+
+        return scene_from_smiles(rest)
+    path = Path(text).expanduser()
+    if text in named_scenes.names():
+        return named_scenes.load(text)
+    suffix = suffix_of(path)
+    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
+        from systems.prepare.molecule import scene_from_mol_file
+
+        return scene_from_mol_file(path)
+    if suffix in _OTHER_SUFFIXES:
+        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
+    if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
+        return prepare_file(
+            path,
+            ph=ph,
+            keep_ligand=keep_ligand,
+            drop_ligand=drop_ligand,
+            keep_water=keep_water,
+            cap_breaks=cap_breaks,
+        )
+    return named_scenes.load(text)
+
+
+def prepare_file(
+    path: Path,
+    *,
+    ph: float = 7.0,
+    keep_ligand: bool = False,
+    drop_ligand: bool = False,
+    keep_water: bool = False,
+    cap_breaks: bool = False,
+) -> Scene:
+    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `prepare`."""
+    if is_mmcif(path) and is_component(text := read_text(path)):
+        from systems.prepare.read.component_file import scene_from_component
+
+        return scene_from_component(text, path)
+    try:
+        return _prepare_file(path, ph, keep_ligand, drop_ligand, keep_water, cap_breaks)
+    except PreparationError as error:
+        if str(path) in str(error):
+            raise
+        raise PreparationError(f"{path}: {error}") from error
+
+
+def _prepare_file(
+    path: Path, ph: float, keep_ligand: bool, drop_ligand: bool, keep_water: bool, cap_breaks: bool
+) -> Scene:
+    found = read_peptide_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
+    repairs = list(found.notes)
+    kept = _choose_alternates(found.atoms, repairs)
+    kept, wet = settle_solvent(found.atoms, kept, keep_water=keep_water, keep_ions=keep_ligand, notes=repairs)
+    part = standardise([found.atoms[i] for i in kept], repairs)
+    structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
+    bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
+    ligands = ligand_atoms(structure.atoms, bonding)
+    if ligands:
+        stays = settle_ligands(structure.atoms, ligands, keep=keep_ligand, drop=drop_ligand, notes=repairs)
+        rest = structure.without(ligands)
+        if stays:
+            refuse_bare_ligands(structure.atoms, ligands)
+            others = structure.only(ligands)
+            others_bonding = find_bonds(others.atoms, others.conect)
+        structure, bonding = rest, find_bonds(rest.atoms, rest.conect, rest.chain_ends)
+    gaps = find_gaps(bonding, structure.chain_ends)
+    if gaps and cap_breaks:
+        caps = caps_of(gaps, structure.atoms, repairs)
+        structure = _Structure([*structure.atoms, *caps], structure.conect, structure.chain_ends)
+        bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
+    refuse_gaps([] if cap_breaks else gaps, structure.atoms)
+    repairs += bonding.notes
+    repairs += _disulfides(bonding, structure.atoms)
+    atoms, bonds = list(structure.atoms), bonding.bonds
+    before = _handedness(bonding, atoms)
+    say_inverted(before, repairs)
+    if not bonding.is_complete:
+        _refuse_beyond_repair(bonding, atoms)
+        from systems.prepare.repair import complete
+
+        atoms, bonds, account = complete(atoms, bonding, ph=ph)
+        repairs += account
+        after = heavy_of_records(atoms)
+        names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
+        compare(before, handedness((key, names[key], heavy) for key, heavy in after.items() if key in names))
+    else:
+        _refuse_bare_skeletons(bonding.residues, atoms)
+    if ligands and stays:
+        bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
+        atoms = [*atoms, *others.atoms]
+        repairs += others_bonding.notes
+    if wet:
+        waters, water_bonds = complete_waters([found.atoms[i] for i in wet], atoms, repairs)
+        bonds = np.concatenate([bonds, water_bonds + len(atoms)])
+        atoms = [*atoms, *waters]
+    repairs += check_contacts(atoms, bonds)
+    scene = scene_from_records(
+        atoms,
+        bonds,
+        name=path.name.removesuffix(".gz").rsplit(".", 1)[0],
+        provenance={
+            "source": "file",
+            "file": path.name,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "ph": ph,
+            "repairs": repairs,
+        },
+    )
+    _refuse_long_double_bonds(scene)
+    return scene
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """Records with what the file says of their bonds (index pairs) and of chain ends (indices)."""
+
+    atoms: list[AtomRecord]
+    conect: list[tuple[int, int]]
+    chain_ends: set[int]
+
+    def only(self, chosen: Sequence[int]) -> _Structure:
+        return _Structure([self.atoms[i] for i in chosen], *_reindexed(self.conect, self.chain_ends, chosen))
+
+    def without(self, left_out: Sequence[int]) -> _Structure:
+        gone = set(left_out)
+        return self.only([i for i in range(len(self.atoms)) if i not in gone])
+
+
+def _reindexed(
+    conect: Sequence[tuple[int, int]], chain_ends: set[int], kept: Sequence[int]
+) -> tuple[list[tuple[int, int]], set[int]]:
+    new = {old: k for k, old in enumerate(kept)}
+    ends = {int(k) - 1 for k in np.searchsorted(kept, sorted(chain_ends), side="right")} - {-1}
+    return [(new[i], new[j]) for i, j in conect if i in new and j in new], ends
+
+
+def _handedness(bonding: Bonding, atoms: Sequence[AtomRecord]) -> Handedness:
+    return handedness(
+        (r.key, r.template.name, {a: atoms[i] for a, i in r.heavy.items()})
+        for r in bonding.residues
+        if r.template is not None
+    )
+
+
+def _disulfides(bonding: Bonding, atoms: Sequence[AtomRecord]) -> list[str]:
+    sulfur = {r.heavy["SG"]: r for r in bonding.residues if "SG" in r.heavy}
+    return [
+        f"disulfide bond {sulfur[i].label} - {sulfur[j].label} "
+        f"({np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom)):.2f} Å)"
+        for i, j in bonding.bonds.tolist()
+        if i in sulfur and j in sulfur
+    ]
+
+
+def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[int]:
+    """Indices of the atoms that stay: of alternate locations, each residue's most occupied."""
+    occupancy: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for atom in atoms:
+        if atom.altloc:
+            occupancy.setdefault((atom.chain, atom.residue_id), {}).setdefault(atom.altloc, []).append(atom.occupancy)
+    chosen = {k: max(v, key=lambda a: (sum(v[a]) / len(v[a]), -ord(a[0]))) for k, v in occupancy.items()}
+    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[a.chain, a.residue_id] == a.altloc]
+    if len(kept) < len(atoms):
+        labels = ", ".join(f"{c}{r}:{a}" for (c, r), a in list(chosen.items())[:6]) + (
+            " ..." if len(chosen) > 6 else ""
+        )
+        repairs.append(
+            f"alternate locations in {len(chosen)} residues: the most occupied kept ({labels}), "
+            f"{len(atoms) - len(kept)} atoms left out"
+        )
+    return kept
+
+
+def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
+    for residue in bonding.residues:
+        if all(atoms[i].element == "H" for i in residue.atoms):
+            raise PreparationError(f"{residue.label} has only hydrogens; give its other atoms, or number it correctly.")
+        if residue.template is None or not residue.heavy:
+            short = next(r for r in bonding.residues if r.missing or r.lacks_hydrogens)
+            raise PreparationError(
+                f"{short.label} lacks atoms that cannot be added beside {residue.label}"
+                f"{describe_residue(residue.key[2])}, which is no standard residue; give the structure with all atoms "
+                "and hydrogens."
+            )
+        essential = [a for a in ("N", "CA", "C") if a in residue.template.heavy and a in residue.missing]
+        if essential:
+            raise PreparationError(
+                f"{residue.label} has only {' '.join(residue.heavy)} of its heavy atoms; "
+                "give a structure with at least the whole backbone."
+            )
+        built = [a for a in residue.missing if a != "OXT"]
+        if built and template_for(residue.key[2]) is None:
+            instead = ", or leave its phosphate out" if "OP3" in built else ""
+            raise PreparationError(
+                f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
+                f"standard residues alone: add all its heavy atoms{instead}."
+            )
+
+
+def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:
+    """A molecule without any hydrogen is most often a file without hydrogens, and would get absurd double bonds."""
+    for residue in residues:
+        symbols = [atoms[i].element for i in residue.atoms]
+        if residue.heavy or "C" not in symbols or "H" in symbols:
+            continue
+        if len(symbols) > 3 and not (
+            {"F", "Cl", "Br", "I"} & set(symbols) and set(symbols) <= _COMPLETE_WITHOUT_HYDROGEN
+        ):
+            raise PreparationError(
+                f"{residue.label} has no hydrogens and is no standard amino acid; add them first (for instance "
+                "`obabel in.pdb -O out.pdb -h`)."
+            )
+
+
+def _refuse_long_double_bonds(scene: Scene) -> None:
+    """Two carbons that each lack a hydrogen look like a double bond, methanol without any like C≡O; lengths tell."""
+    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
+        if order >= 3 or (order >= 2 and scene.elements[i] == scene.elements[j] == "C"):
+            length = float(np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j]))
+            if length > (0.150 if order < 3 else 0.130):
+                a, b = (f"{scene.residue_names[scene.residue_of_atom[k]]} {scene.atom_names[k]}" for k in (i, j))
+                raise PreparationError(
+                    f"{a} and {b} lack hydrogens (a {'double' if order < 3 else 'triple'} bond of {length * 10:.2f} Å "
+                    "is none); give the structure with all hydrogens."
+                )

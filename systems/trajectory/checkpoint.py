@@ -1,0 +1,142 @@
+"""Checkpoints: what a run goes on from, its last two states, believed only as far as its trajectories support them."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError, TrajectoryError
+from systems.files.checksums import packed, unpacked
+from systems.files.whole_file import create_whole
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryWriter
+
+_MAGIC = b"surromd checkpoint 3\n"
+# Of a run's time no more than one part in so many should go into waiting for the medium.
+FLUSH_SHARE = 50
+Checkpoint = tuple[dict[str, Any], bytes]
+
+
+def checkpoint_path(out: Path) -> Path:
+    """Where the checkpoint of a run lies whose first trajectory is `out`: beside it, until the run is complete."""
+    return out.with_name(out.name + ".checkpoint")
+
+
+def new_header(n_files: int, *, overwrite: bool) -> dict[str, Any]:
+    """Return what a checkpoint says of a run of `n_files` trajectories that has not begun: `run_id`, `files`, ...
+
+    `overwrite`: whether other files may lie where those of the run are to be. `files`: of each trajectory how many
+    frames it has, and their digest.
+    """
+    return {"run_id": uuid.uuid4().hex, "overwrite": overwrite, "files": [{"n_frames": 0, "digest": ""}] * n_files}
+
+
+class CheckpointFile:
+    """The checkpoint of a run: its last state, and the last before its trajectories had the frames that they have now.
+
+    That one is gone on from when the power fails and the medium turns out to be one append behind.
+    """
+
+    def __init__(self, path: Path, kept: Checkpoint | None) -> None:
+        self.path = path
+        self._states = [] if kept is None else [(kept[0]["files"], packed(*kept))]
+
+    def write(self, header: dict[str, Any], blob: bytes) -> None:
+        """Replace the file as a whole; it is on the medium when this returns. Raises StorageError: the old one stays.
+
+        `header`: a `new_header` kept up to date, and more that is JSON.
+        """
+        before = [state for state in self._states if state[0] != header["files"]][:1]
+        self._states = [(header["files"], packed(header, blob)), *before]
+        create_whole(self.path, _MAGIC + b"".join(part for _, part in self._states))
+
+
+def refuse_foreign(path: Path) -> None:
+    """Raise InputError where a file lies in the place of a checkpoint that is none (of this version)."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise InputError(
+                    f"{path} lies where the checkpoint goes and is none of this version's; move it away, or choose "
+                    "another name."
+                )
+
+
+def read_checkpoints(path: Path) -> list[Checkpoint]:
+    """Return the states `(header, blob)` in a checkpoint, the last one first. Raises InputError when it is damaged."""
+    found: list[Checkpoint] = []
+    try:
+        rest = path.read_bytes()
+        if not rest.startswith(_MAGIC):
+            raise ValueError("it is of another version of surromd, or no checkpoint")
+        rest = rest[len(_MAGIC) :]
+        while rest or not found:
+            header, blob, rest = unpacked(rest)
+            found.append((header, blob))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
+    return found
+
+
+def last_supported(path: Path, outs: Sequence[Path]) -> Checkpoint:
+    """Return the last state in a checkpoint that the frames in the run's trajectories support, all of them read.
+
+    Raises InputError when the checkpoint is damaged, or a trajectory is gone, damaged, or not the one this run wrote.
+    """
+    states = read_checkpoints(path)
+    reasons = []
+    for header, blob in states:
+        begun = header is not states[0][0] or any(entry["n_frames"] for entry in header["files"])
+        found = [_unsupported(out, header, k, begun=begun) for k, out in enumerate(outs)]
+        if not any(found):
+            return header, blob
+        reasons += [reason for reason in found if reason]
+    raise InputError(f"{reasons[0]}; restore it, or start again with --overwrite.")
+
+
+def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str, Any], k: int = 0, *, resumed: bool,
+              columns: Sequence[str] = ()) -> TrajectoryWriter:  # fmt: skip
+    """Return the writer of a run's k-th trajectory, holding the frames that the run's checkpoint has seen, no more.
+
+    Without frames it begins anew: when `resumed`, what lies there is the run's own, or may be replaced.
+    """
+    from systems.trajectory.codec import open_writer
+
+    n_frames = header["files"][k]["n_frames"]
+    how: dict[str, Any] = {"append": True} if n_frames else {"overwrite": resumed or header["overwrite"]}
+    writer = open_writer(out, scene, record, columns=columns, run_id=header["run_id"], claimed=True, **how)
+    try:
+        writer.truncate(n_frames)
+        if writer.record["completed"]:
+            writer.update_record({"completed": False})
+    except BaseException:
+        writer.close()
+        raise
+    return writer
+
+
+def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> str:
+    """Return why a trajectory does not hold what a checkpoint has seen of it, or nothing."""
+    from systems.trajectory.codec import open_trajectory
+
+    if not begun and (header["overwrite"] or not out.exists()):
+        return ""
+    if not out.exists():
+        return f"{out} is not there to go on from, though its checkpoint is"
+    n_frames, digest = header["files"][k]["n_frames"], header["files"][k]["digest"]
+    try:
+        with open_trajectory(out) as reader:
+            if reader.run_id != header["run_id"]:
+                return f"{out} is not the file that this run wrote, but another's in its place"
+            if reader.n_frames < n_frames:
+                return (
+                    f"{out} holds {reader.n_frames} frames where its checkpoint has seen {n_frames}: it was cut short"
+                )
+            if n_frames and reader.digest(n_frames) != digest:
+                return f"{out} holds other frames than its checkpoint has seen"
+            reader.verify(n_frames)
+    except TrajectoryError as error:
+        return str(error).rstrip(".")
+    return ""

@@ -1,0 +1,130 @@
+"""The right to write an output: one process has it, from start to end, and sweeps what it made in vain."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+
+from systems.errors import StorageError, SurromdError, TrajectoryError
+from systems.files.whole_file import refuse_existing, storage_error
+from systems.trajectory.checkpoint import checkpoint_path, refuse_foreign
+
+_ASK_EVERY_S = 0.5
+
+
+class Claim:
+    """A lock on `.NAME.lock` beside an output, which the system gives back when this process ends, however it ends.
+
+    It holds against other threads of this process, too. Raises TrajectoryError when another one has the output, and has
+    not let go of it after `patience_s`; KeyboardInterrupt when `stopped()` while waiting; StorageError.
+    """
+
+    def __init__(self, path: Path, *, patience_s: float = 0.0, stopped: Callable[[], bool] = lambda: False) -> None:
+        self._path = path.resolve()
+        self._lock = self._path.with_name(f".{self._path.name}.lock")
+        self._fd = -1
+        deadline = time.monotonic() + patience_s
+        while not self._taken():
+            if stopped():
+                raise KeyboardInterrupt
+            if time.monotonic() >= deadline:
+                raise TrajectoryError(f"{path} is being written by another process; wait, or take another name.")
+            time.sleep(_ASK_EVERY_S)
+
+    def _taken(self) -> bool:
+        try:
+            import fcntl
+        except ImportError:  # not a POSIX system: two writers are the user's to avoid
+            return True
+        try:
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+            descriptor = os.open(self._lock, flags, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Who held it before may have removed its name meanwhile: then this is a lock on nothing.
+                if os.path.samestat(os.fstat(descriptor), os.stat(self._lock)):
+                    self._fd, descriptor = descriptor, -1
+            finally:
+                if descriptor >= 0:
+                    os.close(descriptor)
+        except (BlockingIOError, FileNotFoundError) as error:
+            if isinstance(error, FileNotFoundError) and not self._lock.parent.is_dir():
+                raise storage_error(self._path, error, "nothing was changed") from error
+        except OSError as error:
+            # Some file systems of clusters know no locks.
+            if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):
+                raise storage_error(self._path, error, "nothing was changed") from error
+            return True
+        return self._fd >= 0
+
+    def close(self) -> None:
+        """Let go; twice does no harm."""
+        if self._fd >= 0:
+            with suppress(OSError):
+                self._lock.unlink(missing_ok=True)
+            os.close(self._fd)
+            self._fd = -1
+
+    def __enter__(self) -> Claim:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:  # fmt: skip
+        self.close()
+
+
+@contextmanager
+def claimed_outputs(
+    outs: Sequence[Path],
+    *,
+    may_exist: bool,
+    patience_s: float = 0.0,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[None]:
+    """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
+
+    What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
+    Raises what `Claim` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another file
+    lies in the place of the checkpoint, StorageError for an OSError of the run's own.
+    """
+    with ExitStack() as stack:
+        for out in outs:
+            stack.enter_context(Claim(out, patience_s=patience_s, stopped=stopped))
+        refuse_foreign(checkpoint_path(outs[0]))
+        for out in outs:
+            refuse_existing(out, may_exist)
+        before = {member for out in outs for member in family(out) if member.exists()}
+        try:
+            yield
+        except BaseException as error:
+            resumable = isinstance(error, KeyboardInterrupt | StorageError) and checkpoint_path(outs[0]).exists()
+            for out in outs if not resumable else ():
+                with suppress(SurromdError, OSError):  # what cannot be read may hold frames
+                    if not frames_in(out):
+                        for member in set(family(out)) - before:
+                            member.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise storage_error(outs[0], error, "the frames written before are complete and readable") from error
+            raise
+
+
+def family(out: Path) -> list[Path]:
+    """Return the paths of a trajectory and of what is written beside it."""
+    from systems.trajectory.codec import companions
+
+    return [out, checkpoint_path(out), *companions(out)]
+
+
+def frames_in(out: Path) -> int:
+    """Return how many frames a trajectory holds, 0 where it is not there. Raises TrajectoryError."""
+    from systems.trajectory.codec import open_trajectory
+
+    if not out.exists():
+        return 0
+    with open_trajectory(out) as reader:
+        return reader.n_frames

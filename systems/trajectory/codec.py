@@ -1,0 +1,117 @@
+"""The one trajectory codec: HDF5 (the full record) and DCD (what everybody reads), streaming, append, resume."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from systems.errors import InputError, TrajectoryError
+from systems.files.atomic_file import journal_path
+from systems.scene import Scene
+from systems.trajectory.base import FrameBlock, TrajectoryReader, TrajectoryWriter
+
+__all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
+
+_HDF5 = (".h5", ".hdf5")
+
+
+def open_writer(
+    path: str | Path,
+    scene: Scene,
+    record: dict[str, Any],
+    *,
+    append: bool = False,
+    overwrite: bool = False,
+    columns: Sequence[str] = (),
+    run_id: str = "",
+    claimed: bool = False,
+) -> TrajectoryWriter:
+    """Start a trajectory file (`.h5`, `.hdf5` or `.dcd`), or continue one with `append=True`.
+
+    Beside it stands `NAME.pdb`, its topology in its atom order (up to 99,999 atoms), beside a DCD also `NAME.meta.h5`
+    (record, exact times, flags). With `append` the file must be ours and hold the same ordered topology; what it
+    records stays, new keys of `record` are added, and an append that a crash interrupted is cut off. `record` must be
+    JSON-able. `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell of a
+    periodic scene is kept in any case. `run_id`: whose file it is. The writer holds the file's claim
+    (systems.trajectory.claim), unless its caller does (`claimed`).
+    Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
+    `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
+    process; StorageError when the folder is missing, not writable or full.
+    """
+    path = Path(path)
+    if append and overwrite:
+        raise InputError(f"{path}: append and overwrite exclude each other.")
+    if append and not path.exists():
+        raise TrajectoryError(f"{path} does not exist and cannot be continued.")
+    if path.name.endswith(".meta.h5"):
+        raise InputError(f"{path}: names ending in .meta.h5 are kept for the companions of DCD files; choose another.")
+    if path.suffix.lower() == ".dcd" and columns:
+        raise InputError(f"{path}: a DCD holds positions only; write an .h5 to keep {' and '.join(columns)}.")
+    if path.suffix.lower() not in (*_HDF5, ".dcd"):
+        raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
+    from systems.trajectory.claim import Claim
+    from systems.trajectory.dcd_file import DcdWriter
+    from systems.trajectory.hdf5_file import Hdf5Writer
+
+    claim = None if claimed else Claim(path)
+    how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
+    try:
+        writer: TrajectoryWriter
+        if path.suffix.lower() == ".dcd":
+            writer = DcdWriter(path, scene, record, **how)
+        else:
+            writer = Hdf5Writer(path, scene, record, columns=columns, **how)
+    except BaseException:
+        if claim is not None:
+            claim.close()
+        raise
+    if claim is not None:
+        writer.claim = claim
+        weakref.finalize(writer, claim.close)
+    return writer
+
+
+def companions(path: Path) -> tuple[Path, ...]:
+    """Return the paths of what is written beside a trajectory."""
+    from systems.trajectory import dcd_file
+    from systems.trajectory.topology_file import topology_path
+
+    if path.suffix.lower() != ".dcd":
+        return topology_path(path), journal_path(path)
+
+    pdb, meta = dcd_file.companions(path)
+    return pdb, meta, journal_path(meta)
+
+
+def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
+    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, or any format that MDTraj or MDAnalysis reads.
+
+    `top` names a structure or topology file for formats without topology; a DCD of ours finds its companions itself. A
+    file without our record has `record == {}` and `flags is None`; one without times has `times_known` False.
+    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds.
+    Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
+    InputError when a topology is needed, or does not fit.
+    """
+    path = Path(path)
+    top = None if top is None else Path(top)
+    is_hdf5 = path.suffix.lower() in _HDF5
+    if is_hdf5:
+        from systems.trajectory.hdf5_file import Hdf5Reader, is_plain_h5md
+
+        if not is_plain_h5md(path):
+            return Hdf5Reader(path)
+    if path.suffix.lower() == ".dcd":
+        from systems.trajectory.dcd_file import DcdReader
+
+        return DcdReader(path, top)
+    from systems.trajectory.from_mdtraj import is_mdtraj_format
+
+    if is_mdtraj_format(path) and not is_hdf5:
+        from systems.trajectory.mdtraj_file import MdtrajReader
+
+        return MdtrajReader(path, top)
+    from systems.trajectory.from_mdanalysis import MdanalysisReader
+
+    return MdanalysisReader(path, top)

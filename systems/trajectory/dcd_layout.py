@@ -1,0 +1,186 @@
+"""The byte layout of a DCD file: what its header says, where its frames lie, and the header we write.
+
+Blocks of bytes stand between 32-bit lengths: a header of 4 + 80 bytes (`CORD`, number of frames, first step, steps
+between frames, ..., time step in AKMA units as float32), a title, the number of atoms; then x, y and z of each frame,
+after the unit cell where there is one.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.cell_shape import lengths_and_angles, read_cells
+from systems.errors import TrajectoryError
+
+AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
+_HEADER_BYTES = 92
+_MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
+_TITLE = b"Written by surromd"
+
+
+@dataclass(frozen=True)
+class DcdLayout:
+    """Where the frames of a DCD lie, and what its header says. Sizes in bytes."""
+
+    n_atoms: int
+    first_frame_at: int
+    byte_order: str = "<"
+    has_cell: bool = False
+    n_frames_in_header: int = 0
+    first_time_ps: float = 0.0
+    interval_ps: float = 0.0
+    file_bytes: int = 0
+    path: Path = Path()
+    has_our_title: bool = False
+    states_time: bool = True
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, DcdLayout):
+            return NotImplemented
+        mine = (self.n_atoms, self.first_frame_at, self.byte_order, self.has_cell)
+        return mine == (other.n_atoms, other.first_frame_at, other.byte_order, other.has_cell)
+
+    @staticmethod
+    def ours(n_atoms: int, first_frame_at: int, *, has_cell: bool = False) -> DcdLayout:
+        """Return the layout we write."""
+        return DcdLayout(n_atoms, first_frame_at, has_cell=has_cell)
+
+    @staticmethod
+    def read(path: Path) -> DcdLayout:
+        """Read the header. Raises TrajectoryError when it is damaged or of a kind that is not supported."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEADER_BYTES)
+                size = os.fstat(file.fileno()).st_size
+                order = next((o for o in "<>" if np.frombuffer(head[:4], f"{o}i4")[:1] == 84), "")
+                if len(head) < _HEADER_BYTES or not order or head[4:8] != b"CORD":
+                    what = "is empty" if size == 0 else "is not a DCD file of the 32-bit kind"
+                    raise TrajectoryError(f"{path} {what}.")
+                fields = np.frombuffer(head[8:88], f"{order}i4")
+                charmm = fields[19] != 0
+                delta = np.frombuffer(head[44:52], f"{order}f4" if charmm else f"{order}f8")[0]
+                if fields[8] != 0 or (charmm and fields[11] != 0):
+                    raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
+                title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
+                has_our_title = _TITLE in file.read(title + 4)
+                _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
+                first_frame_at = file.tell()
+        except OSError as error:
+            reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+            raise TrajectoryError(f"{path} {reason}.") from error
+        except (ValueError, IndexError) as error:
+            raise TrajectoryError(f"{path} is cut short inside its header.") from error
+        if not 1 <= n_atoms < _MOST_ATOMS:
+            raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
+        # The time step is float32: digits beyond its seventh are noise.
+        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
+        # MDTraj and VMD write a time step of one unit, whatever the times were.
+        states_time = bool(np.isfinite(interval_ps) and interval_ps > 0) and not (delta == 1.0 and fields[2] == 1)
+        if not (np.isfinite(interval_ps) and interval_ps > 0):
+            interval_ps = 1.0
+        first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
+        return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
+                         first_time_ps, interval_ps, size, path, has_our_title, states_time)  # fmt: skip
+
+    @property
+    def frame_dtype(self) -> np.dtype[Any]:
+        """The NumPy record of one frame, block lengths included."""
+        o = self.byte_order
+        cell = [("cell", f"{o}i4", (14,))] if self.has_cell else []
+        axes = [
+            entry
+            for k in range(3)
+            for entry in ((f"before{k}", f"{o}i4"), (f"x{k}", f"{o}f4", (self.n_atoms,)), (f"after{k}", f"{o}i4"))
+        ]
+        return np.dtype(cell + axes)
+
+    def offset(self, frame: int) -> int:
+        return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
+
+    def times_ps(self, n_frames: int) -> npt.NDArray[np.float64]:
+        return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
+
+    def whole_frames(self) -> int:
+        """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some.
+
+        Other programs write the number they intend (or 0) and never correct it, so theirs is only warned about.
+        """
+        n, rest = divmod(self.file_bytes - self.first_frame_at, int(self.frame_dtype.itemsize))
+        stated = self.n_frames_in_header
+        if stated not in (0, n) and not rest and not self.has_our_title:
+            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
+        elif rest or stated not in (0, n):
+            raise TrajectoryError(
+                f"{self.path} is cut short or damaged: its header states {stated} frames, {n} are whole; "
+                "restore it from a whole copy."
+            )
+        return n
+
+
+def step_fields(times_ps: npt.NDArray[np.float64], record: dict[str, Any]) -> tuple[int, int, float]:
+    """Return `(first step, steps between frames, time step in ps)` for the header.
+
+    In units of the integration step where the record states one that divides the times, else of the interval.
+    """
+    stated = record.get("save_every_ps")
+    if len(times_ps) > 1:
+        interval = float(times_ps[1] - times_ps[0])
+    else:
+        interval = float(stated) if isinstance(stated, int | float) and stated > 0 else 1.0
+    timestep = record.get("timestep_ps")
+    for unit in (timestep, interval):
+        if not isinstance(unit, int | float) or unit <= 0:
+            continue
+        nsavc, first = round(interval / unit), round(float(times_ps[0]) / unit)
+        fits = abs(nsavc * unit - interval) < 1e-6 * interval and abs(first * unit - times_ps[0]) < 1e-3 * interval
+        if fits and nsavc >= 1 and 0 <= first < 2**31:
+            return first, nsavc, float(unit)
+    return 0, 1, interval
+
+
+def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Return the unit-cell blocks `(n, 14)` of box vectors `(n, 3, 3)` nm: A, gamma, B, beta, alpha, C (Å, degrees)."""
+    lengths, angles = lengths_and_angles(cell_nm)
+    (a, b, c), (alpha, beta, gamma) = 10.0 * lengths.T, angles.T
+    out = np.full((len(lengths), 14), 48, dtype="<i4")
+    out[:, 1:13] = np.ascontiguousarray(np.stack([a, gamma, b, beta, alpha, c], axis=1), dtype="<f8").view("<i4")
+    return out
+
+
+def cells_of_blocks(blocks: npt.NDArray[np.int32], byte_order: str) -> npt.NDArray[np.float64] | None:
+    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks, None of such as hold zeros.
+
+    Some programs write the cosines of the angles.
+    """
+    raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
+    angles = raw[:, [4, 3, 1]]
+    if (np.abs(angles) <= 1.0).all():
+        angles = np.degrees(np.arccos(angles))
+    return read_cells(0.1 * raw[:, [0, 2, 5]], angles)
+
+
+def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float, *, has_cell: bool = False) -> bytes:
+    """Return the first block of our header; `nsavc` time steps lie between frames."""
+    fields = np.zeros(20, dtype="<i4")
+    fields[:3] = n_frames, first_step, nsavc
+    fields[3] = min(n_frames * nsavc, 2**31 - 1)
+    fields[9:10] = np.array([timestep_ps / AKMA_PS], dtype="<f4").view("<i4")
+    fields[10] = int(has_cell)
+    fields[19] = 24  # CHARMM's version: float32 time step, three dimensions (field 11)
+    mark = np.array([84], dtype="<i4").tobytes()
+    return mark + b"CORD" + fields.tobytes() + mark
+
+
+def title_bytes(n_atoms: int) -> bytes:
+    """Return the title and the number of atoms, which complete our header."""
+    line = (_TITLE + b"; record and exact times in NAME.meta.h5").ljust(80)
+    mark = np.array([84], dtype="<i4").tobytes()
+    title = mark + np.array([1], dtype="<i4").tobytes() + line + mark
+    return title + np.array([4, n_atoms, 4], dtype="<i4").tobytes()

@@ -1,0 +1,162 @@
+"""Scenes from MDTraj topologies and from the structure files that MDTraj reads."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.bond_orders import ValenceError, perceive
+from systems.chemistry.distance_bonds import with_bonds_by_distance
+from systems.chemistry.element_data import atomic_weight_da
+from systems.errors import InputError, TrajectoryError, first_line
+from systems.files.schema import parsed
+from systems.prepare.read.pdb_records import read_structure
+from systems.scene import Scene
+
+
+def scene_from_mdtraj_topology(
+    topology: Any,
+    positions_nm: npt.ArrayLike,
+    *,
+    name: str = "trajectory",
+    source: str = "",
+    elements: Sequence[str] | None = None,
+) -> Scene:
+    """Return a Scene with the atoms, bonds and bond orders of an `mdtraj.Topology`, at positions `(n_atoms, 3)` nm.
+
+    `elements` replaces the topology's. Where no bond order is stated, orders and charges are perceived; they stay 0
+    where the bonds fit no valence (missing hydrogens). Raises InputError when the numbers of atoms differ.
+    """
+    positions = np.array(positions_nm, dtype=np.float64)
+    if positions.shape != (topology.n_atoms, 3):
+        raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
+    atoms, residues = list(topology.atoms), list(topology.residues)
+    rows = sorted(
+        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), _order(b)) for b in topology.bonds
+    )
+    symbols = list(elements) if elements is not None else [a.element.symbol if a.element else "VS" for a in atoms]
+    bonds = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
+    orders = np.array([row[2] for row in rows], dtype=np.float64)
+    numbers = [r.resSeq for r in residues]
+    if numbers == list(range(len(residues))):  # no numbers were stated; people count from one
+        numbers = [n + 1 for n in numbers]
+    charges = np.array([getattr(a, "formal_charge", None) or 0 for a in atoms], dtype=np.int64)
+    if not orders.any():
+        with contextlib.suppress(ValenceError):
+            orders, charges = perceive(symbols, bonds)
+    return Scene(
+        name=name,
+        atom_names=tuple(a.name for a in atoms),
+        elements=tuple(symbols),
+        residue_of_atom=np.array([a.residue.index for a in atoms], dtype=np.int64),
+        residue_names=tuple(r.name for r in residues),
+        residue_ids=tuple(map(str, numbers)),
+        chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
+        bonds=bonds,
+        bond_orders=orders,
+        formal_charges=charges,
+        masses_da=np.array([_mass_da(s, a) for s, a in zip(symbols, atoms, strict=True)], dtype=np.float64),
+        positions_nm=positions,
+        provenance={"source": source} if source else {},
+    )
+
+
+def scene_from_topology_json(text: bytes | str, positions_nm: npt.ArrayLike, path: Path) -> Scene:
+    """Return the Scene of an MDTraj HDF5 file's topology JSON. Raises TrajectoryError when it is damaged."""
+    import mdtraj
+    from mdtraj.core import element
+    from mdtraj.core.topology import bond_name_to_type
+
+    try:
+        record = parsed(text)
+        topology = mdtraj.Topology()
+        for chain_record in sorted(record["chains"], key=lambda c: c["index"]):
+            chain = topology.add_chain(chain_record.get("chain_id"))
+            for entry in sorted(chain_record["residues"], key=lambda r: r["index"]):
+                residue = topology.add_residue(entry["name"], chain, resSeq=entry.get("resSeq", entry["index"] + 1))
+                for atom in sorted(entry["atoms"], key=lambda a: a["index"]):
+                    symbol = atom["element"]
+                    kind = element.get_by_symbol(symbol) if symbol else element.virtual
+                    topology.add_atom(atom["name"], kind, residue, formal_charge=atom.get("formal_charge"))
+        atoms = list(topology.atoms)
+        metadata = record.get("bond_metadata") or [{"order": None, "type": None}] * len(record["bonds"])
+        for (i, j), bond in zip(record["bonds"], metadata, strict=True):
+            topology.add_bond(atoms[i], atoms[j], order=bond["order"], type=bond_name_to_type(bond["type"]))
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise TrajectoryError(f"{path} is damaged: its /topology cannot be understood ({error}).") from error
+    return scene_from_mdtraj_topology(topology, positions_nm, name=path.stem, source=path.name)
+
+
+def scene_from_structure(top: Path, *, name: str) -> Scene:
+    """Return the Scene of a structure or topology file that stands beside a trajectory, by MDTraj or MDAnalysis.
+
+    Bonds are MDTraj's (its residue templates and CONECT records); atoms that it leaves without one are bonded by their
+    distances. Elements of PDB and mmCIF files are read here: where the element column is empty MDTraj takes CA for
+    calcium and HG for mercury. Files without positions (PSF, prmtop) give positions of zero.
+    Raises InputError when neither library reads the file.
+    """
+    import mdtraj
+
+    if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
+        topology = _bare_topology(top)
+        if topology is None:
+            from systems.trajectory.from_mdanalysis import scene_from_universe
+
+            return scene_from_universe(top, name=name)
+        return scene_from_mdtraj_topology(topology, np.zeros((topology.n_atoms, 3)), name=name, source=top.name)
+    try:
+        structure = mdtraj.load(str(top))
+    except Exception as error:  # each MDTraj reader raises its own kinds
+        raise InputError(f"{top} cannot be read as a structure: {first_line(error)}.") from error
+    topology = structure.topology
+    elements = None
+    with contextlib.suppress(InputError):
+        records = read_structure(top).atoms
+        # MDTraj renames atoms, so that only positions tell whether both readers kept the same ones.
+        read_nm = np.array([r.position_angstrom for r in records]) / 10.0
+        if read_nm.shape == structure.xyz[0].shape and np.allclose(read_nm, structure.xyz[0], atol=1e-4):
+            elements = [r.element for r in records]
+    scene = scene_from_mdtraj_topology(topology, structure.xyz[0], name=name, source=top.name, elements=elements)
+    return with_bonds_by_distance(scene)
+
+
+def _bare_topology(top: Path) -> Any:
+    """Return MDTraj's topology of a file without positions (PSF, prmtop), None when MDTraj does not read it."""
+    import mdtraj
+
+    if top.suffix.lower() not in (".psf", ".prmtop", ".parm7", ".top"):
+        return None
+    with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
+        return mdtraj.load_topology(str(top))
+    return None
+
+
+def is_mdtraj_format(path: Path) -> bool:
+    """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
+    from mdtraj.formats.registry import FormatRegistry
+
+    name = path.name.lower()
+    return any(name.endswith(s) for s in FormatRegistry.loaders) and not name.endswith((".xyz", ".xyz.gz", ".gsd"))
+
+
+def _mass_da(symbol: str, atom: Any) -> float:
+    try:
+        return atomic_weight_da(symbol)
+    except KeyError:  # an element without a table entry, or a virtual site
+        return float(atom.element.mass) if atom.element is not None else 0.0
+
+
+def _order(bond: Any) -> float:
+    if bond.order is not None:
+        return float(bond.order)
+    return 0.0 if bond.type is None else float(bond.type)
+
+
+def _chain_id(chain: Any) -> str:
+    given = getattr(chain, "chain_id", None)
+    return str(given) if given else chr(ord("A") + chain.index % 26)

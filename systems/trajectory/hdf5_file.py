@@ -1,0 +1,316 @@
+"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone.
+
+MDTraj: `/coordinates` (n, n_atoms, 3) float32 nm, `/time` ps, `/topology` JSON (mdtraj.org, HDF5 format, version 1.1).
+H5MD 1.1 (de Buyl, Colberg and Höfling, Comput. Phys. Commun. 185, 1546 (2014)): `/particles/trajectory/position` with
+`value` and `time` as hard links onto the same datasets, so that the second convention takes no space. What else frames
+may have (velocities, forces, a cell) is in `extra_columns`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from systems.elements import ATOMIC_NUMBERS
+from systems.errors import InputError, TrajectoryError
+from systems.files.checksums import Checksums, check_frames_read, frame_checksums
+from systems.files.whole_file import refuse_existing
+from systems.scene import Scene
+from systems.trajectory.base import (
+    Float32Array,
+    Float64Array,
+    FrameBlock,
+    TrajectoryReader,
+    TrajectoryWriter,
+    check_same_topology,
+)
+from systems.trajectory.extra_columns import PER_ATOM, check_wanted, extra_values, lay_out_extras, read_cells
+from systems.trajectory.frame_store import (
+    CELLS,
+    CHECKSUMS,
+    EDGES,
+    FRAMES,
+    FrameStore,
+    add_column,
+    columns_with_frames,
+    consistent_length,
+    create_store,
+    damage_reported,
+    get_json,
+    open_hdf5,
+    program_version,
+    read_run_id,
+)
+from systems.trajectory.topology_file import refuse_other_topology, topology_path, write_topology
+
+_CHUNK_BYTES = 131_072
+_STRIDED_READ_FRAMES = 8192
+_BOND_TYPES = {1.0: "Single", 1.5: "Aromatic", 2.0: "Double", 3.0: "Triple"}
+_POSITION = "particles/trajectory/position"
+
+
+class Hdf5Writer(TrajectoryWriter):
+    """Writes one HDF5 trajectory; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
+
+    def __init__(
+        self,
+        path: Path,
+        scene: Scene,
+        record: dict[str, Any],
+        *,
+        append: bool,
+        overwrite: bool,
+        columns: Sequence[str] = (),
+        run_id: str = "",
+    ) -> None:
+        self.path, self.scene = path, scene
+        check_wanted(columns, path)
+        if not append:
+            refuse_existing(path, overwrite)
+            refuse_other_topology(path, scene, overwrite=overwrite)
+            names = (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS]))
+            create_store(
+                path,
+                scene,
+                record,
+                lambda file: _lay_out(file, scene, columns),
+                overwrite=overwrite,
+                run_id=run_id,
+                checksums=names,
+            )
+        self._store = FrameStore(path)
+        try:
+            check_same_topology(path, self._store.scene, scene)
+            if "coordinates" not in self._store.file:
+                raise TrajectoryError(f"{path} holds no coordinates; it is the companion of a DCD file.")
+            if not append or not topology_path(path).exists():
+                write_topology(path, scene)
+            new = {key: value for key, value in record.items() if key not in self._store.record}
+            if append and new:
+                self._store.update_record(new)
+        except BaseException:
+            self._store.close()
+            raise
+        self.n_frames, self.last_time_ps = self._store.n_frames, self._store.last_time_ps
+
+    def _append(self, block: FrameBlock) -> None:
+        self._refuse_closed()
+        timestep_ps = self._store.record.get("timestep_ps")
+        if isinstance(timestep_ps, int | float) and timestep_ps > 0:
+            step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
+        else:
+            step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
+        extra = extra_values(self._store.file, self.scene, block, f"{self.path}, after frame {self.n_frames}")
+        stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
+        if EDGES in extra:
+            stored[CELLS] = extra[EDGES]
+        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
+
+    def truncate(self, n_frames: int) -> None:
+        self._refuse_closed()
+        self._store.truncate(n_frames)
+        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+
+
+class Hdf5Reader(TrajectoryReader):
+    """Reads our own HDF5 trajectories and MDTraj's. Raises TrajectoryError when the file is damaged or incomplete."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = open_hdf5(path)
+        try:
+            with damage_reported(path):
+                self._read_headers()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read_headers(self) -> None:
+        if "coordinates" not in self._file:
+            raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
+        self.n_frames = consistent_length(self._file, self.path)
+        self._coordinates = self._file["coordinates"]
+        if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
+        self._scale = _nm_per_unit(self._coordinates, self.path)
+        self.n_atoms = int(self._coordinates.shape[1])
+        columns = read_columns(self._file, self.path, self.n_frames)
+        self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
+        self.checksums, self.run_id = read_checksums(self._file, self.n_frames), read_run_id(self._file)
+        self.times_known = "surromd" in self._file or "time" in self._file
+        self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
+        self.scene = self._read_scene()
+        if self.scene is not None and self.scene.n_atoms != self.n_atoms:
+            raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
+
+    def _read_scene(self) -> Scene | None:
+        if "surromd" in self._file:
+            return Scene.from_dict(get_json(self._file, "surromd/scene"))
+        if "topology" not in self._file or self.n_frames == 0:
+            return None
+        from systems.trajectory.from_mdtraj import scene_from_topology_json
+
+        return scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        frames = self._gather(self._coordinates, start, stop, stride)
+        check_read(self, FRAMES, frames, slice(start, stop, stride))
+        return frames if self._scale == 1.0 else (frames * np.float32(self._scale))
+
+    def _read_extra(self, name: str, start: int, stop: int, stride: int) -> Float32Array | None:
+        if not self._file:
+            raise InputError(f"{self.path} is closed.")
+        if name not in self._file:
+            return None
+        values = self._gather(self._file[name], start, stop, stride)
+        check_read(self, name, values, slice(start, stop, stride))
+        return values
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if not self._file:
+            raise InputError(f"{self.path} is closed.")
+        with damage_reported(self.path):
+            cells = read_cells(self._file, start, stop, stride)
+        if cells is not None:
+            check_read(self, CELLS, cells, slice(start, stop, stride))
+        return cells
+
+    def _gather(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> Float32Array:
+        if start >= stop:
+            return np.empty((0, *column.shape[1:]), dtype=np.float32)
+        try:
+            if stride == 1:
+                return np.asarray(column[start:stop], dtype=np.float32)
+            # HDF5 gathers strided rows one by one; whole blocks, thinned here, are many times faster.
+            block = max(_STRIDED_READ_FRAMES // stride, 1) * stride
+            parts = [column[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
+            return np.concatenate(parts).astype(np.float32, copy=False)
+        except (OSError, RuntimeError, ValueError) as error:
+            if not self._file:
+                raise InputError(f"{self.path} is closed.") from error
+            reason = str(error).splitlines()[0]
+            raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def is_plain_h5md(path: Path) -> bool:
+    """Whether this is another program's H5MD, without MDTraj's names beside it."""
+    try:
+        with open_hdf5(path) as file:
+            return "h5md" in file and "coordinates" not in file and "surromd" not in file
+    except TrajectoryError:  # its own reader says how it is damaged
+        return False
+
+
+def read_columns(file: h5py.File, path: Path, n_frames: int) -> tuple[Any, Any, Any, dict[str, Any]]:
+    """Return `(time_ps, flags, chunk_idx, scalars)` of the first `n_frames` frames; None for what is not there."""
+    if "surromd" in file or "time" in file:
+        time_ps = file["time"][:n_frames].astype(np.float64)
+    else:
+        time_ps = np.arange(n_frames, dtype=np.float64)
+    flags = file["surromd/flags"][:n_frames] if "surromd/flags" in file else None
+    chunk_idx = file["surromd/chunk_idx"][:n_frames] if "surromd/chunk_idx" in file else None
+    group = file.get("surromd/scalars", {})
+    scalars = {name: group[name][:n_frames] for name in group}
+    if not np.isfinite(time_ps).all():
+        raise TrajectoryError(f"{path} is damaged: some frames have no time.")
+    return time_ps, flags, chunk_idx, scalars
+
+
+def read_checksums(file: h5py.File, n_frames: int) -> dict[str, Checksums]:
+    """Return the checksums `(n_frames,)` of the first frames by what they are of; older files have none."""
+    return {name: column[:n_frames] for name, column in file.get(CHECKSUMS, {}).items()}
+
+
+def check_read(reader: TrajectoryReader, name: str, stored: npt.NDArray[Any], frames: slice) -> None:
+    """Raise TrajectoryError unless what was read of `frames`, as it is on disk, is what was written.
+
+    With positions (FRAMES) go what the reader holds of the same frames: times, chunks, flags, scalars.
+    """
+    if name not in reader.checksums or not len(stored):
+        return
+    columns = {name: stored}
+    if name == FRAMES and reader.chunk_idx is not None:
+        flags = None if reader.flags is None else reader.flags[frames]
+        scalars = {key: values[frames] for key, values in reader.scalars.items()}
+        columns |= columns_with_frames(reader.time_ps[frames], reader.chunk_idx[frames], flags, scalars)
+    found = frame_checksums(columns)
+    check_frames_read(reader.path, reader.checksums[name][frames], found, frames.start, frames.step)
+
+
+def _nm_per_unit(dataset: h5py.Dataset, path: Path) -> float:
+    units = dataset.attrs.get("units", b"nanometers")
+    name = units.decode() if isinstance(units, bytes) else str(units)
+    known = {"nanometers": 1.0, "nanometer": 1.0, "nm": 1.0, "angstroms": 0.1, "angstrom": 0.1}
+    if name not in known:
+        raise TrajectoryError(f"{path}: coordinates are in {name!r}; known units are {', '.join(known)}.")
+    return known[name]
+
+
+def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
+    """Add MDTraj's and H5MD's groups, empty columns and units."""
+    version = program_version()
+    for key, value in {"conventions": "Pande", "conventionVersion": "1.1", "program": "surromd", "title": scene.name,
+                       "programVersion": version, "application": "surromd"}.items():  # fmt: skip
+        file.attrs[key] = np.bytes_(value.encode("ascii", "replace"))
+    frame_bytes = 12 * max(scene.n_atoms, 1)
+    chunk = min(max(_CHUNK_BYTES // frame_bytes, 1), 1024)
+    coordinates = add_column(file, "coordinates", 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
+    coordinates.attrs["units"], coordinates.attrs["unit"] = np.bytes_(b"nanometers"), "nm"
+    time = add_column(file, "time", 0, "<f8")
+    time.attrs["units"], time.attrs["unit"] = np.bytes_(b"picoseconds"), "ps"
+    file.create_dataset("topology", data=np.array([_topology_json(scene).encode("ascii")]))
+
+    h5md = file.create_group("h5md")
+    h5md.attrs["version"] = np.array([1, 1], dtype=np.int32)
+    h5md.create_group("author").attrs["name"] = "surromd"
+    creator = h5md.create_group("creator")
+    creator.attrs["name"], creator.attrs["version"] = "surromd", version
+    particles = file.create_group("particles/trajectory")
+    box = particles.create_group("box")
+    box.attrs["dimension"] = np.int32(3)
+    position = particles.create_group("position")
+    position["value"], position["time"] = coordinates, time
+    add_column(file, f"{_POSITION}/step", 0, "<i8")
+    lay_out_extras(file, scene, columns, chunk)
+    particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
+    particles["mass"] = scene.masses_da
+    particles["mass"].attrs["unit"] = "u"
+
+
+def _topology_json(scene: Scene) -> str:
+    """Return MDTraj's topology JSON. Runs of atoms become residues, so that the atom order survives any scene."""
+    chains: list[dict[str, Any]] = []
+    n_residues = 0
+    last_residue = last_chain = None
+    for atom, residue in enumerate(scene.residue_of_atom.tolist()):
+        chain = scene.chain_of_residue[residue]
+        if chain != last_chain:
+            chains.append({"index": len(chains), "chain_id": chain or None, "residues": []})
+            last_chain, last_residue = chain, None
+        if residue != last_residue:
+            digits = "".join(c for c in scene.residue_ids[residue] if c.isdigit() or c == "-")
+            try:
+                number = int(digits)
+            except ValueError:
+                number = residue + 1
+            name = scene.residue_names[residue]
+            chains[-1]["residues"].append(
+                {"index": n_residues, "name": name, "resSeq": number, "segmentID": "", "atoms": []}
+            )
+            n_residues, last_residue = n_residues + 1, residue
+        chains[-1]["residues"][-1]["atoms"].append(
+            {"index": atom, "name": scene.atom_names[atom], "element": scene.elements[atom],
+             "formal_charge": int(scene.formal_charges[atom])}
+        )  # fmt: skip
+    orders = scene.bond_orders.tolist()
+    metadata = [{"order": order or None, "type": _BOND_TYPES.get(order)} for order in orders]
+    return json.dumps({"chains": chains, "bonds": scene.bonds.tolist(), "bond_metadata": metadata})
