@@ -75,7 +75,14 @@ def test_nothing_is_left_of_charges_being_computed(
 @pytest.mark.slow
 def test_verbs_ended_at_three_moments_leave_nothing(repository: Path) -> None:
     """A part of the table that docs/studies/reference/endings.py prints for all verbs at ten moments."""
-    study = [sys.executable, str(repository / "docs" / "studies" / "endings.py"), "--moments", "3", "--longest", "15"]
+    study = [
+        sys.executable,
+        str(repository / "docs" / "studies" / "reference" / "endings.py"),
+        "--moments",
+        "3",
+        "--longest",
+        "15",
+    ]
     verbs = ["plan", "reference x 2", "campaign", "train", "rollout", "compare"]
     table = subprocess.run(
         [*study, *(word for verb in verbs for word in ("--verb", verb))], capture_output=True, text=True, check=False

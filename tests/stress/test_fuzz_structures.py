@@ -218,7 +218,7 @@ def fuzz(seeds: range, folder: Path, sources: list[bytes]) -> tuple[Counter[str]
 
 @pytest.fixture(scope="module")
 def sources(repository: Path) -> list[bytes]:
-    return [(repository / "systems" / "data" / f"{name}.pdb").read_bytes() for name in SOURCES]
+    return [(repository / "systems" / "library" / "data" / f"{name}.pdb").read_bytes() for name in SOURCES]
 
 
 def test_an_alteration_is_noticed(sources: list[bytes], tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def _read(folder: Path, text: str) -> Campaign:
 
 def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repository: Path) -> None:
     (tmp_path / "pdb").mkdir()
-    pdb = (repository / "systems" / "data" / "alanine-dipeptide.pdb").read_bytes()
+    pdb = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_bytes()
     for name in ("b", "a"):
         (tmp_path / "pdb" / f"{name}.pdb").write_bytes(pdb)
     campaign = _read(
@@ -215,7 +215,7 @@ def test_the_bench_s_molecules_run_as_in_md17_at_both_temperatures(tmp_path: Pat
 def test_the_file_in_the_readme_is_one(tmp_path: Path, repository: Path) -> None:
     blocks = re.findall(r"```toml\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
     (tmp_path / "pdb").mkdir()
-    pdb = (repository / "systems" / "data" / "alanine-dipeptide.pdb").read_bytes()
+    pdb = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_bytes()
     (tmp_path / "pdb" / "a.pdb").write_bytes(pdb)
     campaign = _read(tmp_path, "".join(blocks))
     assert [scene.name for scene in campaign.scenes] == ["alanine-dipeptide", "ACE-GLY-NME", "a", "ethanol"]

@@ -13,7 +13,9 @@ import pytest
 
 @pytest.fixture(scope="module")
 def corpus(repository: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("corpus", repository / "docs" / "studies" / "corpus.py")
+    spec = importlib.util.spec_from_file_location(
+        "corpus", repository / "docs" / "studies" / "preparation" / "corpus.py"
+    )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["corpus"] = module
@@ -34,7 +36,7 @@ def _row(corpus: ModuleType, path: Path, peer: str = "ok:fixer [fixer: 22 atoms,
 
 
 def test_a_file_is_taken_and_every_alteration_noticed(corpus: ModuleType, repository: Path, tmp_path: Path) -> None:
-    text = (repository / "systems" / "data" / "alanine-dipeptide.pdb").read_text()
+    text = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_text()
     path = tmp_path / "whole.pdb"
     path.write_text(text)
     row = _row(corpus, path)

@@ -12,7 +12,7 @@ from systems.prepare.source import prepare
 
 @pytest.fixture
 def ethanol_lines(repository: Path) -> list[str]:
-    return (repository / "systems" / "data" / "ethanol.pdb").read_text().splitlines()
+    return (repository / "systems" / "library" / "data" / "ethanol.pdb").read_text().splitlines()
 
 
 def _prepared(folder: Path, lines: list[str]) -> None:
@@ -51,7 +51,7 @@ def test_an_atom_under_an_unknown_record_is_refused(tmp_path: Path, ethanol_line
 
 def test_replaced_hydrogens_are_said(tmp_path: Path, repository: Path) -> None:
     """Without its carbonyl oxygen the chain ends at ALA 2, and the nitrogen after it gets other hydrogens."""
-    lines = (repository / "systems" / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
+    lines = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_text().splitlines()
     k = next(i for i, line in enumerate(lines) if line[12:21] == " O   ALA ")
     ca = next(i for i, line in enumerate(lines) if line[12:21] == " CA  ALA ")
     changed = [*lines[: ca + 1], "TER", *lines[ca + 1 : k], *lines[k + 1 :]]
