@@ -57,7 +57,7 @@ def test_a_processor_of_either_kind_is_told() -> None:
     if here.unit and "ONEDNN_MAX_CPU_ISA" not in os.environ:
         assert choose_precision("auto").bf16, here
         code = "from surrogate.models.precision import choose_precision as c; print(c('auto').name)"
-        held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[3])}
+        held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[4])}
         said = subprocess.run([sys.executable, "-c", code], env=held_back, capture_output=True, text=True, check=True)
         assert said.stdout == "fp32\n"
 

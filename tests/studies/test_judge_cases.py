@@ -15,7 +15,7 @@ def test_every_case_is_judged_as_it_must_be(shared_data: Path) -> None:
 
 
 def test_the_manual_has_every_case() -> None:
-    page = Path(__file__).parents[4] / "docs" / "judge_cases.md"
+    page = Path(__file__).parents[2] / "docs" / "judge_cases.md"
     text = page.read_text(encoding="utf-8")
     assert "**wrong:**" not in text
     for case in CASES:

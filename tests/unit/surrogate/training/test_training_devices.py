@@ -48,7 +48,7 @@ torch.save({"x": torch.stack(seen), "weights": model.state_dict(), "world": fabr
 def test_two_processes_train_one_model_on_twice_the_data(tmp_path: Path) -> None:
     script = tmp_path / "line.py"
     script.write_text(LINE)
-    root = str(Path(__file__).parents[3])
+    root = str(Path(__file__).parents[4])
     environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     subprocess.run([*command, str(tmp_path)], env=environment, check=True, timeout=300, capture_output=True)

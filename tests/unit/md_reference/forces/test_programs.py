@@ -93,7 +93,7 @@ except KeyboardInterrupt:
 
 def _start(folder: Path, *, deferred: bool = False) -> subprocess.Popen[bytes]:
     """A process of its own that runs SLOW in `folder`, with a scratch folder beside."""
-    root = str(Path(__file__).parents[3])
+    root = str(Path(__file__).parents[4])
     environment = os.environ | {"TMPDIR": str(folder), "PYTHONPATH": root, "SURROMD_TEST": str(folder)}
     command = [sys.executable, "-c", _CHILD, "deferred" if deferred else "at once", *SLOW]
     return subprocess.Popen(command, cwd=folder, env=environment)

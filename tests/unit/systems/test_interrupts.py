@@ -191,7 +191,7 @@ except KeyboardInterrupt:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no such signals on this system")
 def test_an_interruption_that_is_swallowed_comes_again_and_cleaning_up_is_not_disturbed() -> None:
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
     said = subprocess.run(
         [sys.executable, "-c", _SWALLOWS], env=environment, capture_output=True, text=True, check=True
     )
