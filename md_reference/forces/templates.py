@@ -31,7 +31,7 @@ PROTEIN_FILES = {
 # (docs/studies/reference/phosphorylated_residues.py).
 CHAIN_FILES = (
     PROTEIN_FILES["ff14SB"],
-    str(files("systems.library.named_scenes") / "data" / "phosaa14SB.xml"),
+    str(files("systems.library") / "data" / "phosaa14SB.xml"),
     "amber14/DNA.OL15.xml",
     "amber14/RNA.OL3.xml",
 )

@@ -182,6 +182,6 @@ def _ring_bonds(residue: Component) -> dict[frozenset[int], int]:
 
 @cache
 def _lines() -> dict[str, str]:
-    data = gzip.decompress((files("systems.library.named_scenes") / "data" / "components.tsv.gz").read_bytes()).decode()
+    data = gzip.decompress((files("systems.library") / "data" / "components.tsv.gz").read_bytes()).decode()
     rows = (line.partition("\t") for line in data.splitlines() if not line.startswith("#"))
     return {name: rest for name, _, rest in rows}

@@ -83,7 +83,7 @@ def load(name: str) -> Scene:
 def _shipped(file: str) -> Scene:
     from systems.prepare.structure import scene_from_file
 
-    path = Path(str(files("systems.library.named_scenes") / "data" / f"{file}.pdb"))
+    path = Path(str(files("systems.library") / "data" / f"{file}.pdb"))
     return scene_from_file(path, name=file, provenance={})
 
 

@@ -58,7 +58,7 @@ class Outcome:
 def cases() -> list[Case]:
     """Return the committed list."""
     found = []
-    text = (files("systems.library.named_scenes") / "data" / "drug_like_smiles.tsv").read_text()
+    text = (files("systems.library") / "data" / "drug_like_smiles.tsv").read_text()
     for line in text.splitlines():
         if line.startswith("#") or not line.strip():
             continue

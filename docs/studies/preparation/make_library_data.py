@@ -22,7 +22,7 @@ def make(entry: Entry) -> list[Path]:
     from systems.library.named_scenes import load
 
     written = []
-    path = Path(str(files("systems.library.named_scenes") / "data" / f"{entry.file or entry.name}.pdb"))
+    path = Path(str(files("systems.library") / "data" / f"{entry.file or entry.name}.pdb"))
     if not path.exists():
         replace(_scene(entry), name=entry.name).write_pdb(path)
         written.append(path)

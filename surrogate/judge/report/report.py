@@ -69,7 +69,7 @@ def render(comparison: Comparison, *, command: str) -> str:
     from jinja2 import DictLoader, Environment, StrictUndefined
     from markupsafe import Markup
 
-    package = files("surrogate.judge.report.report")
+    package = files("surrogate.judge.report")
 
     def text_of(name: str) -> str:
         return package.joinpath(name).read_text("utf-8")

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.openmm.openmm_state import SurrogateState
-from surrogate.sampling.rollout_checkpoint import UNREADABLE
 from systems.errors import InputError, SimulationError
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
