@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class SurromdError(Exception):
     """Base of every error a user can cause or meet; the command line prints its message and exits with 1."""
@@ -55,3 +57,8 @@ def first_line(error: BaseException) -> str:
     """Return the first line of another library's error without its full stop, or the error's kind."""
     lines = str(error).strip().splitlines()
     return lines[0].rstrip(".") if lines else type(error).__name__
+
+
+def listed(things: Sequence[str], most: int = 6) -> str:
+    """`A1, A2 and 5 more`, for messages."""
+    return ", ".join(things[:most]) + (f" and {len(things) - most} more" if len(things) > most else "")

@@ -177,7 +177,7 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
 def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings]:
     """Return what a table says of itself and of its runs: axes, preparation and settings, unknown keys refused."""
     from md_reference.forces.solvation import solvate
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     own = {f.name for f in fields(cast(Any, kind))}
     settings = read_settings(

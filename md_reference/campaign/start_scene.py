@@ -48,7 +48,7 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
         return load_prepared(path)
     from md_reference.forces.solvation import require_molecules, solvate
     from systems.files.whole_file import create_whole
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     switches = switches_of(prepare)
     scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})

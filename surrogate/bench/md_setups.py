@@ -27,7 +27,7 @@ class Case:
 
     def prepared(self) -> Scene:
         """Return the scene, solvated where the solvent is explicit. Raises PreparationError."""
-        from systems.prepare.source import prepare
+        from systems.source import prepare
 
         scene = prepare(self.scene)
         if not self.spec().is_explicit:

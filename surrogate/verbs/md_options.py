@@ -108,7 +108,7 @@ class MDSettings(TypedDict, total=False):
 
 
 class Preparation(TypedDict, total=False):
-    """How a Scene is made of what a user names: switches of `systems.prepare.source.prepare`."""
+    """How a Scene is made of what a user names: switches of `systems.source.prepare`."""
 
     ph: Annotated[float, Flag("--ph", "Where a peptide's hydrogens are added.", default=7.0, least=0.0, most=14.0)]
     keep_ligand: Annotated[

@@ -79,7 +79,7 @@ def reference(
     `systems.library.protocols`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
     4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
     for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
-    `systems.prepare.source.prepare`. `resume` goes on from the checkpoint beside `out`.
+    `systems.source.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.run.replicas import replica_paths, simulate_replicas

@@ -65,7 +65,7 @@ def rollout(
     record (`interventions`) and in a column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy')
     say which atoms are written. `force` rolls a scene that leaves the training domain where that is possible.
     `temperature_k` is refused unless it is that of the weights. `ph` to `cap_breaks`: see
-    `systems.prepare.source.prepare`. Raises OutOfDomainError for a molecule the weights do not cover, InputError,
+    `systems.source.prepare`. Raises OutOfDomainError for a molecule the weights do not cover, InputError,
     WeightsError, SimulationError (the guard cannot bring a chunk through), StorageError.
     """
     from md_reference.run.replicas import replica_paths

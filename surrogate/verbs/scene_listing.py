@@ -66,12 +66,12 @@ def _written(settings: dict[str, Any]) -> dict[str, Any]:
 def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
     """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr.
 
-    Raises what `systems.prepare.source.prepare` raises.
+    Raises what `systems.source.prepare` raises.
     """
     if not isinstance(scene, str | Path):
         return scene
     scene = str(scene)
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     prepared = prepare(
         scene,

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.components import component, known_template
 from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
-from systems.chemistry.residues import ResidueTemplate, canonical_heavy_name, template_for
-from systems.errors import PreparationError
+from systems.chemistry.residues import canonical_heavy_name, template_for
+from systems.errors import PreparationError, listed
 from systems.files.outside import check_density
+from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.missing_atoms import note_missing
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.read.records import AtomRecord
 from systems.prepare.structure import atom_label
 
 _PEPTIDE_NM = 0.20
@@ -29,49 +28,6 @@ _GLYCOSIDE_NM = 0.155
 _TOLERANCE_NM = 0.04
 _COINCIDENT_NM = 0.03
 _CONECT_SLACK_NM = 0.1
-
-
-@dataclass
-class Residue:
-    """All atoms of one residue, wherever they stand in the file. `heavy` is empty when the names fit no template."""
-
-    key: tuple[str, str, str]
-    atoms: list[int]
-    template: ResidueTemplate | None
-    heavy: dict[str, int] = field(default_factory=dict)
-    missing: list[str] = field(default_factory=list)
-    lacks_hydrogens: bool = False
-
-    @property
-    def label(self) -> str:
-        return f"{self.key[2]} {self.key[0]}{self.key[1]}"
-
-
-@dataclass
-class Bonding:
-    """Bonds `(n_bonds, 2)`, the residues in the order of the file, and an account of where bonds came from.
-
-    `peptide_bonds` are the pairs (C, N) that join standard residues.
-    """
-
-    bonds: npt.NDArray[np.int64]
-    residues: list[Residue]
-    notes: list[str]
-    peptide_bonds: set[tuple[int, int]]
-
-    @property
-    def neighbours(self) -> list[list[int]]:
-        """Of each atom the atoms that it is bonded to."""
-        near: list[list[int]] = [[] for _ in range(sum(len(r.atoms) for r in self.residues))]
-        for i, j in self.bonds.tolist():
-            near[i].append(j)
-            near[j].append(i)
-        return near
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether no residue that is known by its name lacks an atom."""
-        return not any(r.missing or r.lacks_hydrogens for r in self.residues)
 
 
 def find_bonds(

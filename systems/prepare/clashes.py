@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import PreparationError
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.read.records import AtomRecord
 from systems.prepare.structure import atom_label
 
 # Heavy atoms, a heavy atom and a hydrogen, hydrogens. No minimisation can be trusted to part atoms nearer than the

@@ -9,10 +9,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from systems.errors import PreparationError
-from systems.prepare.bonding import Bonding, Residue
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.errors import PreparationError, listed
+from systems.prepare.bonded_residues import Bonding, Residue
+from systems.prepare.read.records import AtomRecord
 
 Vector = npt.NDArray[np.float64]
 # Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).

@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from systems.chemistry.geometry import signed_volumes
-from systems.errors import PreparationError
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.errors import PreparationError, listed
+from systems.prepare.read.records import AtomRecord
 
 # (centre, a, b, c): positive signed volume is the natural form (L; 2S,3R threonine; 2S,3S isoleucine).
 _ALPHA = ("CA", "N", "C", "CB")

@@ -11,10 +11,10 @@ import networkx as nx
 import numpy as np
 
 from systems.chemistry.residues import is_water_name, template_for
-from systems.errors import PreparationError
-from systems.prepare.bonding import Bonding, are_ions
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.errors import PreparationError, listed
+from systems.prepare.bonded_residues import Bonding
+from systems.prepare.bonding import are_ions
+from systems.prepare.read.records import AtomRecord
 
 _WATER_BOND_ANGSTROM = 1.3
 _BOUND_ANGSTROM = 3.0

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.components import PH_OF_FEWEST, Component, component, hydrogens_of
 from systems.chemistry.residues import ResidueTemplate, template_for
-from systems.prepare.read.pdb_records import AtomRecord
-
-if TYPE_CHECKING:
-    from systems.prepare.bonding import Residue
+from systems.prepare.bonded_residues import Residue
+from systems.prepare.read.records import AtomRecord
 
 
 def note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> None:

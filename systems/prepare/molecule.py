@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from systems.chemistry.element_data import atomic_weight_da
-from systems.errors import PreparationError
+from systems.errors import PreparationError, first_line
 from systems.scene import Scene
 
 RESIDUE_NAME = "MOL"
@@ -23,7 +23,7 @@ def scene_from_smiles(smiles: str, *, seed: int = 0) -> Scene:
     PreparationError for text that is no SMILES, several fragments, metals and elements without a model, and stereo
     that no geometry can have.
     """
-    from systems.prepare.embedding import embed, parse_smiles
+    from systems.prepare.read.smiles import embed, parse_smiles
 
     notes: list[str] = []
     text = smiles.strip()
@@ -142,12 +142,6 @@ def n_unpaired_electrons(scene: Scene) -> int:
     Raises PreparationError where the bond orders are not known.
     """
     return sum(atom.GetNumRadicalElectrons() for atom in to_rdkit(scene).GetAtoms())
-
-
-def first_line(error: BaseException) -> str:
-    """First line of another library's complaint, without its full stop."""
-    lines = str(error).strip().splitlines()
-    return lines[0].rstrip(".") if lines else type(error).__name__
 
 
 def _unique_names(elements: tuple[str, ...]) -> tuple[str, ...]:

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from systems.chemistry.geometry import signed_volumes, superposition, torsion
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
-from systems.prepare.modified_residues import D_RESIDUES
 from systems.prepare.protonation import protonation_account
-from systems.prepare.read.pdb_records import read_structure
+from systems.prepare.read.modified_residues import D_RESIDUES
+from systems.prepare.read.structure_text import read_structure
 from systems.prepare.repair import fixed_random_numbers, records_from_openmm
 from systems.prepare.structure import scene_from_records
 from systems.scene import Scene

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 from systems.chemistry.components import component, hydrogens_of
 from systems.chemistry.residues import template_for
-from systems.errors import PreparationError
-from systems.prepare.bonding import Residue
+from systems.errors import PreparationError, listed
+from systems.prepare.bonded_residues import Residue
 from systems.prepare.missing_atoms import links_of
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.read.records import AtomRecord
 
 # Hydrogens (in OpenMM's names) whose presence tells the protonation state.
 TITRATED = {"ASP": ("HD2",), "GLU": ("HE2",), "LYS": ("HZ1", "HZ2", "HZ3"), "HIS": ("HD1", "HE2"), "CYS": ("HG",)}

@@ -15,11 +15,10 @@ import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.residues import template_for
-from systems.errors import PreparationError
-from systems.prepare.bonding import Bonding, Residue
-from systems.prepare.modified_residues import listed
+from systems.errors import PreparationError, listed
+from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_account
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.read.records import AtomRecord
 from systems.prepare.structure import atom_label
 
 _C_OXT_ANGSTROM = 1.25

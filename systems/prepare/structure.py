@@ -14,7 +14,8 @@ from systems.chemistry.components import component
 from systems.chemistry.element_data import atomic_weight_da
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError
-from systems.prepare.read.pdb_records import AtomRecord, read_structure
+from systems.prepare.read.records import AtomRecord
+from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.prepare.read.records import AtomRecord
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.chemistry.element_data import atomic_weight_da
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import parsed
-from systems.prepare.read.pdb_records import read_structure
+from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from command_line import SMALL_LAM_SLIDE, run
-from systems.prepare.source import prepare
+from systems.source import prepare
 from systems.trajectory.codec import open_trajectory, open_writer
 
 SMALL = "[atoms]\nwidth = 24\nn_rounds = 1\n" + SMALL_LAM_SLIDE

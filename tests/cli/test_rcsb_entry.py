@@ -9,7 +9,7 @@ import pytest
 
 from command_line import run
 from systems.library import named_scenes
-from systems.prepare.source import prepare
+from systems.source import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 # The order and the names of the Protein Data Bank: heavy atoms of a residue first.

@@ -24,8 +24,8 @@ from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
-from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
+from systems.source import prepare
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 

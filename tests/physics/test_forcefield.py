@@ -11,8 +11,8 @@ import pytest
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
 from md_reference.run.engine import Engine
 from systems.errors import PreparationError, UnknownNameError
-from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
+from systems.source import prepare
 
 ENERGY_TOLERANCE_KJ_MOL = 1e-3
 FORCE_TOLERANCE_KJ_MOL_NM = 1e-3

@@ -13,8 +13,8 @@ import pytest
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
 from md_reference.forces.small_molecules.ambertools import find_ambertools, run
 from systems.library.named_scenes import load
-from systems.prepare.source import prepare
 from systems.scene import FloatArray, Scene
+from systems.source import prepare
 
 pytestmark = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184

@@ -130,7 +130,7 @@ def try_row(row: Row, *, charges: bool = False, limit_s: int = 300) -> Outcome:
 
 def _try(row: Row, charges: bool) -> Outcome:
     from systems.errors import SurromdError
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     try:
         scene = prepare(row.spec)

@@ -74,7 +74,7 @@ def cases() -> list[Case]:
 def run_case(case: Case, *, time_ps: float, timestep_ps: float, force_field: str) -> Outcome:
     """Prepare, parametrise and simulate one molecule; what refuses it ends in the outcome."""
     from surrogate import api
-    from systems.prepare.source import prepare
+    from systems.source import prepare
     from systems.trajectory.codec import open_trajectory
 
     start = time.perf_counter()
@@ -100,8 +100,8 @@ def run_case(case: Case, *, time_ps: float, timestep_ps: float, force_field: str
 
 def what_is_wrong(scene: Scene, positions_nm: np.ndarray) -> str:
     """Return what a frame `(n_atoms, 3)` nm of the scene's run has lost of its molecule, or an empty string."""
-    from systems.prepare.embedding import stereo_labels
     from systems.prepare.molecule import to_rdkit
+    from systems.prepare.read.smiles import stereo_labels
 
     if not np.isfinite(positions_nm).all():
         return "positions are not finite"

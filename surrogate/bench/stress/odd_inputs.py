@@ -16,9 +16,9 @@ from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import find_deviations, match_domain
 from systems.chemistry.validity import Geometry
 from systems.errors import OutOfDomainError, SurromdError
-from systems.prepare.source import prepare
 from systems.scene import Scene
 from systems.selection import part_of, reordered
+from systems.source import prepare
 from systems.trajectory.pdb_text import pdb_text
 
 if TYPE_CHECKING:

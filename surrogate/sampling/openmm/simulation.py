@@ -282,7 +282,7 @@ _PROPERTIES = {
 
 def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
     if isinstance(scene, str | Path):
-        from systems.prepare.source import prepare
+        from systems.source import prepare
 
         scene = prepare(str(scene))
     if isinstance(weights, str | Path):

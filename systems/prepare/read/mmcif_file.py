@@ -9,7 +9,7 @@ from typing import Any
 
 from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, first_line
-from systems.prepare.read.pdb_records import AtomRecord, StructureFile, coordinates
+from systems.prepare.read.records import AtomRecord, StructureFile, coordinates
 
 _NEEDED = ("Cartn_x", "Cartn_y", "Cartn_z", "label_atom_id")
 _OPTIONAL = (

@@ -10,9 +10,9 @@ import numpy as np
 
 from systems.errors import InputError, PreparationError
 from systems.files.outside import content
-from systems.prepare.embedding import drop_isotopes, embed, require, sanitise
 from systems.prepare.read.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
 from systems.prepare.read.salts import main_molecule
+from systems.prepare.read.smiles import drop_isotopes, embed, require, sanitise
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from systems.chemistry.element_data import element_symbol, repeats_name
 from systems.errors import InputError
 from systems.prepare.read.hybrid36 import decode
-from systems.prepare.read.pdb_records import AtomRecord, StructureFile, coordinates
+from systems.prepare.read.records import AtomRecord, StructureFile, coordinates
 
 # All records of the PDB format, version 3.3 and before, and those that other programs add.
 _RECORDS = frozenset((

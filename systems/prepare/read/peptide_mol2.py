@@ -8,7 +8,7 @@ from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError
 from systems.prepare.read.mol2_file import Mol2, read_mol2
 from systems.prepare.read.mol_file import read_text
-from systems.prepare.read.pdb_records import AtomRecord, StructureFile
+from systems.prepare.read.records import AtomRecord, StructureFile
 
 
 def is_peptide_mol2(path: Path) -> bool:

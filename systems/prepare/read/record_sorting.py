@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from systems.chemistry.residues import is_water_name, template_for
-from systems.errors import InputError
-from systems.prepare.modified_residues import listed
-from systems.prepare.read.pdb_records import AtomRecord, StructureFile
+from systems.errors import InputError, listed
+from systems.prepare.read.records import AtomRecord, StructureFile
 
 # Massless sites of water models (MW, M, EP, OM, LP1), lone pairs (LPOA) and dummy masses (MCH3, MN1): no elements.
 _SITE = re.compile(r"M(W\d?|\d*|N\d|C[BH]\d?|TRP\d?)|EPW?\d?|[LV]P?S?\d|L[PL]\w*|OM|VS\w*|IW")

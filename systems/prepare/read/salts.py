@@ -6,8 +6,7 @@ from collections import Counter
 from functools import cache
 from typing import Any
 
-from systems.errors import PreparationError
-from systems.prepare.modified_residues import listed
+from systems.errors import PreparationError, listed
 
 # What drugs are sold with (the salts of the pharmacopoeias), uncharged; and water, ammonia and what has no such form.
 _COUNTERIONS = (

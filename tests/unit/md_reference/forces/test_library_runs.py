@@ -21,8 +21,8 @@ from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.catalogue import MOLECULES
 from systems.library.protocols import find_protocol
-from systems.prepare.source import prepare
 from systems.scene import Scene
+from systems.source import prepare
 
 MD17 = named_scenes.groups()[MOLECULES]
 GAFF = ForceFieldSpec("gaff2", "vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)

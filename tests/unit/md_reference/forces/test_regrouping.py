@@ -13,8 +13,8 @@ from md_reference.forces.regrouping import permuted, regroup
 from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
-from systems.prepare.source import prepare
 from systems.scene import IntArray, Scene
+from systems.source import prepare
 from systems.trajectory.codec import open_trajectory
 
 SPECS = {

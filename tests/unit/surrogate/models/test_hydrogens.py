@@ -273,7 +273,7 @@ def test_rows_do_not_depend_on_each_other() -> None:
 
 def pyramidal() -> tuple[Scene, list[list[int]]]:
     """Dimethylamine, and (N, C, C, H)."""
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     scene = prepare("smiles:CNC")
     nitrogen = scene.elements.index("N")

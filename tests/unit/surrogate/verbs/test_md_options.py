@@ -15,7 +15,7 @@ from md_reference.run.defaults import defaults
 from surrogate import api
 from surrogate.cli import main
 from surrogate.verbs.md_options import MDOptions, Preparation, flags_of
-from systems.prepare.source import prepare
+from systems.source import prepare
 
 FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
 # How many runs there are, whose settings, and what makes the box: no fields of MDConfig or ForceFieldSpec.

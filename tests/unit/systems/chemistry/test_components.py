@@ -14,8 +14,8 @@ from systems.chemistry.residues import template_for
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.prepare.peptide import build_peptide
-from systems.prepare.source import prepare
 from systems.scene import Scene
+from systems.source import prepare
 
 INSIDE = {"N": 1, "C": 1}
 

@@ -10,8 +10,8 @@ import pytest
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
-from systems.prepare.source import prepare
 from systems.scene import Scene
+from systems.source import prepare
 from systems.trajectory.pdb_text import pdb_text
 
 

@@ -12,8 +12,8 @@ from systems.errors import InputError
 from systems.library import named_scenes
 from systems.prepare.bonding import find_bonds
 from systems.prepare.heterogens import is_water
-from systems.prepare.read.pdb_records import AtomRecord
-from systems.prepare.source import prepare
+from systems.prepare.read.records import AtomRecord
+from systems.source import prepare
 from systems.trajectory.pdb_text import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")

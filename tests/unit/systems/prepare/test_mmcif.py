@@ -8,8 +8,8 @@ import pytest
 
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.prepare.read.pdb_records import read_structure
-from systems.prepare.source import prepare
+from systems.prepare.read.structure_text import read_structure
+from systems.source import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 COLUMNS = (

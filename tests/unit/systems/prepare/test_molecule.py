@@ -15,10 +15,10 @@ from rdkit.Chem import rdDepictor
 
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.prepare.embedding import refuse_changed_stereo, stereo_labels
 from systems.prepare.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles, to_rdkit
-from systems.prepare.source import prepare
+from systems.prepare.read.smiles import refuse_changed_stereo, stereo_labels
 from systems.scene import Scene
+from systems.source import prepare
 
 ACCEPTED = [c for c in cases() if not c.refusal]
 REFUSED = [c for c in cases() if c.refusal]

@@ -11,9 +11,9 @@ from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.prepare.clashes import check_contacts
-from systems.prepare.read.pdb_records import AtomRecord
-from systems.prepare.source import prepare
+from systems.prepare.read.records import AtomRecord
 from systems.scene import Scene
+from systems.source import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 ROWS = [

@@ -17,8 +17,8 @@ from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key
 from systems.errors import InputError, OutOfDomainError, PreparationError, SurromdError, UnknownNameError
 from systems.library import named_scenes
 from systems.prepare.peptide import parse_sequence
-from systems.prepare.source import prepare
 from systems.scene import Scene
+from systems.source import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 RESIDUES = [ALA2.residue_names[r] for r in ALA2.residue_of_atom]

@@ -14,12 +14,13 @@ from systems.library import named_scenes
 from systems.prepare.bonding import find_bonds
 from systems.prepare.handedness import compare, handedness, say_inverted
 from systems.prepare.heterogens import ligand_atoms
-from systems.prepare.modified_residues import standardise
 from systems.prepare.protonation import protonation_account
 from systems.prepare.read.hybrid36 import decode, encode
-from systems.prepare.read.pdb_records import AtomRecord, read_structure
+from systems.prepare.read.modified_residues import standardise
+from systems.prepare.read.records import AtomRecord
+from systems.prepare.read.structure_text import read_structure
 from systems.prepare.repair import _with_usual_lengths, complete
-from systems.prepare.source import prepare
+from systems.source import prepare
 from systems.trajectory.pdb_text import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")

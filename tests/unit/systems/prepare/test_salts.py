@@ -11,7 +11,7 @@ from rdkit.Chem import rdDistGeom
 
 from systems.errors import PreparationError
 from systems.prepare.molecule import to_rdkit
-from systems.prepare.source import prepare
+from systems.source import prepare
 
 
 @pytest.mark.parametrize(

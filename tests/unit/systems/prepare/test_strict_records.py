@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from systems.errors import InputError
-from systems.prepare.source import prepare
+from systems.source import prepare
 
 
 @pytest.fixture

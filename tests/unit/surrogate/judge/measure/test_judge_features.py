@@ -197,7 +197,7 @@ def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fol
 
 
 def test_small_molecules_have_every_rotatable_torsion() -> None:
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     kinds = {name: sorted((t.kind, t.fold) for t in find_torsions(prepare(f"smiles:{smiles}")))
              for name, smiles in (("aspirin", "CC(=O)Oc1ccccc1C(=O)O"), ("ethanol", "CCO"), ("benzene", "c1ccccc1"),

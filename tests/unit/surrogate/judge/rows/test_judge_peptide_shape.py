@@ -41,7 +41,7 @@ def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
 
 
 def test_ends_are_those_of_the_chain() -> None:
-    from systems.prepare.source import prepare
+    from systems.source import prepare
 
     scene = prepare("sequence:ACE-LYS-ALA-ARG-NME")
     ends = _ends(scene)

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from systems.chemistry.residues import template_for
-from systems.prepare.read.pdb_records import AtomRecord
+from systems.errors import listed
+from systems.prepare.read.records import AtomRecord
 
 D_RESIDUES = {
     "DAL": "ALA", "DAR": "ARG", "DSG": "ASN", "DAS": "ASP", "DCY": "CYS", "DGN": "GLN", "DGL": "GLU", "DHI": "HIS",
@@ -90,8 +91,3 @@ def _caps_apart(atoms: list[AtomRecord], notes: list[str]) -> list[AtomRecord]:
 def _is_near(atoms: Sequence[AtomRecord], i: int, others: Sequence[int]) -> bool:
     gaps = [np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom) for j in others]
     return bool(np.linalg.norm(gaps, axis=1).min() < _CAP_BOND_ANGSTROM)
-
-
-def listed(things: Sequence[str], most: int = 6) -> str:
-    """`A1, A2 and 5 more`, for messages."""
-    return ", ".join(things[:most]) + (f" and {len(things) - most} more" if len(things) > most else "")

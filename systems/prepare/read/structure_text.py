@@ -1,58 +1,20 @@
-"""PDB and mmCIF files as atom records: order and names of the file survive."""
+"""PDB and mmCIF files, read as atom records: order and names of the file survive."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from systems.errors import InputError
 from systems.files.outside import content
+from systems.prepare.read.mmcif_file import read_mmcif
+from systems.prepare.read.pdb_columns import read_pdb
+from systems.prepare.read.record_sorting import settle
+from systems.prepare.read.records import StructureFile
 
 _PDB_SUFFIXES = (".pdb", ".ent")
 _CIF_SUFFIXES = (".cif", ".mmcif")
 _FARTHEST_ANGSTROM = 9_999.0
-# Narrower than float(), which also takes 1_0.5, tabs and the digits of other alphabets.
-_COORDINATE = re.compile(r" *[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)? *|\s*[-+]?(nan|inf)\w*\s*", re.ASCII | re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class AtomRecord:
-    """One ATOM or HETATM record; positions in Å as the file has them."""
-
-    serial: str
-    name: str
-    altloc: str
-    residue_name: str
-    chain: str
-    residue_id: str
-    position_angstrom: tuple[float, float, float]
-    occupancy: float
-    element: str
-    hetero: bool
-
-    @property
-    def residue_key(self) -> tuple[str, str, str]:
-        """(chain, residue number with insertion code, residue name)."""
-        return self.chain, self.residue_id, self.residue_name
-
-
-@dataclass
-class StructureFile:
-    """The first model of a structure file: records in the file's order, the bonds it states, and what was passed over.
-
-    `conect` holds the pairs of CONECT, LINK and SSBOND records (`_struct_conn` in mmCIF), `chain_ends` the atoms that a
-    TER record follows, or with which a chain of mmCIF ends. An atom whose element is not known has the element "", and
-    `unknown` says where it stands.
-    """
-
-    atoms: list[AtomRecord]
-    conect: list[tuple[int, int]] = field(default_factory=list)
-    chain_ends: set[int] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
-    unknown: dict[int, str] = field(default_factory=dict)
 
 
 def read_structure(path: Path) -> StructureFile:
@@ -61,16 +23,10 @@ def read_structure(path: Path) -> StructureFile:
     Raises InputError (one line: the file, what is wrong, what to do) for a missing file, a directory, a suffix that is
     neither, bytes that are no text, a record that cannot be read, no atoms, or positions that are not finite.
     """
-    from systems.prepare.read.record_sorting import settle
-
     text = read_text(path)
     if is_mmcif(path):
-        from systems.prepare.read.mmcif_file import read_mmcif
-
         found = read_mmcif(text, path)
     else:
-        from systems.prepare.read.pdb_columns import read_pdb
-
         found = read_pdb(text, path)
     if not found.atoms and "_atom_site_fract_x" in text.lower():
         raise InputError(f"{path} is the CIF of a crystal, in fractions of its cell; give one molecule as SDF or PDB.")
@@ -93,14 +49,6 @@ def read_structure(path: Path) -> StructureFile:
 def is_mmcif(path: Path) -> bool:
     """Whether the suffix is one of mmCIF's."""
     return _suffix(path) in _CIF_SUFFIXES
-
-
-def coordinates(fields: Sequence[str]) -> tuple[float, float, float] | None:
-    """Return three coordinates written as plain decimal numbers, or None where one is written otherwise."""
-    if not all(_COORDINATE.fullmatch(text) for text in fields):
-        return None
-    x, y, z = (float(text) for text in fields)
-    return x, y, z
 
 
 def read_text(path: Path) -> str:

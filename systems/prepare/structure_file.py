@@ -1,4 +1,4 @@
-"""A Scene from what the user names: a library system, a structure file, a SMILES string or a peptide sequence."""
+"""A Scene from a structure file: what is in it is chosen, bonded, completed and checked, and each repair is said."""
 
 from __future__ import annotations
 
@@ -10,85 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from systems.chemistry.residues import template_for
-from systems.errors import InputError, PreparationError
-from systems.prepare.bonding import Bonding, Residue, find_bonds
+from systems.errors import PreparationError
+from systems.prepare.bonded_residues import Bonding, Residue
+from systems.prepare.bonding import find_bonds
 from systems.prepare.clashes import check_contacts
 from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
 from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
 from systems.prepare.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
-from systems.prepare.modified_residues import describe_residue, standardise
 from systems.prepare.read.mmcif_file import is_component
-from systems.prepare.read.mol_file import SUFFIXES, suffix_of
-from systems.prepare.read.pdb_records import AtomRecord, is_mmcif, read_structure, read_text
-from systems.prepare.read.peptide_mol2 import is_peptide_mol2, read_peptide_mol2
+from systems.prepare.read.modified_residues import describe_residue, standardise
+from systems.prepare.read.mol_file import suffix_of
+from systems.prepare.read.peptide_mol2 import read_peptide_mol2
+from systems.prepare.read.records import AtomRecord
+from systems.prepare.read.structure_text import is_mmcif, read_structure, read_text
 from systems.prepare.structure import scene_from_records
 from systems.prepare.waters import complete_waters
 from systems.scene import Scene
 
-_FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
-_OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
-
-
-def prepare(
-    spec: str,
-    *,
-    ph: float = 7.0,
-    keep_ligand: bool = False,
-    drop_ligand: bool = False,
-    drop_water: bool = False,
-    keep_water: bool = False,
-    cap_breaks: bool = False,
-) -> Scene:
-    """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
-    `sequence:ACE-ALA-NME`.
-
-    Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
-    line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
-    missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
-    them free ions, which no N, O or S of the rest holds, unless `keep_ligand`. Other ions and ligands beside a peptide
-    are refused until one says what becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
-    with the caps NME and ACE.
-    Raises UnknownNameError, InputError or PreparationError, each in one line.
-    """
-    from systems.library import named_scenes
-
-    if not 0.0 <= ph <= 14.0:
-        raise InputError(f"pH {ph:g} lies outside 0 to 14.")
-    if keep_ligand and drop_ligand:
-        raise InputError("--keep-ligand and --drop-ligand exclude each other; choose one.")
-    if keep_water and drop_water:
-        raise InputError("--keep-water and --drop-water exclude each other; choose one.")
-    text = str(spec).strip()
-    kind, _, rest = text.partition(":")
-    if kind.lower() == "sequence":
-        from systems.prepare.peptide import build_peptide
-
-        return build_peptide(rest, ph=ph)
-    if kind.lower() == "smiles":
-        from systems.prepare.molecule import scene_from_smiles
-
-        return scene_from_smiles(rest)
-    path = Path(text).expanduser()
-    if text in named_scenes.names():
-        return named_scenes.load(text)
-    suffix = suffix_of(path)
-    if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
-        from systems.prepare.molecule import scene_from_mol_file
-
-        return scene_from_mol_file(path)
-    if suffix in _OTHER_SUFFIXES:
-        raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
-    if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
-        return prepare_file(
-            path,
-            ph=ph,
-            keep_ligand=keep_ligand,
-            drop_ligand=drop_ligand,
-            keep_water=keep_water,
-            cap_breaks=cap_breaks,
-        )
-    return named_scenes.load(text)
 
 
 def prepare_file(
@@ -100,9 +39,9 @@ def prepare_file(
     keep_water: bool = False,
     cap_breaks: bool = False,
 ) -> Scene:
-    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `prepare`."""
+    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `systems.source.prepare`."""
     if is_mmcif(path) and is_component(text := read_text(path)):
-        from systems.prepare.read.component_file import scene_from_component
+        from systems.prepare.component_file import scene_from_component
 
         return scene_from_component(text, path)
     try:
