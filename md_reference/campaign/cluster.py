@@ -14,7 +14,7 @@ from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, ClusterSpec
 from md_reference.forces.small_molecules.programs import scratch_folder
-from md_reference.run.replicas import available_cores
+from md_reference.run.machine import available_cores
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt, stop_if_asked
 

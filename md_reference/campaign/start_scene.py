@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.campaign.campaign_file import SceneSpec, switches_of
-from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.forcefield import build_system, resolve
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from systems.errors import InputError

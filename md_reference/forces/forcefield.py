@@ -1,116 +1,25 @@
-"""Scene -> openmm.System: which force field and solvent, what goes together, and who builds it."""
+"""Build the openmm.System of a scene: settle the force field for it, and join what builds its parts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from systems.errors import InputError, PreparationError, UnknownNameError, nearest
+from md_reference.forces import born
+from md_reference.forces.mixture import is_water, merge, molecules_of
+from md_reference.forces.model_forces import build_model_system
+from md_reference.forces.nonstandard import build_chain, find_chain
+from md_reference.forces.quantum import build_quantum_system
+from md_reference.forces.small_molecules.gaff import parameters
+from md_reference.forces.small_molecules.prmtop import load_openmm
+from md_reference.forces.spec import MODEL, PROTEIN_FORCE_FIELDS, QUANTUM, ForceFieldSpec
+from md_reference.forces.template_files import cutoff_nm
+from md_reference.forces.templates import build_templated, uncovered_residue
+from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
-
-PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
-QUANTUM = "gfn2-xtb"
-MODEL = "model"
-_WITH_LIGANDS = tuple(f"{name}+gaff2" for name in PROTEIN_FORCE_FIELDS if name != "charmm36")
-FORCE_FIELDS = (*PROTEIN_FORCE_FIELDS, "gaff2", *_WITH_LIGANDS, QUANTUM, MODEL, "auto")
-IMPLICIT_SOLVENTS = ("obc2", "gbn2", "amber99-obc")
-EXPLICIT_SOLVENTS = ("tip3p", "opc")
-SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
-
-
-@dataclass(frozen=True)
-class ForceFieldSpec:
-    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; bonds to hydrogen are always constrained
-    when `constrain_hydrogens` (needed above 1 fs).
-
-    `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
-    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite, no constraints); 'model' for scenes with
-    `interactions`; 'auto', which `resolve` settles for a scene.
-
-    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
-    2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
-    for scenes with a periodic cell: `solvation.solvate`), 'vacuum', or 'auto'.
-    """
-
-    force_field: str = "ff14SB"
-    solvent: str = "obc2"
-    hydrogen_mass_da: float | None = 3.0
-    constrain_hydrogens: bool = True
-
-    def __post_init__(self) -> None:
-        if self.force_field not in FORCE_FIELDS:
-            raise UnknownNameError(
-                f"unknown force field {self.force_field!r}; known: {', '.join(FORCE_FIELDS)}."
-                + nearest(self.force_field, list(FORCE_FIELDS))
-            )
-        if self.solvent not in SOLVENTS:
-            raise UnknownNameError(
-                f"unknown solvent {self.solvent!r}; known: {', '.join(SOLVENTS)}."
-                + nearest(self.solvent, list(SOLVENTS))
-            )
-        if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
-            raise PreparationError("solvent 'amber99-obc' goes with --force-field ff99SB-ILDN; use obc2 otherwise.")
-        if self.force_field in (QUANTUM, MODEL) and self.solvent not in ("vacuum", "auto"):
-            raise PreparationError(f"{self.force_field} has no solvent; leave --solvent out or give vacuum.")
-        if self.force_field == "charmm36" and self.solvent == "opc":
-            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use --solvent tip3p.")
-
-    @staticmethod
-    def of(record: Mapping[str, Any]) -> ForceFieldSpec:
-        """Return what a trajectory's record, or the conditions of a training, say of the forces. Raises KeyError where
-        they name no force field or no solvent."""
-        return ForceFieldSpec(
-            record["force_field"],
-            record["solvent"],
-            record.get("hydrogen_mass_da"),
-            constrain_hydrogens=record.get("constrain_hydrogens", True),
-        )
-
-    @property
-    def is_explicit(self) -> bool:
-        """Whether the solvent is made of molecules, in a periodic cell."""
-        return self.solvent in EXPLICIT_SOLVENTS
-
-    @property
-    def is_born(self) -> bool:
-        """Whether there is a generalised Born term."""
-        return self.solvent in IMPLICIT_SOLVENTS
-
-    @property
-    def protein(self) -> str:
-        """The force field of peptides, water and ions."""
-        name = self.force_field.removesuffix("+gaff2")
-        return name if name in PROTEIN_FORCE_FIELDS else "ff14SB"
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is known to go badly together, one line each."""
-        found = []
-        name = self.protein
-        if self.is_born and name == "ff19SB":
-            found.append(f"ff19SB is tuned for OPC water; with {self.solvent} helices and turns are off. Use ff14SB.")
-        if self.is_born and name == "charmm36":
-            found.append(f"charmm36 was not made for {self.solvent}, whose radii are Amber's. Use ff14SB, or tip3p.")
-        if self.solvent == "tip3p" and name == "ff19SB":
-            found.append("ff19SB is tuned for OPC water; use --solvent opc.")
-        return tuple(found)
-
-
-def at_level(level: str | None, force_field: str | None) -> str | None:
-    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands.
-
-    Raises UnknownNameError, and InputError where the two contradict each other.
-    """
-    if level is None:
-        return force_field
-    if level not in ("mm", QUANTUM):
-        raise UnknownNameError(f"unknown level {level!r}; known: mm, {QUANTUM}." + nearest(level, ["mm", QUANTUM]))
-    if (level == QUANTUM) != (force_field == QUANTUM) and force_field not in (None, "auto"):
-        raise InputError(f"--level {level} contradicts --force-field {force_field}; give one of them.")
-    return QUANTUM if level == QUANTUM else force_field
+from systems.selection import part_of
 
 
 def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
@@ -144,11 +53,6 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
 
 def _choose(scene: Scene) -> str:
-    from md_reference.forces.mixture import is_water, molecules_of
-    from md_reference.forces.nonstandard import find_chain
-    from md_reference.forces.templates import uncovered_residue
-    from systems.selection import part_of
-
     rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene, m)]
     others = [m for m in rest if uncovered_residue(part_of(scene, m), "ff14SB") is not None]
     if not others:
@@ -169,16 +73,10 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:
-        from md_reference.forces.model_forces import build_model_system
-
         return build_model_system(scene)
     _check_cell(scene, spec)
     if spec.force_field == QUANTUM:
-        from md_reference.forces.quantum import build_quantum_system
-
         return build_quantum_system(scene)
-    from md_reference.forces.templates import build_templated
-
     if spec.force_field in PROTEIN_FORCE_FIELDS:
         system = build_templated(scene, spec, native_gb=native_gb)
     else:
@@ -189,8 +87,6 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
 
 
 def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
-    from md_reference.forces.templates import cutoff_nm
-
     if spec.is_explicit and scene.cell_nm is None:
         raise PreparationError(
             f"scene {scene.name!r} has no periodic cell for {spec.solvent} water; solvate it first (the command line "
@@ -213,12 +109,6 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
 
 def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     """GAFF2 molecules and chains with residues from GAFF2, alone or beside peptides, water and ions."""
-    from md_reference.forces import born
-    from md_reference.forces.mixture import is_water, merge, molecules_of
-    from md_reference.forces.nonstandard import build_chain, find_chain
-    from md_reference.forces.templates import build_templated, uncovered_residue
-    from systems.selection import part_of
-
     templated: list[IntArray] = []
     others: list[IntArray] = []
     for atoms in molecules_of(scene):
@@ -263,9 +153,6 @@ def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
     """Return the System of one GAFF2 molecule in vacuum."""
     from openmm import app, unit
 
-    from md_reference.forces.small_molecules.gaff import parameters
-    from md_reference.forces.small_molecules.prmtop import load_openmm
-
     return load_openmm(parameters(scene)).createSystem(
         nonbondedMethod=app.NoCutoff,
         constraints=app.HBonds if spec.constrain_hydrogens else None,
@@ -277,8 +164,6 @@ def _build_molecule(scene: Scene, spec: ForceFieldSpec) -> Any:
 
 def _use_pme(system: Any, spec: ForceFieldSpec) -> None:
     from openmm import NonbondedForce
-
-    from md_reference.forces.templates import cutoff_nm
 
     nonbonded = next(f for f in system.getForces() if isinstance(f, NonbondedForce))
     nonbonded.setNonbondedMethod(NonbondedForce.PME)

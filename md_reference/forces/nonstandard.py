@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from md_reference.forces.capped_residues import cap
 from md_reference.forces.regrouping import permuted, regroup
 from md_reference.forces.residue_templates import ResidueTemplate, make_template
-from md_reference.forces.templates import CHAIN_FILES, force_field_of, unmatched_residues
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
-
-if TYPE_CHECKING:
-    from md_reference.forces.forcefield import ForceFieldSpec
 
 
 @dataclass(frozen=True)

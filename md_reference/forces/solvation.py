@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.forcefield import ForceFieldSpec
-from md_reference.forces.templates import cutoff_nm
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.template_files import cutoff_nm
 from systems.chemistry.element_data import atomic_weight_da, covalent_radius_nm
 from systems.errors import InputError, PreparationError
 from systems.scene import FloatArray, Scene

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.forces.forcefield import ForceFieldSpec, resolve
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.integrators import check_ensemble
 from systems.errors import InputError
 from systems.files.outside import check_disk
@@ -84,6 +84,8 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
 
     Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
     """
+    from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
+
     _ = config.steps_per_frame
     check_disk(out, config.n_frames, scene.n_atoms)
     if config.columns and out.suffix.lower() == ".dcd":

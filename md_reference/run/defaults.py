@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any
 
-from md_reference.forces.forcefield import QUANTUM, ForceFieldSpec
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import MDConfig
 from systems.errors import InputError
 from systems.library import named_scenes

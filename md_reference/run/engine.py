@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
+from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.errors import SimulationError
 from systems.scene import FloatArray, Scene
@@ -37,13 +39,6 @@ class State:
     velocities_nm_ps: FloatArray | None = None
     forces_kj_mol_nm: FloatArray | None = None
     cell_nm: FloatArray | None = None
-
-
-def platform_properties(name: str, threads: int) -> dict[str, str]:
-    """Return the properties of a Context. More threads than one add up forces in a fixed order, so that runs repeat."""
-    if name != "CPU":
-        return {}
-    return {"Threads": str(threads)} | ({"DeterministicForces": "true"} if threads > 1 else {})
 
 
 def one_line(error: Exception) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.run.engine import one_line, platform_properties
+from md_reference.run.engine import one_line
+from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.errors import SimulationError
 from systems.scene import FloatArray, Scene

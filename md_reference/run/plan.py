@@ -7,14 +7,15 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
+from md_reference.run.machine import available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform
-from md_reference.run.replicas import available_cores
 from md_reference.run.timing import as_records
 from systems.scene import FloatArray, Scene
 from systems.selection import part_of

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from md_reference.run.timing import Timing, measuring_allowed, platforms, recall, remember, size_class
+import numpy as np
+
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.machine import platforms
+from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
 from systems.errors import UnknownNameError, nearest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from md_reference.forces.forcefield import ForceFieldSpec
-    from systems.scene import Scene
+from systems.scene import Scene
 
 # Up to so many atoms a thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
 # OpenMM 8.6.1 on peptides of 22 to 108 atoms: level with native OBC2 at 47 atoms on free cores (102 against 115
@@ -174,11 +175,7 @@ def _time(
     system: Callable[[], Any] | None,
     bath: tuple[float, float, float],
 ) -> list[Timing]:
-    import numpy as np
     import openmm
-
-    from md_reference.forces.forcefield import build_system
-    from md_reference.run.timing import time_platforms
 
     built = build_system(scene, spec) if system is None else system()
     n_virtual = built.getNumParticles() - scene.n_atoms

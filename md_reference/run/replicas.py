@@ -13,7 +13,9 @@ from typing import Any
 
 from md_reference.forces.forcefield import resolve
 from md_reference.run.config import MDConfig, check_run
+from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
+from md_reference.run.plan import line_of_run
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.simulate import PreparingFn, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, SurromdError
@@ -32,11 +34,6 @@ def replica_paths(out: Path, n_replicas: int) -> list[Path]:
     if n_replicas > _MOST_REPLICAS:
         raise InputError(f"{n_replicas:.4g} replicas are too many, {_MOST_REPLICAS} at most; use a campaign for more.")
     return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
-
-
-def available_cores() -> int:
-    """Cores this process may use (affinity respected where the system tells)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def simulate_replicas(
@@ -79,8 +76,6 @@ def simulate_replicas(
             side_by_side=width,
         )
         if announce is not None:
-            from md_reference.run.plan import line_of_run
-
             announce(line_of_run(scene, config, choice, replicas=len(outs)))
     if len(outs) == 1:
         how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}

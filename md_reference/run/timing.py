@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
-import platform as machine
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
+from md_reference.forces.small_molecules.parameter_cache import cache_folder
+from md_reference.run.machine import machine_name, platform_properties
 from systems.errors import SurromdError
 from systems.files.outside import content
 from systems.files.schema import parsed
@@ -52,28 +52,6 @@ def size_class(n_atoms: int) -> int:
     return round(math.log(max(n_atoms, 1)) / math.log(1.1))
 
 
-@cache
-def machine_name() -> str:
-    """Return what the speed depends on: processor, number of cores, version and platforms of OpenMM."""
-    import openmm
-
-    model = machine.processor()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass
-    return " | ".join([machine.machine(), model, f"{os.cpu_count()} cores", openmm.__version__, *platforms()])
-
-
-@cache
-def platforms() -> tuple[str, ...]:
-    """Return the names of OpenMM's platforms that are installed here."""
-    import openmm
-
-    return tuple(openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms()))
-
-
 def time_platforms(
     system: Any,
     positions_nm: Any,
@@ -99,7 +77,7 @@ def time_platforms(
         name, threads = candidate
         try:
             context = openmm.Context(
-                system, make_integrator(), openmm.Platform.getPlatform(name), _properties(name, threads)
+                system, make_integrator(), openmm.Platform.getPlatform(name), platform_properties(name, threads)
             )
             context.setPositions(positions_nm if relaxed is None else relaxed)
             context.computeVirtualSites()
@@ -138,12 +116,6 @@ def time_platforms(
     ]
 
 
-def _properties(name: str, threads: int) -> dict[str, str]:
-    from md_reference.run.engine import platform_properties
-
-    return platform_properties(name, threads)
-
-
 def _batch(context: Any, candidate: tuple[str, int], n_steps: int) -> tuple[float, float | None]:
     """Return the seconds of one step, and wall over processor time where the processor's is what counts."""
     one_core = candidate[0] in _ONE_CORE and candidate[1] == 1
@@ -162,8 +134,6 @@ def _batch(context: Any, candidate: tuple[str, int], n_steps: int) -> tuple[floa
 
 def cache_file() -> Path:
     """Where timings are remembered."""
-    from md_reference.forces.small_molecules.parameter_cache import cache_folder
-
     return cache_folder() / "platform-timings.json"
 
 

@@ -94,7 +94,7 @@ def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: in
 
     Raises InputError for weights that carry no velocities.
     """
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
 
     weights = load_weights(path)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
-from md_reference.forces.templates import PROTEIN_FILES, cutoff_nm, water_file
-from md_reference.run.engine import platform_properties
+from md_reference.forces.forcefield import build_system, resolve
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.template_files import PROTEIN_FILES, cutoff_nm, water_file
+from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import measured_platform
 from systems.scene import Scene
 

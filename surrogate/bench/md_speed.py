@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
-from md_reference.run.replicas import available_cores
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.md_setups import CASES, Case, Setup, ours, plain
 from systems.errors import InputError, SimulationError, SurromdError, nearest

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from md_reference.run.replicas import available_cores
+from md_reference.run.machine import available_cores
 from surrogate import api
 
 SCENE = "alanine-dipeptide"

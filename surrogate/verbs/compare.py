@@ -99,7 +99,8 @@ def _one_each(name: str, given: Any, n: int) -> list[Any]:
 
 def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArray[np.float64]], float]:
     """Return what gives the energy in kJ/mol of a frame with its stiff bonds at rest, infinity where there is none."""
-    from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+    from md_reference.forces.forcefield import build_system, resolve
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.frame_relaxation import Relaxer
     from systems.errors import SimulationError
 

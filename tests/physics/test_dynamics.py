@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from md_reference.run.replicas import simulate_replicas
 from md_reference.run.simulate import MDConfig, simulate

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine, State
 from md_reference.run.run_summary import correlation_frames, drift, mean_and_error
 from md_reference.run.simulate import MDConfig, simulate

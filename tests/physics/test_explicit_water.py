@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.solvation import solvate, solvate_if_asked
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError
 from systems.library.named_scenes import load

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from systems.errors import PreparationError, UnknownNameError
 from systems.scene import FloatArray, Scene

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.small_molecules import gaff, parameter_cache
 from md_reference.forces.small_molecules.ambertools import find_ambertools
 from md_reference.forces.small_molecules.prmtop import Prmtop, load_openmm
+from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene

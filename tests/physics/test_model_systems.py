@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
 from md_reference.forces.model_forces import build_model_system, build_nve_integrator, generate_n_body
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from systems.library.particles import (
     N_BODY,

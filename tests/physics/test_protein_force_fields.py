@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.small_molecules.ambertools import find_ambertools, run
+from md_reference.forces.spec import ForceFieldSpec
 from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
 from systems.source import prepare

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, at_level, resolve
+from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
+from md_reference.forces.spec import ForceFieldSpec, at_level
 from md_reference.run.defaults import settle
 from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError, UnknownNameError

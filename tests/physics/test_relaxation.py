@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import SimulationError

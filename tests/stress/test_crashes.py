@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from disk_model import LOSSES, NO_SPACE, Disk, watched
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.simulate import MDConfig, simulate
 from surrogate.data.weights import Weights
 from surrogate.sampling.runner import RolloutConfig, rollout

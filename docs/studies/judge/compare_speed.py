@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.run.replicas import available_cores
+from md_reference.run.machine import available_cores
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]

@@ -150,8 +150,9 @@ def _forces(scene: Any, charges: bool) -> tuple[str, str, float | None]:
     """Return the state, a message and the energy of the scene as it stands, kJ/mol, where forces were built."""
     import openmm
 
-    from md_reference.forces.forcefield import ForceFieldSpec, build_system
+    from md_reference.forces.forcefield import build_system
     from md_reference.forces.small_molecules.ambertools import find_ambertools
+    from md_reference.forces.spec import ForceFieldSpec
     from systems.errors import SurromdError
 
     started = subprocess.Popen.__init__

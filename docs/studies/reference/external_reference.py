@@ -137,7 +137,7 @@ def read_psi(paths: Sequence[Path], *, top: Path | None = None) -> list[FloatArr
 
 def run_ours(out_dir: Path, *, n_runs: int, time_ps: float, workers: int | None, quiet: bool = False) -> None:
     """Make the runs that are missing: seeds 200, 201, ..., one process each, `workers` at a time."""
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.replicas import simulate_replicas
     from md_reference.run.simulate import MDConfig
     from surrogate.progress import progress_bar

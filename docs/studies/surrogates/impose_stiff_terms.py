@@ -97,7 +97,8 @@ def energies(scene: Scene, conditions: dict[str, Any], frames_nm: FloatArray) ->
     import openmm
     from openmm import unit
 
-    from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+    from md_reference.forces.forcefield import build_system, resolve
+    from md_reference.forces.spec import ForceFieldSpec
 
     system = build_system(scene, resolve(scene, ForceFieldSpec.of(conditions)))
     context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))

@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=128)
     parser.add_argument("--steps", type=int, nargs="*", default=[1, 2, 3, 4], help="of leapfrog in a chunk")
     args = parser.parse_args()
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
 
     torch.set_num_threads(1)

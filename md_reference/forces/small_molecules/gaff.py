@@ -18,7 +18,7 @@ from md_reference.forces.small_molecules.charge_cost import announced, expected_
 from md_reference.forces.small_molecules.parameter_cache import Entry
 from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.forces.small_molecules.programs import scratch_folder
-from md_reference.forces.templates import CHAIN_FILES, force_field_of, unmatched_residues
+from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.errors import InputError, PreparationError, StorageError
 from systems.scene import FloatArray, Scene

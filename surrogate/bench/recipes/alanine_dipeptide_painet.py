@@ -83,7 +83,7 @@ def training_config(budget_s: float) -> PainetTraining:
 
 def make_reference(folder: Path, name: str, runs: Runs) -> list[Path]:
     """Run what is missing: ff14SB, OBC2, flexible bonds, natural masses, velocity Verlet, frames 1 fs apart."""
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.config import MDConfig
     from md_reference.run.replicas import replica_paths, simulate_replicas
     from systems.library.named_scenes import load
@@ -145,7 +145,7 @@ def short_runs(path: Path, frames: TrainingFrames, states: Iterable[tuple[FloatA
                source: dict[str, Any]) -> TrainingFrames:  # fmt: skip
     """Run OpenMM at constant energy from each state for SHORT_FRAMES frames; kept in a windows file. States that are
     beyond physics are left out."""
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
     from surrogate.data.frames import at_rest, load_frames, quantise
 

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig, settings_of
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import integrator_name
+from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
 from md_reference.run.platforms import PlatformChoice, measured_platform
-from md_reference.run.replicas import available_cores
 from surrogate.bench.recipes.peptide_list import Peptide, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
-from md_reference.run.engine import Engine, platform_properties
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.engine import Engine
+from md_reference.run.machine import platform_properties
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, rotatable_torsions
 from systems.scene import Scene

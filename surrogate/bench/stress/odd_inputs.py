@@ -155,7 +155,8 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
 
 def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
     """A frame `(n_atoms, 3)` nm of MD at 50 K more than the training's, None for weights that OpenMM cannot follow."""
-    from md_reference.forces.forcefield import ForceFieldSpec, resolve
+    from md_reference.forces.forcefield import resolve
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
 
     conditions, scene = weights.domain.conditions, weights.domain.scene

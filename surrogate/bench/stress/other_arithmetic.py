@@ -140,7 +140,8 @@ def measure_solvers(weights: Weights, *, chunks: int, seed: int = 0) -> list[dic
 def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
     """OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain does not
     say one of these, and what `Engine` raises."""
-    from md_reference.forces.forcefield import ForceFieldSpec, resolve
+    from md_reference.forces.forcefield import resolve
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
 
     conditions = domain.conditions

@@ -42,7 +42,8 @@ class Coupling:
     """
 
     def __init__(self, weights: Weights, *, platform: str = "auto") -> None:
-        from md_reference.forces.forcefield import ForceFieldSpec, build_system, resolve
+        from md_reference.forces.forcefield import build_system, resolve
+        from md_reference.forces.spec import ForceFieldSpec
         from md_reference.run.frame_relaxation import Relaxer
 
         self._scene, self._conditions = weights.domain.scene, weights.domain.conditions

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec, build_system
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.regrouping import permuted, regroup
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError

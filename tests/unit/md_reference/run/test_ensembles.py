@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import simulate as module
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, Engine
 from md_reference.run.platforms import PlatformChoice

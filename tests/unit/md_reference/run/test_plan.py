@@ -6,10 +6,10 @@ import json
 
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.machine import available_cores
 from md_reference.run.plan import make_plan
 from md_reference.run.platforms import choose_platform
-from md_reference.run.replicas import available_cores
 from systems.errors import UnknownNameError
 from systems.scene import Scene
 

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, StorageError, TrajectoryError, UnitError, UnknownNameError
 from systems.scene import Scene

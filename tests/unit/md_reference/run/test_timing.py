@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import platforms, timing
 from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
 from md_reference.run.timing import Timing, cache_file, recall, remember, size_class
@@ -39,7 +39,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[list[tuple[str, int]]]:
         speeds = {("CPU", 1): 40.0, ("CPU", 2): 15.0, ("Reference", 1): 50.0}
         return [Timing(*c, speeds.get(c)) for c in candidates]
 
-    monkeypatch.setattr(timing, "time_platforms", invent)
+    monkeypatch.setattr(platforms, "time_platforms", invent)
     return asked
 
 

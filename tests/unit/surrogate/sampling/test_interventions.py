@@ -105,7 +105,7 @@ def scatter(frames: Tensor, noise: Tensor) -> Tensor:
 @pytest.fixture(scope="module")
 def md(alanine_dipeptide: Scene) -> Iterator[np.ndarray]:
     """30 ps of MD, frames 0.1 ps apart, superposed: what the scripted model would have been trained on."""
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.engine import Engine
 
     with Engine(alanine_dipeptide, ForceFieldSpec("ff14SB", "obc2", 3.0), timestep_ps=0.002, seed=3) as engine:

@@ -119,7 +119,8 @@ def test_a_cycle_without_hydrogens_gets_them_and_stays_one(tmp_path: Path) -> No
 
 
 def test_a_phosphoserine_without_hydrogens_is_charged_and_covered(tmp_path: Path) -> None:
-    from md_reference.forces.forcefield import ForceFieldSpec, resolve
+    from md_reference.forces.forcefield import resolve
+    from md_reference.forces.spec import ForceFieldSpec
 
     scene = build_peptide("ACE-ALA-SER-ALA-NME")
     at = {scene.atom_names[i]: i for i in range(scene.n_atoms) if scene.residue_of_atom[i] == 2}

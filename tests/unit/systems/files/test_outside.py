@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.forcefield import ForceFieldSpec
 from md_reference.forces.small_molecules.parameter_cache import Entry, _read, store
+from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig, check_run
 from md_reference.run.replicas import replica_paths
 from systems.chemistry.distance_bonds import bonds_by_distance

@@ -168,7 +168,7 @@ def test_a_near_miss_is_told() -> None:
 
 
 def test_protocols_name_settings_that_runs_have() -> None:
-    from md_reference.forces.forcefield import ForceFieldSpec
+    from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.simulate import MDConfig
 
     known = {f.name for c in (MDConfig, ForceFieldSpec) for f in dataclasses.fields(c)} | {"ensemble"}

@@ -1,0 +1,110 @@
+"""What the forces of a scene are: the force field and the solvent, and what goes together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from systems.errors import InputError, PreparationError, UnknownNameError, nearest
+
+PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
+QUANTUM = "gfn2-xtb"
+MODEL = "model"
+_WITH_LIGANDS = tuple(f"{name}+gaff2" for name in PROTEIN_FORCE_FIELDS if name != "charmm36")
+FORCE_FIELDS = (*PROTEIN_FORCE_FIELDS, "gaff2", *_WITH_LIGANDS, QUANTUM, MODEL, "auto")
+IMPLICIT_SOLVENTS = ("obc2", "gbn2", "amber99-obc")
+EXPLICIT_SOLVENTS = ("tip3p", "opc")
+SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
+
+
+@dataclass(frozen=True)
+class ForceFieldSpec:
+    """What the forces are. `hydrogen_mass_da=None` leaves natural masses; bonds to hydrogen are always constrained
+    when `constrain_hydrogens` (needed above 1 fs).
+
+    `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
+    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite, no constraints); 'model' for scenes with
+    `interactions`; 'auto', which `resolve` settles for a scene.
+
+    `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
+    2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
+    for scenes with a periodic cell: `solvation.solvate`), 'vacuum', or 'auto'.
+    """
+
+    force_field: str = "ff14SB"
+    solvent: str = "obc2"
+    hydrogen_mass_da: float | None = 3.0
+    constrain_hydrogens: bool = True
+
+    def __post_init__(self) -> None:
+        if self.force_field not in FORCE_FIELDS:
+            raise UnknownNameError(
+                f"unknown force field {self.force_field!r}; known: {', '.join(FORCE_FIELDS)}."
+                + nearest(self.force_field, list(FORCE_FIELDS))
+            )
+        if self.solvent not in SOLVENTS:
+            raise UnknownNameError(
+                f"unknown solvent {self.solvent!r}; known: {', '.join(SOLVENTS)}."
+                + nearest(self.solvent, list(SOLVENTS))
+            )
+        if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
+            raise PreparationError("solvent 'amber99-obc' goes with --force-field ff99SB-ILDN; use obc2 otherwise.")
+        if self.force_field in (QUANTUM, MODEL) and self.solvent not in ("vacuum", "auto"):
+            raise PreparationError(f"{self.force_field} has no solvent; leave --solvent out or give vacuum.")
+        if self.force_field == "charmm36" and self.solvent == "opc":
+            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use --solvent tip3p.")
+
+    @staticmethod
+    def of(record: Mapping[str, Any]) -> ForceFieldSpec:
+        """Return what a trajectory's record, or the conditions of a training, say of the forces. Raises KeyError where
+        they name no force field or no solvent."""
+        return ForceFieldSpec(
+            record["force_field"],
+            record["solvent"],
+            record.get("hydrogen_mass_da"),
+            constrain_hydrogens=record.get("constrain_hydrogens", True),
+        )
+
+    @property
+    def is_explicit(self) -> bool:
+        """Whether the solvent is made of molecules, in a periodic cell."""
+        return self.solvent in EXPLICIT_SOLVENTS
+
+    @property
+    def is_born(self) -> bool:
+        """Whether there is a generalised Born term."""
+        return self.solvent in IMPLICIT_SOLVENTS
+
+    @property
+    def protein(self) -> str:
+        """The force field of peptides, water and ions."""
+        name = self.force_field.removesuffix("+gaff2")
+        return name if name in PROTEIN_FORCE_FIELDS else "ff14SB"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is known to go badly together, one line each."""
+        found = []
+        name = self.protein
+        if self.is_born and name == "ff19SB":
+            found.append(f"ff19SB is tuned for OPC water; with {self.solvent} helices and turns are off. Use ff14SB.")
+        if self.is_born and name == "charmm36":
+            found.append(f"charmm36 was not made for {self.solvent}, whose radii are Amber's. Use ff14SB, or tip3p.")
+        if self.solvent == "tip3p" and name == "ff19SB":
+            found.append("ff19SB is tuned for OPC water; use --solvent opc.")
+        return tuple(found)
+
+
+def at_level(level: str | None, force_field: str | None) -> str | None:
+    """Return the force field that a level of theory ('mm', 'gfn2-xtb' or None) leaves or demands.
+
+    Raises UnknownNameError, and InputError where the two contradict each other.
+    """
+    if level is None:
+        return force_field
+    if level not in ("mm", QUANTUM):
+        raise UnknownNameError(f"unknown level {level!r}; known: mm, {QUANTUM}." + nearest(level, ["mm", QUANTUM]))
+    if (level == QUANTUM) != (force_field == QUANTUM) and force_field not in (None, "auto"):
+        raise InputError(f"--level {level} contradicts --force-field {force_field}; give one of them.")
+    return QUANTUM if level == QUANTUM else force_field
