@@ -11,6 +11,7 @@ import numpy.typing as npt
 from surrogate.data.poses import order_along_axis
 from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, cover, torsion_environments
 from surrogate.sampling.lags import at_lag, choose_lag
+from surrogate.sampling.peptide_coverage import cover_peptide, unseen_neighbours
 from systems.chemistry.graph import bonded_graph
 from systems.chemistry.matching import match_atoms
 from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names
@@ -20,6 +21,7 @@ from systems.scene import Scene
 if TYPE_CHECKING:
     # Sampling and training know nothing of each other at run time: the api hands the weights over.
     from surrogate.data.weights import TrainingDomain, Weights
+    from surrogate.models.interface import Surrogate
 
 __all__ = [
     "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain", "match_scene",
@@ -32,31 +34,36 @@ TEMPERATURE_TOLERANCE_K = 0.5
 @dataclass(frozen=True, eq=False)
 class DomainMatch:
     """Model atom k is scene atom `order[k]`, `(n_atoms,)`; `deviations` are those that were overruled. `domain`: of the
-    one molecule that the scene is rolled as; `seen` whether that was trained on."""
+    one molecule that the scene is rolled as; `seen` whether that was trained on; `nearness`: of an unseen peptide, how
+    near training comes."""
 
     order: npt.NDArray[np.int64]
     domain: TrainingDomain
     deviations: tuple[Deviation, ...] = ()
     seen: bool = True
+    nearness: str = ""
 
     def remarks(self, weights: str) -> tuple[str, ...]:
         """Return what is to be said before the scene is rolled with weights of this name; nothing inside the domain."""
-        unseen = f"{weights} was not trained on this molecule; compare with MD of it before you trust the rollout"
+        near = f" ({self.nearness})" if self.nearness else ""
+        unseen = f"{weights} was not trained on this molecule{near}; compare with MD of it before you trust the rollout"
         beyond = (f"outside the training domain: {d.what}: {d.reason}" for d in self.deviations)
         return (*(() if self.seen else (unseen,)), *beyond)
 
 
 def find_deviations(
-    scene: Scene, domain: TrainingDomain, *, temperature_k: float | None = None
+    scene: Scene, domain: TrainingDomain, *, model: Surrogate | None = None, temperature_k: float | None = None
 ) -> tuple[Deviation, ...]:
     """Return how a scene leaves a training domain, the gravest first; nothing where the weights cover it.
+
+    `model`: of these weights; one that knows peptides by residues covers other sequences, too.
 
     Weights that know atoms by their bonds cover other molecules too: see `coverage.cover`. Compared are elements, the
     number of atoms, the total charge, bond types (elements and order), the surroundings of rotatable bonds,
     connectivity, stereo, the starting structure (by the validity of the training reference's frames) and the
     temperature, where one is asked for.
     """
-    return _compare(scene, domain, temperature_k).deviations
+    return _compare(scene, domain, model, temperature_k).deviations
 
 
 def match_domain(
@@ -68,7 +75,7 @@ def match_domain(
     stereoisomer, a strained start and another temperature can, and the rollout's record says so.
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
-    found = _compare(scene, weights.domain, temperature_k)
+    found = _compare(scene, weights.domain, weights.model, temperature_k)
     deviations = found.deviations
     barred = [d for d in deviations if not d.forcible]
     if not barred and (force or not deviations):
@@ -110,11 +117,17 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     return match_domain(scene, weights).order
 
 
-def _compare(scene: Scene, domain: TrainingDomain, temperature_k: float | None) -> DomainMatch:
+def _compare(scene: Scene, domain: TrainingDomain, model: Surrogate | None, temperature_k: float | None) -> DomainMatch:
     own, beyond = cover(scene, domain)
     seen = not domain.transferable or any(own.scene is member.scene for member in domain.members)
     found, order = list(beyond), np.arange(0)
-    if not seen:
+    nearness = ""
+    if not seen and model is not None and model.knows_chains:
+        own, order, beyond = cover_peptide(scene, domain, model.config)
+        found = list(beyond)
+        new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
+        nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"
+    elif not seen:
         order = order_along_axis(scene)
     elif not beyond:
         order, found = _compare_molecules(scene, own.scene)
@@ -125,7 +138,7 @@ def _compare(scene: Scene, domain: TrainingDomain, temperature_k: float | None) 
     if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
         reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
         found.append(Deviation("temperature", reason, forcible=True))
-    return DomainMatch(order, own, tuple(found), seen)
+    return DomainMatch(order, own, tuple(found), seen, nearness)
 
 
 def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.int64], list[Deviation]]:

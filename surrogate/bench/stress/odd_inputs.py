@@ -134,7 +134,7 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
     geometry = Geometry.from_dict(weights.domain.geometry)
     rows = []
     for name, scene in odd_scenes(weights, seed):
-        deviations = find_deviations(scene, weights.domain)
+        deviations = find_deviations(scene, weights.domain, model=weights.model)
         row: dict[str, Any] = {"input": name, "outcome": "refused" if deviations else "run"}
         row["reasons"] = ", ".join(d.what for d in deviations)
         try:

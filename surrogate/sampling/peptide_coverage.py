@@ -1,0 +1,77 @@
+"""Peptides that weights by residues cover: any chain of residues that were trained on, whatever its sequence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from surrogate.data.features.peptide_chains import chain_features
+from surrogate.data.features.standard_peptide import standard_peptide
+from surrogate.data.poses import in_standard_pose
+from surrogate.sampling.coverage import Deviation
+from systems.chemistry.validity import INVALID, check_frames, flag_names, geometry_from_scene
+from systems.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import TrainingDomain
+    from surrogate.models.peptides.model import PeptideConfig
+    from systems.scene import Scene
+
+
+def cover_peptide(
+    scene: Scene, domain: TrainingDomain, config: PeptideConfig
+) -> tuple[TrainingDomain, npt.NDArray[np.int64], tuple[Deviation, ...]]:
+    """Return the domain of an unseen peptide, the order of its atoms in the model, and how it leaves the training.
+
+    The molecule is the scene under standard names; a valid frame has the bond lengths and angles that residues of its
+    kinds have on average in the training references. A residue, or an end of a chain, that no training peptide has
+    cannot be forced; more residues than any of them has, and a strained start, can.
+    """
+    try:
+        standard, order = standard_peptide(scene)
+        chain = chain_features(standard, config)
+    except InputError as error:
+        return domain, np.arange(0), (Deviation("residues", str(error).rstrip("."), forcible=False),)
+    found = []
+    most = max(_n_amino_acids(member.scene) for member in domain.members)
+    if _n_amino_acids(standard) > most:
+        found.append(
+            Deviation("size", f"{_n_amino_acids(standard)} amino acids; trained on up to {most}", forcible=True)
+        )
+    tokens = chain.code.encode(torch.tensor(standard.positions_nm))
+    turning = torch.zeros(tokens.numel(), dtype=torch.bool)
+    turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
+    usual = chain.code.decode(torch.where(turning, tokens.flatten(), 0.0).reshape(tokens.shape))
+    geometry = geometry_from_scene(standard.with_positions(usual.double().numpy()))
+    flags = int(check_frames(standard.positions_nm, geometry)[0]) & INVALID
+    if flags:
+        reason = f"the starting structure is unlike frames of such residues ({', '.join(flag_names(flags))})"
+        found.append(Deviation("start", reason, forcible=True))
+    conditions = {
+        key: value if all(member.conditions.get(key) == value for member in domain.members) else None
+        for key, value in domain.conditions.items()
+    }
+    own = replace(
+        domain, scene=in_standard_pose(standard), conditions=conditions, geometry=geometry.to_dict(), limits=None,
+        further=(), transferable=False,
+    )  # fmt: skip
+    return own, order, tuple(found)
+
+
+def unseen_neighbours(scene: Scene, domain: TrainingDomain) -> list[str]:
+    """Return the pairs of neighbouring residues of a standard peptide that no training peptide has, as 'LEU-SER'."""
+    known = {pair for member in domain.members for pair in _pairs(member.scene)}
+    return [f"{a}-{b}" for a, b in dict.fromkeys(_pairs(scene)) if (a, b) not in known]
+
+
+def _pairs(scene: Scene) -> list[tuple[str, str]]:
+    return list(pairwise(scene.residue_names))
+
+
+def _n_amino_acids(scene: Scene) -> int:
+    return sum(name not in ("ACE", "NME", "NH2") for name in scene.residue_names)

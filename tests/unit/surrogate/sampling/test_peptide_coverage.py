@@ -1,0 +1,115 @@
+"""Weights by residues cover sequences that training never saw, under any program's names; and say where they end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.features.peptide_chains import chain_features
+from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.splits import Split
+from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.trainer import PeptideSubject, _with_scale, normalise
+from surrogate.sampling.domain import find_deviations, match_domain
+from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.training.provenance import training_domain
+from systems.errors import OutOfDomainError
+from systems.prepare.peptide import build_peptide
+from systems.scene import Scene
+from systems.selection import reordered
+from systems.trajectory.codec import open_trajectory
+
+TRAINED = ("ACE-ALA-NME", "ACE-SER-NME", "ACE-ALA-SER-NME")
+SMALL = PeptideConfig(width=32, n_layers=1, n_heads=2, chunk_frames=4, longest_ps=40.0)
+
+
+def trembling(name: str) -> TrainingFrames:
+    scene = build_peptide(name)
+    x = scene.positions_nm + 0.003 * np.random.default_rng(0).normal(size=(200, scene.n_atoms, 3))
+    conditions = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0}
+    posed = quantise(canonicalise(x, scene))
+    return TrainingFrames(scene, posed, np.array([0, 200]), 1.0, True, conditions, (), split=Split(0.2))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Weights:
+    sets = [trembling(name) for name in TRAINED]
+    config = _with_scale(SMALL, sets)
+    torch.manual_seed(0)
+    model = PeptideSlide(config)
+    normalise(model, [PeptideSubject(f, chain_features(f.scene, config)) for f in sets], 0)
+    domains = [training_domain(f, strides=(1, 2)) for f in sets]
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    save_weights(path, model, replace(domains[0], further=tuple(domains[1:]), transferable=True), {})
+    return load_weights(path)
+
+
+def as_another_program(scene: Scene, seed: int = 0) -> Scene:
+    """Atoms shuffled within residues and all hydrogens renamed, as files of other programs have them."""
+    rng = np.random.default_rng(seed)
+    order = np.concatenate([
+        rng.permutation(np.flatnonzero(scene.residue_of_atom == r)) for r in range(len(scene.residue_names))
+    ])  # fmt: skip
+    mixed = reordered(scene, order)
+    names = tuple(
+        f"H{k}" if e == "H" else n for k, (n, e) in enumerate(zip(mixed.atom_names, mixed.elements, strict=True))
+    )
+    return replace(mixed, atom_names=names)
+
+
+def test_an_unseen_sequence_is_covered_under_any_names(weights: Weights) -> None:
+    built = build_peptide("ACE-SER-ALA-NME")
+    scene = as_another_program(built)
+    found = match_domain(scene, weights)
+    assert not found.deviations and not found.seen
+    assert found.domain.scene.atom_names == built.atom_names
+    i, j = built.bonds.T
+    ours, theirs = scene.positions_nm[found.order], built.positions_nm
+    assert np.allclose(np.linalg.norm(ours[i] - ours[j], axis=1), np.linalg.norm(theirs[i] - theirs[j], axis=1))
+    remark = found.remarks("small")[0]
+    assert "SER-ALA" in remark and "ALA-NME" not in remark
+
+
+def test_a_peptide_that_was_trained_on_is_seen(weights: Weights) -> None:
+    found = match_domain(as_another_program(build_peptide("ACE-ALA-SER-NME")), weights)
+    assert found.seen and found.remarks("small") == ()
+
+
+@pytest.mark.parametrize("sequence", ["ACE-GLY-NME", "ALA-SER"])
+def test_residues_and_ends_without_training_are_refused_for_good(weights: Weights, sequence: str) -> None:
+    for force in (False, True):
+        with pytest.raises(OutOfDomainError, match="residues: "):
+            match_domain(build_peptide(sequence), weights, force=force)
+
+
+def test_d_residues_are_refused(weights: Weights) -> None:
+    scene = build_peptide("ACE-SER-ALA-NME")
+    mirrored = scene.with_positions(scene.positions_nm * np.array([1.0, 1.0, -1.0]))
+    assert [d.what for d in find_deviations(mirrored, weights.domain, model=weights.model)] == ["residues"]
+
+
+def test_longer_and_strained_peptides_roll_when_forced(weights: Weights) -> None:
+    long = build_peptide("ACE-SER-ALA-SER-NME")
+    assert [d.what for d in find_deviations(long, weights.domain, model=weights.model)] == ["size"]
+    assert match_domain(long, weights, force=True).deviations
+    scene = build_peptide("ACE-SER-ALA-NME")
+    strained = scene.with_positions(1.5 * scene.positions_nm)
+    assert [d.what for d in find_deviations(strained, weights.domain, model=weights.model)] == ["start"]
+
+
+def test_an_unseen_peptide_rolls_in_the_order_of_its_file(weights: Weights, tmp_path: Path) -> None:
+    scene = as_another_program(build_peptide("ACE-SER-ALA-NME"), 3)
+    rollout(scene, weights, [tmp_path / "out.h5"], RolloutConfig(time_ps=40.0, seed=1, guard="flag"))
+    with open_trajectory(tmp_path / "out.h5") as reader:
+        assert reader.scene.atom_names == scene.atom_names
+        x = reader.read().astype(np.float64)
+    i, j = scene.bonds.T
+    lengths = np.linalg.norm(x[:, i] - x[:, j], axis=-1)
+    start = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1)
+    assert np.abs(lengths - start).max() < 0.03
+    assert np.abs(lengths - np.roll(start, 1)).max() > 0.03, "bonds of another order would be seen"
