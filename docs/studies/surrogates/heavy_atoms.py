@@ -4,7 +4,7 @@ REF... --test REF...`.
 Three LaM-SLidE of alanine dipeptide (or another peptide with phi and psi) are trained for the same time: of all atoms,
 of heavy atoms whose hydrogens are placed (`train --hydrogens placed`), and of residues (`train --entities residue`).
 Each draws one chunk from frames of a trajectory that it never saw, beside MD from the same frames (see
-`surrogate.bench.lags`), and is timed. What is finished in FOLDER is not done again.
+`surrogate.bench.lag_errors`), and is timed. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogate.bench.lags import Row, evenly_started, hold_against
+from surrogate.bench.lag_errors import Row, evenly_started, hold_against
 from systems.chemistry.validity import Geometry
 from systems.units import parse_wall_s
 

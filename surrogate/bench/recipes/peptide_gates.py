@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.bench.lags import Row, evenly_started, hold_against, joint_distance, table, torsions
+from surrogate.bench.lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
 from systems.chemistry.validity import Geometry
 
 if TYPE_CHECKING:

@@ -1,0 +1,147 @@
+"""Rules of the source tree that neither ruff nor import-linter checks. Each has a negative control."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import grimp
+import networkx as nx
+import pytest
+
+PACKAGES = ("systems", "md_reference", "surrogate")
+MOST_FILES = 15
+MOST_LINES = 400
+MOST_PARAMETERS = 8
+# What every architecture or room has one of.
+COMMON_NAMES = {"__init__", "config", "model", "base", "trainer"}
+
+# Each list may only become shorter: a line goes when what it names is mended.
+LONG_FILES = {
+    "surrogate/cli/main.py": "options are still spelled out verb by verb",
+}
+CIRCLES = {
+    "systems.scene": "a Scene makes its own graph and PDB text",
+    "systems.trajectory.base": "readers and writers find each other by suffix",
+}
+MANY_PARAMETERS = {
+    "surrogate/api.py:train": "the documented call; its settings become a Config",
+    "surrogate/cli/bench_verbs.py:cost_error": "typer: one parameter an option",
+    "surrogate/cli/bench_verbs.py:stress": "typer: one parameter an option",
+    "surrogate/cli/main.py:reference": "typer: one parameter an option",
+    "surrogate/cli/main.py:train": "typer: one parameter an option",
+    "surrogate/cli/main.py:rollout": "typer: one parameter an option",
+    "surrogate/cli/main.py:compare": "typer: one parameter an option",
+    "surrogate/cli/reproduce_verb.py:reproduce": "typer: one parameter an option",
+    "surrogate/verbs/compare.py:compare": "the verbs' settings become Configs",
+    "surrogate/verbs/reference.py:reference": "the verbs' settings become Configs",
+    "surrogate/verbs/rollout.py:rollout": "the verbs' settings become Configs",
+    "surrogate/judge/comparison.py:_judge": "the comparison's conditions, one by one",
+    "surrogate/judge/rows/block_means.py:shift_row": "the fields of a row, by name",
+    "surrogate/judge/rows/rows.py:observable_row": "the fields of a row, by name",
+    "surrogate/judge/rows/shape/contact_rows.py:_mean_row": "the fields of a row, by name",
+    "surrogate/judge/rows/shape/wasserstein_rows.py:_row": "the fields of a row, by name",
+    "surrogate/models/lam_slide/objectives.py:flow_loss": "the loss' tensors, by name",
+    "surrogate/models/lam_slide/trainer.py:_stage_one": "what both stages share is not yet one value",
+    "surrogate/models/lam_slide/trainer.py:_stage_two": "what both stages share is not yet one value",
+    "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
+    "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",
+    "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
+    "surrogate/training/loop.py:run_stage": "callbacks beside the settings",
+    "md_reference/run/engine.py:__init__": "settings of the bath, one by one",
+    "md_reference/run/plan.py:make_plan": "settings of the run, one by one",
+    "md_reference/run/platforms.py:measured_platform": "settings of the run, one by one",
+    "md_reference/run/replicas.py:simulate_replicas": "callbacks beside the settings",
+    "md_reference/run/replicas.py:_replica": "what a process gets",
+    "md_reference/run/simulate.py:simulate": "callbacks beside the settings",
+    "surrogate/bench/cost_error/sweep.py:cost_error": "settings of the sweep, one by one",
+    "surrogate/bench/reproduce/md17.py:reproduce_molecules": "settings of the task, one by one",
+    "surrogate/bench/reproduce/n_body.py:reproduce": "settings of the task, one by one",
+}
+
+
+def sources(root: Path) -> list[Path]:
+    """Return the files of code below `root`: the packages and the studies."""
+    return sorted(f for top in (*PACKAGES, "docs/studies") for f in (root / top).rglob("*.py"))
+
+
+def crowded_folders(files: Iterable[Path]) -> dict[Path, int]:
+    counts: dict[Path, int] = defaultdict(int)
+    for file in files:
+        counts[file.parent] += file.name != "__init__.py"
+    return {folder: n for folder, n in counts.items() if n > MOST_FILES}
+
+
+def repeated_names(root: Path) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for package in PACKAGES:
+        by_name: dict[str, list[Path]] = defaultdict(list)
+        for file in (root / package).rglob("*.py"):
+            by_name[file.stem].append(file)
+        found |= {n: files for n, files in by_name.items() if len(files) > 1 and n not in COMMON_NAMES}
+    return found
+
+
+def long_files(files: Iterable[Path]) -> list[Path]:
+    return [file for file in files if file.read_text().count("\n") > MOST_LINES]
+
+
+def wide_functions(file: Path) -> Iterator[str]:
+    """Yield the functions of a file that take more parameters than a reader keeps in mind."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            if len(names) - (names[:1] in (["self"], ["cls"])) > MOST_PARAMETERS:
+                yield node.name
+
+
+def circles(*packages: str) -> list[list[str]]:
+    """Return the groups of modules that import each other, imports inside functions and for types alone included."""
+    graph = grimp.build_graph(*packages, exclude_type_checking_imports=False, cache_dir=None)
+    edges = ((m, other) for m in graph.modules for other in graph.find_modules_directly_imported_by(m))
+    return sorted(sorted(group) for group in nx.strongly_connected_components(nx.DiGraph(edges)) if len(group) > 1)
+
+
+def test_a_folder_holds_at_most_fifteen_files(repository: Path, tmp_path: Path) -> None:
+    assert not crowded_folders([*sources(repository), *(repository / "tests").rglob("*.py")])
+    assert crowded_folders(tmp_path / f"room_{k}.py" for k in range(MOST_FILES + 1)) == {tmp_path: MOST_FILES + 1}
+
+
+def test_no_name_stands_twice_in_a_package(repository: Path, tmp_path: Path) -> None:
+    assert not repeated_names(repository)
+    for room in ("surrogate/data", "surrogate/judge"):
+        (tmp_path / room).mkdir(parents=True)
+        (tmp_path / room / "frames.py").touch()
+        (tmp_path / room / "config.py").touch()
+    assert list(repeated_names(tmp_path)) == ["frames"]
+
+
+def test_a_file_has_at_most_four_hundred_lines(repository: Path, tmp_path: Path) -> None:
+    assert {str(f.relative_to(repository)) for f in long_files(sources(repository))} <= LONG_FILES.keys()
+    (tmp_path / "long.py").write_text("\n" * (MOST_LINES + 1))
+    assert long_files(tmp_path.iterdir()) == [tmp_path / "long.py"]
+
+
+def test_a_function_has_at_most_eight_parameters(repository: Path, tmp_path: Path) -> None:
+    found = {f"{file.relative_to(repository)}:{name}" for file in sources(repository) for name in wide_functions(file)}
+    assert found <= MANY_PARAMETERS.keys()
+    (tmp_path / "wide.py").write_text(
+        "class A:\n"
+        "    def fits(self, a, b, c, d, *, e, f, g, h): ...\n"
+        "    def is_wide(self, a, b, c, d, *, e, f, g, h, i): ...\n"
+    )
+    assert list(wide_functions(tmp_path / "wide.py")) == ["is_wide"]
+
+
+def test_no_modules_import_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown = [group for group in circles(*PACKAGES) if not CIRCLES.keys() & set(group)]
+    assert not unknown
+    room = tmp_path / "circular_example"
+    room.mkdir()
+    (room / "__init__.py").touch()
+    (room / "first.py").write_text("from circular_example.second import b\n\na = b\n")
+    (room / "second.py").write_text("def b():\n    from circular_example import first\n\n    return first.a\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert circles("circular_example") == [["circular_example.first", "circular_example.second"]]
