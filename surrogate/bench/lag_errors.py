@@ -1,4 +1,6 @@
-"""Error against lag of a LaM-SLidE that takes it: `python -m surrogate.bench.lag_errors FOLDER --train REF... --test REF...`.
+"""Error against lag of a LaM-SLidE that takes it.
+
+`python -m surrogate.bench.lag_errors FOLDER --train REF... --test REF...`
 
 One model is trained on alanine dipeptide (or another peptide with phi and psi) for all spacings of frames up to
 `--longest-lag-ps`. At each of some lags it is started from frames of a trajectory that it never saw, which are in
