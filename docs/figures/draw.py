@@ -1,0 +1,117 @@
+"""Draw the figures of README and manual: `python docs/figures/draw.py [DEMO_FOLDER]`.
+
+`cost_error.svg` is made of docs/results/tables/cost_error.json; `overlay.png` of the trajectories that `surromd demo`
+left in DEMO_FOLDER, and left as it is without one.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+TABLE = HERE.parent / "results" / "tables" / "cost_error.json"
+# of one core, from the same measurement (docs/results/alanine_dipeptide.md)
+ROLLED_NS, FLOOR = 20.0, 0.058
+KT_KJ_PER_MOL = 2.494
+
+
+def numbers(cell: str) -> list[float]:
+    """Return the numbers in a cell: '0.167 [0.153, 0.186]' -> [0.167, 0.153, 0.186]."""
+    return [float(n) for n in re.findall(r"\d+(?:\.\d+)?", cell)]
+
+
+def draw_cost_error(table: dict[str, Any], out: Path) -> None:
+    """Draw distance to the truth against processor seconds: the surrogate's settings, and MD after as many seconds."""
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    seconds = np.array([ROLLED_NS * numbers(row["s/ns"])[0] for row in rows])
+    md = np.array([numbers(row["MD, same seconds"])[0] for row in rows])
+    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    order = np.argsort(seconds)
+    # the table rounds to two digits
+    axes.plot(seconds[order], md[order], "x:", color="black", lw=0.9, label="OpenMM, the same seconds")
+    for solver, colour in (("fitted", "#d62728"), ("multistep", "#1f77b4")):
+        axes.plot([], [], "o", color=colour, label=f"surrogate, solver {solver}")
+        for x, row in zip(seconds, rows, strict=True):
+            name = row["solver, steps"].replace("`", "")
+            if not name.startswith(solver):
+                continue
+            y, low, high = numbers(row["distance"])
+            axes.errorbar(x, y, [[y - low], [high - y]], color=colour, marker="o", capsize=2, lw=1)
+            steps = int(numbers(name)[0])
+            where = {"xytext": (6, -11), "textcoords": "offset points", "fontsize": 8}
+            axes.annotate(f"{steps} steps", (x, y), color=colour, **where)
+    axes.axhline(FLOOR, color="black", lw=0.8, ls=":", label="two runs of 100 ns of MD (12 min each)")
+    axes.set(
+        xlabel=f"processor seconds of one core ({ROLLED_NS:g} ns of rollout)",
+        ylabel="Jensen-Shannon distance of φ/ψ maps",
+        ylim=(0, 0.3),
+        xlim=(10, 29),
+    )
+    axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 0.2))
+    figure.savefig(out, metadata={"Date": None})
+    plt.close(figure)
+
+
+def dihedrals(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
+    """Return φ and ψ (n_frames,) in degrees of all frames of trajectories of one peptide with one residue of each."""
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
+    from systems.trajectory.codec import open_trajectory
+
+    frames, quads = [], {}
+    for path in paths:
+        trajectory = open_trajectory(path)
+        quads = backbone_torsions(trajectory.scene)
+        frames.append(trajectory.read())
+    positions = np.concatenate(frames)
+    phi, psi = (np.degrees(torsion(positions, quads[name])[:, 0]) for name in ("phi", "psi"))
+    return phi, psi
+
+
+def draw_overlay(demo: Path, out: Path) -> None:
+    """Draw φ/ψ free energies of the demo's reference and surrogate side by side, and one laid over the other."""
+    edges = np.linspace(-180, 180, 49)
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    maps = {}
+    for title, pattern in (("OpenMM", "reference_r*.h5"), ("surrogate", "surrogate_r*.h5")):
+        phi, psi = dihedrals(sorted(p for p in demo.glob(pattern) if not p.name.endswith(".meta.h5")))
+        counts = np.histogram2d(phi, psi, bins=(edges, edges))[0].T
+        with np.errstate(divide="ignore"):
+            energy = -KT_KJ_PER_MOL * np.log(counts / counts.max())
+        maps[f"{title}, {1e-3 * len(phi):g} ns"] = np.where(counts > 0, energy, np.nan)
+    figure, panels = plt.subplots(1, 3, figsize=(9.2, 3.2), sharex=True, sharey=True, layout="constrained")
+    for panel, (title, energy) in zip(panels, maps.items(), strict=False):
+        image = panel.pcolormesh(edges, edges, energy, cmap="viridis", vmin=0, vmax=15, rasterized=True)
+        panel.set_title(title, fontsize=10)
+    figure.colorbar(image, ax=panels[1], label="kJ/mol", shrink=0.85)
+    levels = [2.5, 5.0, 10.0]
+    for energy, colour, style in zip(maps.values(), ("black", "#d62728"), ("-", "--"), strict=True):
+        filled = np.where(np.isnan(energy), 20.0, energy)
+        panels[2].contour(centres, centres, filled, levels, colors=colour, linestyles=style, linewidths=1)
+    panels[2].plot([], [], "k-", label="OpenMM")
+    panels[2].plot([], [], "--", color="#d62728", label="surrogate")
+    panels[2].legend(frameon=False, fontsize=8, loc="lower right")
+    panels[2].set_title("2.5, 5 and 10 kJ/mol", fontsize=10)
+    panels[0].set_ylabel("ψ (°)")
+    for panel in panels:
+        panel.set(xlabel="φ (°)", xlim=(-180, 180), ylim=(-180, 180), aspect="equal")
+        panel.set_xticks([-120, 0, 120])
+        panel.set_yticks([-120, 0, 120])
+    figure.savefig(out, dpi=130)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    draw_cost_error(json.loads(TABLE.read_text(encoding="utf-8")), HERE / "cost_error.svg")
+    if len(sys.argv) > 1:
+        draw_overlay(Path(sys.argv[1]), HERE / "overlay.png")
