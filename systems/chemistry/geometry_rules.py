@@ -23,6 +23,9 @@ _TOLERATED_SHARE = 1e-3
 _CLASH_WITHOUT_FRAMES_NM = (0.1, 0.1, 0.2)
 _CLASH_AT_MOST_NM = (0.14, 0.14, 0.24)
 _CLASH_SHARE_OF_LEAST = 0.8
+# Of unit vectors to three neighbours: 0.77 where a fourth is missing, 0 where there is none.
+_PYRAMID = 0.4
+_FRAMES_FOR_SHAPE = 200
 
 
 def n_pairs(n_atoms: int) -> int:
@@ -66,7 +69,8 @@ def measured_rules(scene: Scene, positions_nm: FloatArray) -> dict[str, Any]:
         raise InputError("None of the reference frames is finite.")
     frames = positions_nm if finite.all() else positions_nm[finite]
     ring_idx = _flat_ring_torsions(scene, lambda quads: _means(frames, quads))
-    bonds, stereo_idx, omega_idx = rules["bond_idx"], rules["stereo_idx"], rules["omega_idx"]
+    bonds, omega_idx = rules["bond_idx"], rules["omega_idx"]
+    stereo_idx = np.concatenate([rules["stereo_idx"], centres_without_hydrogen(scene, frames)])
     mean, std = _bond_lengths(frames, bonds)
     pairs = _pairs_by_kind(rules) if n_pairs(scene.n_atoms) <= MAX_PAIRS else []
     n_broken, n_positive = np.zeros(len(bonds)), np.zeros(len(stereo_idx))
@@ -98,6 +102,27 @@ def measured_rules(scene: Scene, positions_nm: FloatArray) -> dict[str, Any]:
         seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
         rules["clash_min_nm"] = np.minimum(_CLASH_SHARE_OF_LEAST * seen, _CLASH_AT_MOST_NM)
     return rules
+
+
+def centres_without_hydrogen(scene: Scene, positions_nm: FloatArray) -> IntArray:
+    """Return rows (centre, a, b, c), `(k, 4)`, of carbons whose hydrogen is not in the scene: three neighbours of three
+    kinds, and not flat in frames `(n_frames, n_atoms, 3)` nm.
+
+    The fourth neighbour lies where the three leave room, so that the sign of their volume is the handedness.
+    """
+    from systems.chemistry.graph import atom_classes
+
+    neighbours = scene.neighbours()
+    rows = [(i, *around) for i, around in enumerate(neighbours) if scene.elements[i] == "C" and len(around) == 3]
+    if not rows:
+        return np.empty((0, 4), dtype=np.int64)
+    found = np.array(rows, dtype=np.int64)
+    frames = positions_nm[:: max(1, len(positions_nm) // _FRAMES_FOR_SHAPE)].astype(np.float64)
+    arms = frames[:, found[:, 1:]] - frames[:, found[:, :1]]
+    arms /= np.maximum(np.linalg.norm(arms, axis=-1, keepdims=True), 1e-9)
+    found = found[np.abs(np.linalg.det(arms).mean(axis=0)) > _PYRAMID]
+    classes = atom_classes(scene)
+    return found[[len(set(classes[row[1:]].tolist())) == 3 for row in found]].reshape(-1, 4)
 
 
 class _Labels:

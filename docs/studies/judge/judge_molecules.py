@@ -34,33 +34,34 @@ class Molecule:
     kind: str
     scene: str
     time_ps: float
-    n_replicas: int = 6
+    n_replicas: int = 3
     every_ps: float = 1.0
 
 
 MOLECULES = (
-    Molecule("butane", "small molecule", "smiles:CCCC", 5000.0),
-    Molecule("glycol", "small molecule", "smiles:OCCO", 2000.0),
-    Molecule("methylcyclohexane", "small molecule", "smiles:CC1CCCCC1", 2000.0),
-    Molecule("aspirin", "drug", "smiles:CC(=O)Oc1ccccc1C(=O)O", 3000.0),
-    Molecule("paracetamol", "drug", "smiles:CC(=O)Nc1ccc(O)cc1", 2000.0),
-    Molecule("caffeine", "drug", "smiles:Cn1c(=O)c2c(ncn2C)n(C)c1=O", 1000.0),
-    Molecule("ibuprofen", "drug", "smiles:CC(C)Cc1ccc(cc1)C(C)C(=O)O", 2000.0),
-    Molecule("lidocaine", "drug", "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 2000.0),
-    Molecule("valine", "peptide", "ACE-VAL-NME", 2000.0, 3),
-    Molecule("chignolin", "protein", "chignolin", 60.0, 3, 0.2),
-    Molecule("trialanine", "peptide", "ac-ala3-nhme", 300.0, 3),
-    Molecule("SDFS", "peptide", "SDFS", 200.0, 3),
-    Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 20.0, 3, 0.1),
+    Molecule("butane", "small molecule", "smiles:CCCC", 20_000.0, 4),
+    Molecule("glycol", "small molecule", "smiles:OCCO", 50_000.0, 4, 2.0),
+    Molecule("methylcyclohexane", "small molecule", "smiles:CC1CCCCC1", 5000.0, 4),
+    Molecule("aspirin", "drug", "smiles:CC(=O)Oc1ccccc1C(=O)O", 10_000.0, 4),
+    Molecule("paracetamol", "drug", "smiles:CC(=O)Nc1ccc(O)cc1", 20_000.0),
+    Molecule("caffeine", "drug", "smiles:Cn1c(=O)c2c(ncn2C)n(C)c1=O", 2000.0),
+    Molecule("ibuprofen", "drug", "smiles:CC(C)Cc1ccc(cc1)C(C)C(=O)O", 10_000.0),
+    Molecule("lidocaine", "drug", "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 10_000.0),
+    Molecule("valine", "peptide", "ACE-VAL-NME", 4000.0),
+    Molecule("trialanine", "peptide", "ac-ala3-nhme", 1000.0),
+    Molecule("SDFS", "peptide", "SDFS", 500.0),
+    Molecule("chignolin", "protein", "chignolin", 300.0, every_ps=0.5),
+    Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 40.0, every_ps=0.2),
 )
 
 
-def make_runs(molecule: Molecule, folder: Path) -> list[Path]:
-    """Simulate what is missing of the replicas of a molecule; return their files."""
+def make_runs(molecule: Molecule, folder: Path, first_seed: int = 0) -> list[Path]:
+    """Simulate what is missing of the replicas of a molecule, seeds from `first_seed` on; return their files."""
     from surrogate import api
 
-    paths = [folder / f"{molecule.name}_{k}.h5" for k in range(molecule.n_replicas)]
-    for seed, path in enumerate(paths):
+    seeds = range(first_seed, first_seed + molecule.n_replicas)
+    paths = [folder / f"{molecule.name}_{seed}.h5" for seed in seeds]
+    for seed, path in zip(seeds, paths, strict=True):
         if not path.exists():
             part = path.with_name(f"{path.stem}.part.h5")
             api.reference(
@@ -85,7 +86,7 @@ def load_runs(paths: Sequence[Path]) -> list[Ensemble]:
     return [first, *(load_ensemble([path], template=first.scene) for path in paths[1:])]
 
 
-def count_all(molecules: Sequence[Molecule], folder: Path) -> dict[str, Alarms]:
+def count_all(molecules: Sequence[Molecule], folder: Path, first_seed: int = 0) -> dict[str, Alarms]:
     """Return the false alarms of each molecule; what was counted is kept in `folder/NAME.json` and not repeated."""
     found = {}
     for molecule in molecules:
@@ -94,7 +95,7 @@ def count_all(molecules: Sequence[Molecule], folder: Path) -> dict[str, Alarms]:
             found[molecule.name] = Alarms(**json.loads(kept.read_text()))
             continue
         start = time.monotonic()
-        found[molecule.name] = count_alarms(load_runs(make_runs(molecule, folder)), molecule.time_ps)
+        found[molecule.name] = count_alarms(load_runs(make_runs(molecule, folder, first_seed)), molecule.time_ps)
         kept.write_text(json.dumps(vars(found[molecule.name])))
         spent = time.monotonic() - start
         sys.stdout.write(f"{molecule.name} ({molecule.kind}), {spent:.0f} s: {report(found[molecule.name])}\n")
@@ -115,15 +116,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="runs and counts are kept here")
     parser.add_argument("--only", nargs="*", default=None, metavar="NAME", help="these molecules")
+    parser.add_argument("--first-seed", type=int, default=0, help="fresh replicas (in a FOLDER of their own)")
     parser.add_argument("--simulate-only", action="store_true", help="make the runs, judge nothing")
     args = parser.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     chosen = [m for m in MOLECULES if args.only is None or m.name in args.only]
     if args.simulate_only:
         for molecule in chosen:
-            make_runs(molecule, args.out)
+            make_runs(molecule, args.out, args.first_seed)
         return
-    found = count_all(chosen, args.out)
+    found = count_all(chosen, args.out, args.first_seed)
     sys.stdout.write(f"all {len(found)} molecules: {report(together(list(found.values())))}\n")
 
 

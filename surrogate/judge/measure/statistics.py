@@ -22,6 +22,8 @@ MIN_BLOCKS = 4
 MAX_BLOCKS = 100
 BLOCK_IN_CORRELATION_TIMES = 10
 ENOUGH_AS_FAR = 100
+# Beyond this an interval of a logarithm says that nothing is known, and its ends overflow.
+_WIDEST_LOG = 20.0
 
 
 class Piece(NamedTuple):
@@ -145,8 +147,8 @@ def estimate(value: float, draws: npt.ArrayLike, n_blocks: int, *, log: bool = F
     if log and math.isfinite(log_error):
         logs = np.log(array)
         low, high = np.quantile(logs, [0.025, 0.975]) - logs.mean()
-        factor = widen * t_over_normal
-        bounds = value * math.exp(factor * low), value * math.exp(factor * high)
+        half = min(widen * t_over_normal * max(-low, high), _WIDEST_LOG)
+        bounds = value * math.exp(-half), value * math.exp(half)
     else:
         low, high = np.quantile(array, [0.025, 0.975]) - array.mean()
         bounds = value + widen * t_over_normal * low, value + widen * t_over_normal * high
@@ -161,21 +163,35 @@ def mean_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estimate:
 def difference_p(a: Estimate, b: Estimate, *, log: bool = False) -> float:
     """Return the two-sided p-value of a = b: Student's t of the difference over the combined standard error.
 
-    With `log` the logarithms are compared. Two numbers without any spread give 1 when equal and 0 when not; NaN when
-    one of them is not finite.
+    The error is that of two unequal variances (Welch, Biometrika 34, 28, 1947) or, where it is larger, that of one
+    variance for all blocks: of few blocks one in many has far too small a spread by chance. With `log` the logarithms
+    are compared. Two numbers without any spread give 1 when equal and 0 when not; NaN when one of them is not finite.
     """
     from scipy.special import stdtr
 
     if log and a.value > 0 and b.value > 0 and math.isfinite(a.log_error) and math.isfinite(b.log_error):
-        gap, combined = abs(math.log(a.value / b.value)), math.hypot(a.log_error, b.log_error)
+        gap, errors = abs(math.log(a.value / b.value)), (a.log_error, b.log_error)
     else:
-        gap, combined = abs(a.value - b.value), math.hypot(a.error, b.error)
-    if not (math.isfinite(gap) and math.isfinite(combined)):
+        gap, errors = abs(a.value - b.value), (a.error, b.error)
+    if not (math.isfinite(gap) and math.isfinite(sum(errors))):
         return math.nan
-    if combined == 0.0:
+    if max(errors) == 0.0:
         return 1.0 if gap == 0.0 else 0.0
-    freedom = max(min(a.n_blocks, b.n_blocks) - 1, 1)
+    combined, freedom = _combined(errors, (a.n_blocks, b.n_blocks))
     return float(2.0 * stdtr(freedom, -gap / combined))
+
+
+def _combined(errors: tuple[float, float], n_blocks: tuple[int, int]) -> tuple[float, float]:
+    """Return the standard error of a difference and its degrees of freedom; see `difference_p`."""
+    each = [max(n - 1, 1) for n in n_blocks]
+    unequal = math.hypot(*errors)
+    of_block = [error**2 * (free + 1) for error, free in zip(errors, each, strict=True)]
+    common = sum(v * free for v, free in zip(of_block, each, strict=True)) / sum(each)
+    equal = math.sqrt(common * sum(1.0 / (free + 1) for free in each))
+    if equal > unequal * (1.0 + 1e-9):
+        return equal, float(sum(each))
+    shares = [(error / unequal) ** 2 for error in errors]
+    return unequal, 1.0 / sum(share**2 / free for share, free in zip(shares, each, strict=True))
 
 
 def pooled(a: Estimate, b: Estimate, *, log: bool = False) -> Estimate:

@@ -24,6 +24,7 @@ MAX_DRAWN_LAGS = 240
 _MIN_BOUNDARIES = 20
 _MOST_RELAXING = 6
 _SHARE_OF_WINDOW = 0.85
+_NORMAL_KURTOSIS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,23 +127,27 @@ def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: 
     time = float(kinetics.correlation_time(curve))
     below = np.flatnonzero(~(curve > 0))
     crossing = int(below[0]) if len(below) else n_lags
-    draws = _widened(np.concatenate(times), sample.blocks.n_blocks, crossing, sum(map(len, series)))
+    draws = _widened(np.concatenate(times), sample.blocks.n_blocks, crossing, series)
     return _Correlated(curve, time, draws, kept, np.concatenate(values))
 
 
-def _widened(draws: FloatArray, n_blocks: int, crossing: int, n_frames: int) -> FloatArray:
+def _widened(draws: FloatArray, n_blocks: int, crossing: int, series: Sequence[FloatArray]) -> FloatArray:
     """Return bootstrap draws of an integrated autocorrelation time, spread as the sum over so many lags is at least.
 
     Blocks cut off what is remembered beyond them, so that their draws know too little of the tail: the relative
-    variance of a sum to lag W over n frames is 2 (2 W + 1) / n (Madras and Sokal, J. Stat. Phys. 50, 109, 1988), of
-    which `_SHARE_OF_WINDOW` is left where the window ends at the first zero (measured on series of known time).
+    variance of a sum to lag W over n frames is (k - 1) (2 W + 1) / n, with k = 3, the kurtosis of a normal series, in
+    Madras and Sokal (J. Stat. Phys. 50, 109, 1988); what is seldom visited has a greater one, and few visits to tell
+    its time by. `_SHARE_OF_WINDOW` is left where the window ends at the first zero (measured on series of known time).
     """
     known = np.isfinite(draws) & (draws > 0)
     if known.sum() < 2 or n_blocks < 2:
         return draws
     logs = np.log(draws[known])
     spread = float(logs.std()) * widening(n_blocks)
-    least = _SHARE_OF_WINDOW * math.sqrt(2.0 * (2.0 * crossing + 1.0) / n_frames)
+    values = np.concatenate(series)
+    values = values[np.isfinite(values)] - np.nanmean(values)
+    kurtosis = max(float((values**4).mean() / max(float((values**2).mean()) ** 2, 1e-300)), _NORMAL_KURTOSIS)
+    least = _SHARE_OF_WINDOW * math.sqrt((kurtosis - 1.0) * (2.0 * crossing + 1.0) / len(values))
     if not 0.0 < spread < least:
         return draws
     out = draws.copy()

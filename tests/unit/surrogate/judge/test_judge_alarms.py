@@ -7,9 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from judge_alarms import Alarms, count_alarms, cut, fair_trios, report
+from judge_alarms import (
+    Alarms,
+    count_alarms,
+    count_intervals,
+    cut,
+    fair_trios,
+    report,
+    report_intervals,
+)
 
+from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.motion import relaxation_rows
 from systems.errors import InputError
 
 
@@ -38,6 +48,21 @@ def test_a_run_that_is_not_like_the_others_is_an_alarm(runs: list[Ensemble]) -> 
     assert found.n_alarms >= 1 and any(key.startswith("bond") for key in found.rows), report(found)
     with pytest.raises(InputError, match="Fewer than three runs"):
         count_alarms(runs[:2], 700.0)
+
+
+def test_intervals_of_relaxation_times_are_counted(runs: list[Ensemble], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six pieces, one psi each; negative control: intervals a tenth as wide hold less often."""
+    found = count_intervals(runs, 350.0)
+    assert found.n == 6 and found.n_held >= 5 and list(found.times_ps) == ["ALA 2"]
+    assert "of 6 intervals hold" in report_intervals(found)
+    made = relaxation_rows.estimate
+
+    def narrow(value: float, draws: np.ndarray, n_blocks: int, *, log: bool = False) -> Estimate:
+        whole = made(value, draws, n_blocks, log=log)
+        return replace(whole, low=value - 0.1 * (value - whole.low), high=value + 0.1 * (whole.high - value))
+
+    monkeypatch.setattr(relaxation_rows, "estimate", narrow)
+    assert count_intervals(runs, 350.0).n_held < found.n_held
 
 
 def test_the_share_is_tested_against_one_in_twenty() -> None:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
@@ -67,12 +68,15 @@ def test_blocks_shorter_than_the_correlation_time_do_not_cover() -> None:
     assert coverage(0.9, 3, 2, n_experiments=40) < 0.75
 
 
-def test_log_interval_stays_positive_and_is_asymmetric() -> None:
+def test_log_interval_stays_positive_and_is_as_wide_to_either_side_as_to_the_wider() -> None:
     rng = np.random.default_rng(3)
     found = statistics.estimate(1.0, np.exp(rng.normal(0.2, 0.8, 2000)), 20, log=True)
-    assert 0 < found.low < 1 < found.high
-    assert found.high - 1 > 1 - found.low
+    assert 0 < found.low < 1 < found.high and found.low * found.high == pytest.approx(1.0)
     assert found.log_error == pytest.approx(0.8, rel=0.1)
+    skewed = np.exp(-rng.exponential(0.8, 2000))
+    for draws in (skewed, 1 / skewed):
+        wide = statistics.estimate(1.0, draws, 20, log=True)
+        assert wide.high == pytest.approx(found.high, rel=0.8) and wide.high > found.high, "the long side decides"
 
 
 def test_an_estimate_of_nothing_has_no_interval() -> None:
@@ -89,6 +93,24 @@ def test_difference_of_equal_and_of_distant_numbers() -> None:
     assert statistics.difference_p(still, still) == 1.0
     assert statistics.difference_p(still, Estimate(1.1, error=0.0)) == 0.0
     assert math.isnan(statistics.difference_p(a, Estimate(math.nan)))
+
+
+def test_few_blocks_with_a_small_spread_by_chance_are_no_alarm() -> None:
+    """Means of 4 and of 80 blocks of one distribution: p < 0.001 once in a thousand times, not several times as often,
+    as with Welch's error alone (negative control); a shift of three spreads of a block is mostly seen."""
+    rng, n_trials, level = np.random.default_rng(11), 4000, 1e-3
+    few, many = rng.standard_normal((n_trials, 4)), rng.standard_normal((n_trials, 80))
+
+    def made(blocks: np.ndarray) -> list[Estimate]:
+        errors = blocks.std(axis=1, ddof=1) / math.sqrt(blocks.shape[1])
+        return [Estimate(m, error=e, n_blocks=blocks.shape[1]) for m, e in zip(blocks.mean(1), errors, strict=True)]
+
+    fair = [statistics.difference_p(a, b) for a, b in zip(made(few), made(many), strict=True)]
+    shifted = [statistics.difference_p(a, b) for a, b in zip(made(few + 3.0), made(many), strict=True)]
+    welch = scipy.stats.ttest_ind(few, many, axis=1, equal_var=False).pvalue
+    assert np.mean(np.array(fair) < level) <= 2 * level
+    assert np.mean(welch < level) > 2 * level, "negative control"
+    assert np.mean(np.array(shifted) < level) > 0.5
 
 
 def test_permutation_p_is_uniform_under_the_null_and_small_off_it() -> None:

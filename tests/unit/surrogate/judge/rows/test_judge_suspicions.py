@@ -93,17 +93,32 @@ def test_a_topology_that_does_not_fit_is_refused(simulate: Callable[..., Ensembl
 def test_a_check_that_could_not_be_made_is_not_zero(
     simulate: Callable[..., Ensemble], alanine_dipeptide: Scene
 ) -> None:
-    """Without hydrogens the stereocentre of alanine cannot be told: no count, and the reason says why."""
-    three = [simulate(k, 200) for k in (51, 52, 53)]
-    heavy = np.array([i for i, e in enumerate(alanine_dipeptide.elements) if e != "H"])
+    """Without the atoms beside it a stereocentre cannot be told: no count, and the reason says why."""
     from systems.selection import part_of
 
-    bare = three[1].restricted(heavy, part_of(alanine_dipeptide, heavy))
+    three = [simulate(k, 200) for k in (51, 52, 53)]
+    backbone = np.array([i for i, n in enumerate(alanine_dipeptide.atom_names) if n in ("N", "CA", "C", "O", "CH3")])
+    bare = three[1].restricted(backbone, part_of(alanine_dipeptide, backbone))
     whole = compare(three[0], [three[1]], three[2], options=OPTIONS).judgements[0]
     part = compare(three[0], [bare], three[2], options=OPTIONS).judgements[0]
     assert whole.faults[1].counts["stereocentre inverted"] == 0
-    if "stereocentre inverted" not in part.faults[1].counts:
-        assert "not checked" in dict(part.skipped)["Stereocentres"]
+    assert "stereocentre inverted" not in part.faults[1].counts
+    assert "not checked" in dict(part.skipped)["Stereocentres"]
+
+
+def test_a_mirror_image_without_its_hydrogens_is_seen(
+    simulate: Callable[..., Ensemble], alanine_dipeptide: Scene
+) -> None:
+    """Three neighbours of a centre tell its handedness; negative control: the fair run has none inverted."""
+    from systems.selection import part_of
+
+    three = [simulate(k, 200) for k in (51, 52, 53)]
+    heavy = alanine_dipeptide.heavy_idx
+    bare = three[1].restricted(heavy, part_of(alanine_dipeptide, heavy))
+    mirrored = replace(bare, segments=[bare.segments[0] * np.array([-1, 1, 1], dtype=np.float32)], label="mirror")
+    fair, wrong = compare(three[0], [bare, mirrored], three[2], options=OPTIONS).judgements
+    assert fair.faults[1].counts["stereocentre inverted"] == 0
+    assert wrong.faults[1].counts["stereocentre inverted"] == 200 and wrong.status == "broken"
 
 
 def test_a_replicate_that_differs_is_not_the_candidates_fault(simulate: Callable[..., Ensemble]) -> None:
