@@ -3,8 +3,11 @@
 `lag`: one model of alanine dipeptide (or any one peptide with phi and psi), trained for a number of steps on `--train`,
 is started from frames of `--test`, which it never saw. At each lag: the correlation of cos psi one lag later and the
 joint phi/psi distance, beside MD from the same starts; and Chapman and Kolmogorov's test: ten steps of 10 ps against
-one of 100 ps, beside two halves of MD. `--plain` trains without innovations, the ablation. What is finished in FOLDER
-is not done again.
+one of 100 ps, beside two halves of MD. `--plain` trains without innovations, the ablation.
+
+`pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (a folder of `peptide_runs`), the
+model rolls each molecule below `--test` (a campaign's folder) as long and as often as MD did. Distances over MD's own
+scatter, beside the library of monomers' torsions (`peptide_scores`). What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
@@ -21,16 +24,22 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
+from surrogate.bench.recipes.peptide_list import training_peptides
 from systems.chemistry.validity import Geometry
+from systems.errors import InputError
 
 if TYPE_CHECKING:
+    from surrogate.bench.recipes.peptide_scores import Scores
     from surrogate.data.frames import TrainingFrames
     from surrogate.data.weights import Weights
+    from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
 LAGS_PS = (1, 3, 10, 30, 100, 300, 1000)
 STEPS = 7300
 STARTS = 5000
+# Frames of rollouts and of MD are compared so far apart.
+FRAMES_PS = 10.0
 _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
 
 
@@ -87,21 +96,73 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse, train, measure, print the table and keep it in FOLDER."""
+def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
+    """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
+
+    Raises InputError when fewer pairs have runs.
+    """
+    from surrogate.data.frames import collect_frames
+    from surrogate.models.lam_slide.trainer import is_trained
+    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
+
+    if is_trained(out):
+        return
+    known = [p for p in training_peptides() if p.capped and len(p.residues) <= 2]
+    found = [(p, sorted((runs / p.name).glob("run_*.h5"))) for p in known]
+    singles = [files for p, files in found if files and len(p.residues) == 1]
+    doubles = [files for p, files in found if files and len(p.residues) == 2][:n_pairs]
+    if len(doubles) < n_pairs:
+        raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
+    sets = [collect_frames(files) for files in singles + doubles]
+    train_peptides(sets, out, PeptideConfig(), PeptideTraining(steps=steps), resume=True)
+
+
+def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
+    """Return the distances of one test molecule: MD's own, the model's, and those of the library of `monomers`.
+
+    The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
+    """
+    from surrogate.bench.recipes.peptide_scores import angles, floor, library, score, turns_of
+    from surrogate.sampling.runner import RolloutConfig, rollout
+
+    scene, truth, time_ps = _thinned(runs)
+    turns = turns_of(scene)
+    outs = [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))]
+    if not all(out.exists() for out in outs):
+        folder.mkdir(parents=True, exist_ok=True)
+        rollout(scene, weights, outs, RolloutConfig(time_ps, lag_ps=FRAMES_PS, seed=1, guard="off"), overwrite=True)
+    rolled = [_thinned([out])[1][0] for out in outs]
+    truth, rolled = [angles(turns, x) for x in truth], [angles(turns, x) for x in rolled]
+    names = [name for name in scene.residue_names if name not in ("ACE", "NME")]
+    alone = [_thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
+    own = [turns_of(of) for of, _, _ in alone]
+    values = [angles(t, np.concatenate(x)) for t, (_, x, _) in zip(own, alone, strict=True)]
+    rng = np.random.default_rng(0)
+    drawn = [library(turns, values, own, len(truth[0]), rng) for _ in runs]
+    return [floor(turns, truth), score(turns, truth, rolled, "model"), score(turns, truth, drawn, "library")]
+
+
+def _thinned(paths: Sequence[Path]) -> tuple[Scene, list[FloatArray], float]:
+    """Return the scene, the frames FRAMES_PS apart of each file, and the time that the first one spans."""
+    from systems.trajectory.codec import open_trajectory
+
+    frames = []
+    for path in paths:
+        with open_trajectory(path) as reader:
+            every = max(1, round(FRAMES_PS / float(reader.time_ps[1] - reader.time_ps[0])))
+            frames.append(reader.read(every - 1, None, every).astype(np.float64))
+            scene = reader.scene
+    if scene is None:
+        raise InputError(f"{paths[-1]} does not say what molecule it is of.")
+    return scene, frames, len(frames[0]) * FRAMES_PS
+
+
+def lag_gate(a: argparse.Namespace) -> None:
+    """Train on one peptide, measure each lag and Chapman and Kolmogorov's test, print and keep the table."""
     from surrogate.data.frames import collect_frames
     from surrogate.data.weights import load_weights
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("gate", choices=("lag",))
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
-    parser.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
-    parser.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
-    parser.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
-    parser.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
-    a = parser.parse_args(arguments)
-    a.folder.mkdir(parents=True, exist_ok=True)
     name = "lag-plain" if a.plain else "lag"
     train(a.train, a.folder / f"{name}.safetensors", steps=a.steps, innovation=not a.plain)
     weights, test = load_weights(a.folder / f"{name}.safetensors"), collect_frames(list(a.test))
@@ -114,6 +175,63 @@ def main(arguments: Sequence[str] | None = None) -> None:
     record: dict[str, Any] = {"provenance": weights.provenance, "rows": [asdict(row) for row in rows], **found}
     (a.folder / f"{name}.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(table(rows) + "\n" + "\n".join(f"{what}: {value:.3f}" for what, value in found.items()) + "\n")
+
+
+def pairs_gate(a: argparse.Namespace) -> None:
+    """Train on each number of pairs, roll every test molecule, print and keep the table."""
+    from surrogate.data.weights import load_weights
+
+    rows = []
+    for n_pairs in a.pairs:
+        out = a.folder / f"pairs-{n_pairs}.safetensors"
+        train_on_pairs(a.train, out, n_pairs, steps=a.steps)
+        weights = load_weights(out)
+        for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
+            runs = sorted(molecule.rglob("*_r?.h5"))
+            if len(runs) < 2:
+                continue
+            for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name):
+                rows.append({"pairs": n_pairs, "molecule": molecule.name, **asdict(scores)})
+            sys.stderr.write(f"{n_pairs} pairs: {molecule.name} measured\n")
+    (a.folder / "pairs.json").write_text(json.dumps(rows, indent=1))
+    sys.stdout.write(pairs_table(rows) + "\n")
+
+
+def pairs_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the rows as Markdown, distances as multiples of MD's own."""
+    lines = [
+        "| pairs | molecule | source | torsions | over floor | joint maps | over floor |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    least: dict[str, Any] = {}
+    for row in rows:
+        least = row if row["source"] == "MD" else least
+        lines.append(
+            f"| {row['pairs']} | {row['molecule']} | {row['source']} "
+            f"| {row['single']:.3f} ± {row['single_error']:.3f} | {row['single'] / least['single']:.2f} "
+            f"| {row['joint']:.3f} ± {row['joint_error']:.3f} | {row['joint'] / least['joint']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse and run one gate."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    gates = parser.add_subparsers(dest="gate", required=True)
+    lag, pairs = gates.add_parser("lag"), gates.add_parser("pairs")
+    for gate in (lag, pairs):
+        gate.add_argument("folder", type=Path)
+        gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
+    lag.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
+    lag.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
+    lag.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
+    lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
+    pairs.add_argument("--train", type=Path, required=True, help="folder of `peptide_runs`")
+    pairs.add_argument("--test", type=Path, required=True, help="folder of a campaign of molecules never trained on")
+    pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
+    a = parser.parse_args(arguments)
+    a.folder.mkdir(parents=True, exist_ok=True)
+    {"lag": lag_gate, "pairs": pairs_gate}[a.gate](a)
 
 
 if __name__ == "__main__":

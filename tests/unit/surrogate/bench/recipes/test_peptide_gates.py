@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.bench.recipes import peptide_gates
+from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_writer
 
@@ -54,3 +55,32 @@ def test_the_lag_gate_trains_measures_and_keeps_its_table(
     before = (tmp_path / "lag.safetensors").read_bytes()
     peptide_gates.main(arguments)
     assert (tmp_path / "lag.safetensors").read_bytes() == before
+
+
+def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, test = tmp_path / "train", tmp_path / "test"
+
+    def write(path: Path, sequence: str, n: int, seed: int) -> None:
+        scene = build_peptide(sequence)
+        x = scene.positions_nm + 0.004 * np.random.default_rng(seed).normal(size=(n, scene.n_atoms, 3))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        record = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0}
+        with open_writer(path, scene, record) as writer:
+            writer.append(x.astype(np.float32), 1.0 + np.arange(n))
+
+    first, second = next(p.residues for p in peptide_gates.training_peptides() if len(p.residues) == 2)
+    for names in ((first,), (second,), (first, second)):
+        write(runs / "-".join(names) / "run_000.h5", "-".join(("ACE", *names, "NME")), 900, len(names))
+    for k in range(2):
+        write(test / "unseen" / "300K" / f"unseen_300K_r{k}.h5", f"ACE-{first}-{second}-NME", 200, 10 + k)
+    arguments = ["pairs", str(tmp_path / "out"), "--train", str(runs), "--test", str(test), "--steps", "2"]
+    with pytest.raises(InputError, match="1 pairs, 2 are asked for"):
+        peptide_gates.main([*arguments, "--pairs", "2"])
+    peptide_gates.main([*arguments, "--pairs", "1"])
+    rows = json.loads((tmp_path / "out" / "pairs.json").read_text())
+    assert [r["source"] for r in rows] == ["MD", "model", "library"]
+    least, model, library = (r["single"] for r in rows)
+    assert 0 < least < min(model, library) and max(model, library) < 0.83
+    assert "| 1 | unseen | MD |" in capsys.readouterr().out

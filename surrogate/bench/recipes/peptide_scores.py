@@ -1,0 +1,135 @@
+"""How near rollouts of a peptide come to MD of it, beside MD's own scatter and a library of monomers' torsions.
+
+Figures are Jensen-Shannon distances of 50 bins (36 x 36 of joint maps), means over all torsions of a peptide: phi, psi
+and chi, each folded by its symmetry. The floor is the mean over pairs of independent MD runs; a source's figure is the
+mean over each of its runs against each of MD's, of equal length and as many frames. The library draws each residue's
+torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat on joint maps
+of neighbours, or it has learned nothing of pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.judge.measure.distributions import distance
+from surrogate.judge.measure.torsions import find_torsions
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
+from systems.scene import Scene
+
+FloatArray = npt.NDArray[np.float64]
+_BINS, _JOINT_BINS = 50, 36
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One torsion of a peptide: its `kind` (phi, psi, chi1, ...), the place of its residue among the amino acids, its
+    four atoms, and by how many equal positions it is folded."""
+
+    kind: str
+    residue: int
+    quad: tuple[int, int, int, int]
+    fold: int = 1
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Distances of one source to MD of a peptide, with the standard error over its runs: mean over single torsions, and
+    over joint maps of psi and the next residue's phi (NaN for a monomer)."""
+
+    source: str
+    single: float
+    single_error: float
+    joint: float
+    joint_error: float
+
+
+def turns_of(scene: Scene) -> list[Turn]:
+    """Return phi, psi and chi of each amino acid; rotors without heavy atoms and omega are left out."""
+    backbone = backbone_torsions(scene)
+    rows = [("phi", 2, q) for q in backbone["phi"].tolist()] + [("psi", 1, q) for q in backbone["psi"].tolist()]
+    found = [(kind, int(scene.residue_of_atom[q[place]]), tuple(q), 1) for kind, place, q in rows]
+    for t in find_torsions(scene):
+        if t.kind == "χ":
+            found.append(
+                (t.label.split()[0].replace("χ", "chi"), int(scene.residue_of_atom[t.quad[1]]), t.quad, t.fold)
+            )
+    rank = {r: k for k, r in enumerate(sorted({r for _, r, _, _ in found}))}
+    return [Turn(kind, rank[r], (q[0], q[1], q[2], q[3]), fold) for kind, r, q, fold in found]
+
+
+def angles(turns: Sequence[Turn], frames_nm: npt.NDArray[np.floating]) -> FloatArray:
+    """Return the torsions `(n_frames, n_turns)` of frames `(n_frames, n_atoms, 3)` nm, in rad, folded ones
+    multiplied."""
+    raw = np.asarray(torsion(frames_nm.astype(np.float64), [t.quad for t in turns]), dtype=np.float64)
+    folded = raw * np.array([t.fold for t in turns])
+    return np.asarray((folded + np.pi) % (2 * np.pi) - np.pi)
+
+
+def library(turns: Sequence[Turn], monomers: Sequence[FloatArray], monomer_turns: Sequence[Sequence[Turn]], n: int,
+            rng: np.random.Generator) -> FloatArray:  # fmt: skip
+    """Return `n` draws `(n, n_turns)`: of residue k together from `monomers[k]` (n_frames, its turns), blind to others.
+
+    Raises KeyError for a torsion that the residue's monomer does not have.
+    """
+    out = np.empty((n, len(turns)))
+    for k, (values, own) in enumerate(zip(monomers, monomer_turns, strict=True)):
+        column = {t.kind: j for j, t in enumerate(own)}
+        rows = values[rng.integers(len(values), size=n)]
+        for j, t in enumerate(turns):
+            if t.residue == k:
+                out[:, j] = rows[:, column[t.kind]]
+    return out
+
+
+def score(turns: Sequence[Turn], truth: Sequence[FloatArray], source: Sequence[FloatArray], name: str) -> Scores:
+    """Return a source's distances to MD; `truth` and `source` are runs of torsions `(n_frames, n_turns)` of one
+    length."""
+    return _scores(turns, [(i, a, b) for i, a in enumerate(source) for b in truth], name)
+
+
+def floor(turns: Sequence[Turn], truth: Sequence[FloatArray]) -> Scores:
+    """Return the distances between independent MD runs."""
+    return _scores(turns, [(k, a, b) for k, (a, b) in enumerate(combinations(truth, 2))], "MD")
+
+
+def _scores(turns: Sequence[Turn], pairs: list[tuple[int, FloatArray, FloatArray]], name: str) -> Scores:
+    joints = [
+        (i, j)
+        for i, a in enumerate(turns)
+        for j, b in enumerate(turns)
+        if (a.kind, b.kind) == ("psi", "phi") and b.residue == a.residue + 1
+    ]
+
+    def over_pairs(measured: Callable[[FloatArray, FloatArray], float]) -> tuple[float, float]:
+        of_run: dict[int, list[float]] = {}
+        for run, a, b in pairs:
+            of_run.setdefault(run, []).append(measured(a, b))
+        means = np.array([np.mean(values) for values in of_run.values()])
+        error = float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else float("nan")
+        return float(means.mean()), error
+
+    def single(a: FloatArray, b: FloatArray) -> float:
+        return float(np.mean([_distance_1d(a[:, k], b[:, k]) for k in range(len(turns))]))
+
+    def joint(a: FloatArray, b: FloatArray) -> float:
+        return (
+            float(np.mean([_distance_2d(a[:, ij], b[:, ij]) for ij in map(list, joints)])) if joints else float("nan")
+        )
+
+    return Scores(name, *over_pairs(single), *over_pairs(joint))
+
+
+def _distance_1d(a: FloatArray, b: FloatArray) -> float:
+    edges = np.linspace(-np.pi, np.pi, _BINS + 1)
+    return float(distance(*(np.histogram(x, edges)[0].astype(np.float64) for x in (a, b))))
+
+
+def _distance_2d(a: FloatArray, b: FloatArray) -> float:
+    edges = np.linspace(-np.pi, np.pi, _JOINT_BINS + 1)
+    return float(distance(*(np.histogram2d(x[:, 0], x[:, 1], (edges, edges))[0].ravel() for x in (a, b))))

@@ -1,0 +1,64 @@
+"""Scores of peptides: the floor is MD's own scatter, the library is blind to couplings, a shift is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogate.bench.recipes.peptide_scores import FloatArray, angles, floor, library, score, turns_of
+from systems.prepare.peptide import build_peptide
+
+
+def test_all_turns_of_a_pair_are_found_and_folded() -> None:
+    turns = turns_of(build_peptide("ACE-PHE-ASN-NME"))
+    found = {(t.residue, t.kind): t.fold for t in turns}
+    assert found == {
+        (0, "phi"): 1, (0, "psi"): 1, (0, "chi1"): 1, (0, "chi2"): 2,
+        (1, "phi"): 1, (1, "psi"): 1, (1, "chi1"): 1, (1, "chi2"): 1,
+    }  # fmt: skip
+
+
+def test_angles_are_those_of_the_frames() -> None:
+    scene = build_peptide("ACE-PHE-NME")
+    turns = turns_of(scene)
+    values = angles(turns, np.stack([scene.positions_nm, scene.positions_nm * np.array([1.0, 1.0, -1.0])]))
+    assert values[0] == pytest.approx(-values[1], abs=1e-6), "a mirror image turns all signs"
+    by_kind = {t.kind: np.degrees(values[0, k]) for k, t in enumerate(turns)}
+    assert by_kind["phi"] == pytest.approx(-140, abs=15) and by_kind["psi"] == pytest.approx(140, abs=15)
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[list[FloatArray], list[FloatArray]]:
+    """Truth and a source of a made-up pair: phi of the second residue follows psi of the first."""
+    rng = np.random.default_rng(0)
+
+    def coupled(n: int = 4000) -> FloatArray:
+        psi = np.where(rng.random(n) < 0.5, -0.7, 2.4)
+        phi = np.where(psi > 0, -2.2, -1.2) + 0.3 * rng.normal(size=n)
+        return np.stack([-1.3 + 0.4 * rng.normal(size=n), psi + 0.3 * rng.normal(size=n), phi,
+                         0.5 * rng.normal(size=n)], axis=1)  # fmt: skip
+
+    return [coupled() for _ in range(3)], [coupled() for _ in range(3)]
+
+
+def test_a_perfect_source_is_as_far_as_md_and_the_library_fails_on_joint_maps_alone(
+    runs: tuple[list[FloatArray], list[FloatArray]],
+) -> None:
+    truth, source = runs
+    turns = [t for t in turns_of(build_peptide("ACE-ALA-ALA-NME")) if t.kind in ("phi", "psi")]
+    order = [("phi", 0), ("psi", 0), ("phi", 1), ("psi", 1)]
+    turns = [next(t for t in turns if (t.kind, t.residue) == key) for key in order]
+    least = floor(turns, truth)
+    perfect = score(turns, truth, source, "perfect")
+    assert perfect.single == pytest.approx(least.single, rel=0.25)
+    assert perfect.joint == pytest.approx(least.joint, rel=0.25)
+    # Monomers with the right distribution of each residue, told apart: single torsions right, the coupling lost.
+    own = [[t for t in turns if t.residue == k] for k in (0, 1)]
+    monomers = [np.concatenate(truth)[:, [turns.index(t) for t in some]] for some in own]
+    rng = np.random.default_rng(1)
+    blind = [library(turns, monomers, own, 4000, rng) for _ in range(3)]
+    rival = score(turns, truth, blind, "library")
+    assert rival.single < 1.25 * least.single
+    assert rival.joint > 2.0 * least.joint
+    shifted = score(turns, truth, [x + 0.3 for x in source], "shifted")
+    assert shifted.single > 3.0 * least.single
