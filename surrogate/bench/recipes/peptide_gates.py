@@ -7,7 +7,10 @@ one of 100 ps, beside two halves of MD. `--plain` trains without innovations, th
 
 `pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (a folder of `peptide_runs`), the
 model rolls each molecule below `--test` (a campaign's folder) as long and as often as MD did. Distances over MD's own
-scatter, beside the library of monomers' torsions (`peptide_scores`). What is finished in FOLDER is not done again.
+scatter, beside the library of monomers' torsions (`peptide_scores`).
+
+`free-energy`: of phi > 0 of a capped residue, in kT, by two well-tempered metadynamics runs, which must agree, and by
+the runs of `--md`. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import numpy.typing as npt
 
 from surrogate.bench.lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
 from surrogate.bench.recipes.peptide_list import training_peptides
+from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 
@@ -40,6 +44,7 @@ STEPS = 7300
 STARTS = 5000
 # Frames of rollouts and of MD are compared so far apart.
 FRAMES_PS = 10.0
+_KELVIN, _BIAS_FACTOR = 300.0, 8.0
 _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
 
 
@@ -197,6 +202,48 @@ def pairs_gate(a: argparse.Namespace) -> None:
     sys.stdout.write(pairs_table(rows) + "\n")
 
 
+def free_energy_gate(a: argparse.Namespace) -> None:
+    """Run metadynamics twice, print and keep the free energies of phi > 0."""
+    from surrogate.bench.recipes.peptide_seeds import metadynamics
+    from systems.prepare.peptide import build_peptide
+    from systems.trajectory.codec import open_trajectory
+
+    scene = build_peptide(a.sequence)
+    record: dict[str, Any] = {"sequence": a.sequence, "metadynamics_ps": a.time_ps}
+    for seed in (1, 2):
+        path = a.folder / f"{a.sequence}-metadynamics-{seed}.npz"
+        if not path.exists():
+            _, free = metadynamics(
+                scene, time_ps=a.time_ps, temperature_k=_KELVIN, bias_factor=_BIAS_FACTOR, seed=seed,
+                platform="Reference",
+            )  # fmt: skip
+            np.savez(path, free_kj_mol=free[0])
+        record[f"metadynamics {seed}"] = positive_phi_kt(np.load(path)["free_kj_mol"])
+    shares = []
+    for path in a.md:
+        with open_trajectory(path) as reader:
+            phi = torsions(scene, reader.read(stride=10).astype(np.float64))[:, 0]
+            shares.append(float((phi > 0).mean()))
+    if shares:
+        p = float(np.mean(shares))
+        record["md"] = float(np.log((1 - p) / p))
+        # of ln((1 - p) / p), by the scatter of p over runs
+        record["md_error"] = float(np.std(shares, ddof=1) / len(shares) ** 0.5 / (p * (1 - p)))
+    (a.folder / f"{a.sequence}-free-energy.json").write_text(json.dumps(record, indent=1))
+    sys.stdout.write(json.dumps(record, indent=1) + "\n")
+
+
+def positive_phi_kt(free_kj_mol: FloatArray, temperature_k: float = _KELVIN) -> float:
+    """Return the free energy of phi > 0 over phi < 0, kT, of a surface `(n_psi, n_phi)` from -π to π, ends included."""
+    kt = GAS_CONSTANT_KJ * temperature_k
+    weights = np.exp(-(free_kj_mol - free_kj_mol.min()) / kt)[:-1, :-1]
+    phi = np.linspace(-np.pi, np.pi, free_kj_mol.shape[1])[:-1]
+    # The two grid lines on which phi changes its sign belong to either side by half.
+    share = np.where(np.isclose(phi, 0) | np.isclose(phi, -np.pi), 0.5, (phi > 0).astype(float))
+    positive = float((weights * share).sum())
+    return float(-np.log(positive / (float(weights.sum()) - positive)))
+
+
 def pairs_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the rows as Markdown, distances as multiples of MD's own."""
     lines = [
@@ -218,9 +265,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     gates = parser.add_subparsers(dest="gate", required=True)
-    lag, pairs = gates.add_parser("lag"), gates.add_parser("pairs")
-    for gate in (lag, pairs):
+    lag, pairs, energy = (gates.add_parser(name) for name in ("lag", "pairs", "free-energy"))
+    for gate in (lag, pairs, energy):
         gate.add_argument("folder", type=Path)
+    for gate in (lag, pairs):
         gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
     lag.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
     lag.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
@@ -229,9 +277,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pairs.add_argument("--train", type=Path, required=True, help="folder of `peptide_runs`")
     pairs.add_argument("--test", type=Path, required=True, help="folder of a campaign of molecules never trained on")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
+    energy.add_argument("--sequence", default="ACE-ALA-NME")
+    energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")
+    energy.add_argument("--md", type=Path, nargs="*", default=(), help="long runs of the same molecule")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
-    {"lag": lag_gate, "pairs": pairs_gate}[a.gate](a)
+    {"lag": lag_gate, "pairs": pairs_gate, "free-energy": free_energy_gate}[a.gate](a)
 
 
 if __name__ == "__main__":

@@ -84,3 +84,16 @@ def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_l
     least, model, library = (r["single"] for r in rows)
     assert 0 < least < min(model, library) and max(model, library) < 0.83
     assert "| 1 | unseen | MD |" in capsys.readouterr().out
+
+
+def test_the_free_energy_of_positive_phi_is_that_of_known_surfaces() -> None:
+    phi = np.linspace(-np.pi, np.pi, 61)
+    kt = 0.00831446261815324 * 300.0
+    flat = np.zeros((61, 61))
+    assert peptide_gates.positive_phi_kt(flat) == pytest.approx(0.0, abs=1e-12)
+    step = np.where(phi > 0, 2.0 * kt, 0.0) * np.ones((61, 1))
+    # both ends and phi = 0 lie on the lower side of the step, by half of them on the other side of the sum
+    low, high = 29.0, 29.0
+    expected = -np.log((high * np.exp(-2.0) + 1.0) / (low + 1.0))
+    assert peptide_gates.positive_phi_kt(step) == pytest.approx(expected, abs=1e-9)
+    assert peptide_gates.positive_phi_kt(step[:, ::-1]) < -1.5, "the other way round"
