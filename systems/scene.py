@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -103,13 +102,6 @@ class Scene:
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
-    def molecule_key(self) -> str:
-        """Canonical hash, free of atom order, names and positions (elements, bond graph, charge, stereo)."""
-        from systems.chemistry.graph import molecule_key
-
-        return molecule_key(self)
-
-    @property
     def formula(self) -> str:
         """Hill-order formula, for people: C6H12N2O2; `5 particles` where there are no elements."""
         if self.elements and set(self.elements) == {PARTICLE}:
@@ -166,9 +158,3 @@ class Scene:
         import mdtraj
 
         return mdtraj.Topology.from_openmm(self.to_openmm_topology())
-
-    def write_pdb(self, path: str | Path) -> None:
-        """Write a PDB file (positions in Å, CONECT for every bond, atoms in this scene's order)."""
-        from systems.trajectory.pdb_text import pdb_text
-
-        Path(path).write_text(pdb_text(self))

@@ -12,6 +12,7 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.platforms import PlatformChoice, measured_platform
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
@@ -32,7 +33,7 @@ class PreparedScene:
             "n_atoms": self.scene.n_atoms,
             "formula": self.scene.formula,
             "topology_hash": self.scene.topology_hash,
-            "molecule_key": self.scene.molecule_key,
+            "molecule_key": molecule_key(self.scene),
             "platform": self.platform.name,
             "force": asdict(self.force),
             "repairs": list(self.scene.provenance.get("repairs", [])),

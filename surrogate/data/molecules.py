@@ -10,6 +10,7 @@ import numpy as np
 from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames
 from surrogate.data.poses import in_standard_pose, standard_turn
 from surrogate.data.splits import Split
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 
 
@@ -54,7 +55,7 @@ def refuse_mixtures(sets: FrameSets) -> None:
         asked, known = (f.conditions.get("temperature_k") for f in (frames, first))
         if asked != known:
             raise InputError(f"{name} was made at {asked} K, {first.scene.name} at {known} K; this model takes none.")
-        other = keys.setdefault(frames.scene.molecule_key, frames)
+        other = keys.setdefault(molecule_key(frames.scene), frames)
         if other is not frames:
             both = " and would be both trained on and held out" if frames in sets.unseen else ""
             raise InputError(

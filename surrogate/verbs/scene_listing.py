@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from systems.chemistry.graph import molecule_key
+
 if TYPE_CHECKING:
     from surrogate.verbs.md_options import Preparation
     from systems.scene import Scene
@@ -46,7 +48,7 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
             "charge_e": int(scene.formal_charges.sum()),
             "torsions": {key: len(quads) for key, quads in backbone_torsions(scene).items() if len(quads)},
             "topology_hash": scene.topology_hash,
-            "molecule_key": scene.molecule_key,
+            "molecule_key": molecule_key(scene),
             "protocols": {each: _written(find_protocol(each).settings) for each in named_scenes.protocols(name)},
         }
         if scene.interactions is not None:

@@ -16,6 +16,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
 from systems.source import prepare
+from systems.trajectory.pdb_text import pdb_text
 
 pytestmark = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184
@@ -23,7 +24,7 @@ KJ_PER_KCAL = 4.184
 
 def tleap(scene: Scene, force_field: str, radii: str, folder: Path) -> tuple[str, list[int]]:
     """Return the prmtop that tleap makes of the scene's PDB file, and which of its atoms each of the scene's is."""
-    scene.write_pdb(folder / "in.pdb")
+    (folder / "in.pdb").write_text(pdb_text(scene))
     text = "".join(
         line + "\n"
         for line in (folder / "in.pdb").read_text().splitlines()

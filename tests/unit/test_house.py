@@ -23,7 +23,6 @@ LONG_FILES = {
     "surrogate/cli/main.py": "options are still spelled out verb by verb",
 }
 CIRCLES = {
-    "systems.scene": "a Scene makes its own graph and PDB text",
     "systems.trajectory.base": "readers and writers find each other by suffix",
 }
 MANY_PARAMETERS = {

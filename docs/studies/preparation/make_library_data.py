@@ -14,6 +14,7 @@ from pathlib import Path
 
 from systems.library.catalogue import ENTRIES, Entry
 from systems.scene import Scene
+from systems.trajectory.pdb_text import pdb_text
 
 
 def make(entry: Entry) -> list[Path]:
@@ -24,7 +25,7 @@ def make(entry: Entry) -> list[Path]:
     written = []
     path = Path(str(files("systems.library") / "data" / f"{entry.file or entry.name}.pdb"))
     if not path.exists():
-        replace(_scene(entry), name=entry.name).write_pdb(path)
+        path.write_text(pdb_text(replace(_scene(entry), name=entry.name)))
         written.append(path)
     if entry.smiles:
         written.append(write_shipped(load(entry.name)))

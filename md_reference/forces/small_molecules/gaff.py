@@ -20,6 +20,7 @@ from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.forces.small_molecules.programs import scratch_folder
 from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.chemistry.element_data import covalent_radius_nm
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError, StorageError
 from systems.scene import FloatArray, Scene
 from systems.units import format_wall
@@ -75,7 +76,7 @@ def write_shipped(scene: Scene) -> Path:
     """
     refuse(scene)
     found = _parametrise(scene)
-    path = parameter_cache.shipped_folder() / f"{scene.molecule_key}-{METHOD}.json.gz"
+    path = parameter_cache.shipped_folder() / f"{molecule_key(scene)}-{METHOD}.json.gz"
     path.unlink(missing_ok=True)
     parameter_cache.store(path, found)
     return path

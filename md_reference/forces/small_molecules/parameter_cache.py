@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.forces.small_molecules.prmtop import Prmtop
-from systems.chemistry.graph import match_atoms
+from systems.chemistry.graph import match_atoms, molecule_key
 from systems.errors import InputError, OutOfDomainError
 from systems.files.checksums import sealed, unsealed
 from systems.files.outside import content
@@ -60,21 +60,21 @@ def shipped_folder() -> Path:
 
 def find_shipped(scene: Scene, method: str) -> Entry | None:
     """Return the shipped parameters of this molecule, or None."""
-    return _read(shipped_folder() / f"{scene.molecule_key}-{method}.json.gz")
+    return _read(shipped_folder() / f"{molecule_key(scene)}-{method}.json.gz")
 
 
 def find_cached(scene: Scene, method: str, version: str | None) -> Entry | None:
     """Return parameters computed here earlier by this version (by any, the last by name, where `version` is None)."""
     folder = cache_folder() / "parameters"
     if version is not None:
-        return _read(folder / f"{scene.molecule_key}-{method}-{version}.json.gz")
-    found = sorted(folder.glob(f"{scene.molecule_key}-{method}-*.json.gz"))
+        return _read(folder / f"{molecule_key(scene)}-{method}-{version}.json.gz")
+    found = sorted(folder.glob(f"{molecule_key(scene)}-{method}-*.json.gz"))
     return _read(found[-1]) if found else None
 
 
 def cached_path(scene: Scene, method: str, version: str) -> Path:
     """Where `find_cached` looks."""
-    return cache_folder() / "parameters" / f"{scene.molecule_key}-{method}-{version}.json.gz"
+    return cache_folder() / "parameters" / f"{molecule_key(scene)}-{method}-{version}.json.gz"
 
 
 def fits(entry: Entry | None, scene: Scene) -> bool:

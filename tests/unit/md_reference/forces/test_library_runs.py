@@ -17,6 +17,7 @@ from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.defaults import defaults, settle
 from md_reference.run.engine import Engine
+from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import check_frames, geometry_from_scene
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
@@ -102,7 +103,7 @@ def test_parameters_follow_the_molecule_into_another_atom_order() -> None:
 )
 def test_one_molecule_has_one_default_under_all_its_names(names: tuple[str, ...]) -> None:
     scenes = [prepare(name) for name in names]
-    assert len({scene.molecule_key for scene in scenes}) == 1
+    assert len({molecule_key(scene) for scene in scenes}) == 1
     found = []
     for scene in scenes:
         settings, said = settle(scene, {})

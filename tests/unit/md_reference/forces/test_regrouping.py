@@ -17,6 +17,7 @@ from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
 from systems.source import prepare
 from systems.trajectory.codec import open_trajectory
+from systems.trajectory.pdb_text import pdb_text
 
 SPECS = {
     "ff14SB": ForceFieldSpec(),
@@ -200,7 +201,7 @@ def test_an_unknown_force_is_not_guessed_at(alanine_dipeptide: Scene) -> None:
 
 
 def test_reference_of_a_file_in_one_residue(alanine_dipeptide: Scene, order: IntArray, tmp_path: Path) -> None:
-    as_one_residue(shuffled(alanine_dipeptide, order)).write_pdb(tmp_path / "some.pdb")
+    (tmp_path / "some.pdb").write_text(pdb_text(as_one_residue(shuffled(alanine_dipeptide, order))))
     scene = prepare(str(tmp_path / "some.pdb"))
     assert scene.residue_names == ("UNL",)
     out = simulate(scene, MDConfig(time_ps=0.4, save_every_ps=0.1, equilibrate_ps=0.4), tmp_path / "a.h5")

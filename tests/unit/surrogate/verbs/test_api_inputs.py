@@ -13,6 +13,7 @@ import surrogate as sm
 from systems.errors import InputError, UnitError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.pdb_text import pdb_text
 from systems.units import PARSERS
 
 VERBS: dict[str, tuple[Any, ...]] = {
@@ -91,5 +92,5 @@ def test_a_single_path_is_one_candidate_and_no_other_file_is_read(
 
 
 def test_a_scene_may_be_a_path(here: Path, alanine_dipeptide: Scene) -> None:
-    alanine_dipeptide.write_pdb(here / "mine.pdb")
+    (here / "mine.pdb").write_text(pdb_text(alanine_dipeptide))
     assert sm.plan(here / "mine.pdb", platform="Reference")["force_field"] == "ff14SB"

@@ -13,6 +13,7 @@ from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.converted import to_mdanalysis, to_mdtraj
+from systems.trajectory.pdb_text import pdb_text
 
 
 def write(path: Path, scene: Scene, times: np.ndarray) -> np.ndarray:
@@ -55,7 +56,7 @@ def test_objects_equal_what_the_libraries_read(tmp_path: Path, alanine_dipeptide
 
 def write_pdb(folder: Path, scene: Scene) -> Path:
     path = folder / "top.pdb"
-    scene.write_pdb(path)
+    path.write_text(pdb_text(scene))
     return path
 
 

@@ -13,6 +13,7 @@ from systems.chemistry.cell_shape import box_vectors, lengths_and_angles, volume
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.pdb_text import pdb_text
 
 N = 5
 # A truncated octahedron's kind of cell: three lengths, three angles, all different.
@@ -82,7 +83,7 @@ def test_every_reader_sees_the_same(periodic: Scene, frames: dict[str, np.ndarra
     np.testing.assert_allclose(trajectory.unitcell_angles, np.tile(ANGLES, (N, 1)), rtol=1e-6)
     np.testing.assert_allclose(trajectory.unitcell_vectors, frames["cell"], atol=2e-6)
     scene_pdb = tmp_path / "a.pdb"
-    periodic.write_pdb(scene_pdb)
+    scene_pdb.write_text(pdb_text(periodic))
     universe = MDAnalysis.Universe(str(scene_pdb), str(path), format="H5MD")
     for k, ts in enumerate(universe.trajectory):
         # Å, Å/ps and kJ/mol/Å

@@ -24,6 +24,7 @@ from systems.files import atomic_file
 from systems.scene import Scene
 from systems.trajectory import frame_store, hdf5_file
 from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.pdb_text import pdb_text
 
 SUFFIXES = (".h5", ".dcd")
 RECORD = {"kind": "reference", "timestep_ps": 0.004, "save_every_ps": 1.0, "seed": 7, "completed": False}
@@ -189,7 +190,7 @@ def test_mdtraj_and_mdanalysis_read_it(tmp_path: Path, suffix: str, alanine_dipe
         writer.append(positions[4:], 5.0 + np.arange(3) * 0.5)
     pdb = tmp_path / "a.pdb"
     if suffix == ".h5":
-        alanine_dipeptide.write_pdb(pdb)
+        pdb.write_text(pdb_text(alanine_dipeptide))
     seen = mdtraj.load(str(path)) if suffix == ".h5" else mdtraj.load(str(path), top=str(pdb))
     np.testing.assert_allclose(seen.xyz, positions, atol=1e-6)
     assert [a.name for a in seen.topology.atoms] == list(alanine_dipeptide.atom_names)
@@ -306,7 +307,7 @@ def test_xtc_through_mdtraj(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     positions = alanine_dipeptide.positions_nm + frames(3, 22) * 0.01
     topology = alanine_dipeptide.to_mdtraj_topology()
     mdtraj.Trajectory(positions, topology, time=np.array([2.0, 4.0, 6.0])).save_xtc(str(tmp_path / "a.xtc"))
-    alanine_dipeptide.write_pdb(tmp_path / "top.pdb")
+    (tmp_path / "top.pdb").write_text(pdb_text(alanine_dipeptide))
     with open_trajectory(tmp_path / "a.xtc", top=tmp_path / "top.pdb") as reader:
         np.testing.assert_allclose(reader.read(1, None), positions[1:], atol=1e-3)
         np.testing.assert_allclose(reader.time_ps, [2.0, 4.0, 6.0])
