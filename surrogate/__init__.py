@@ -10,13 +10,37 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from surrogate.api import campaign, compare, demo, info, plan, reference, rollout, systems, train, windows
+    from surrogate.api import (
+        campaign,
+        compare,
+        demo,
+        explain_training,
+        info,
+        plan,
+        reference,
+        rollout,
+        systems,
+        train,
+        windows,
+    )
     from surrogate.sampling.openmm.simulation import Simulation
     from systems.trajectory.converted import to_mdanalysis, to_mdtraj
 
 __version__ = "0.1.0"
 
-_VERBS = ("campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows")
+_VERBS = (
+    "campaign",
+    "compare",
+    "demo",
+    "explain_training",
+    "info",
+    "plan",
+    "reference",
+    "rollout",
+    "systems",
+    "train",
+    "windows",
+)
 _ELSEWHERE = {
     "Simulation": "surrogate.sampling.openmm.simulation",
     "to_mdanalysis": "systems.trajectory.converted",
@@ -28,6 +52,7 @@ __all__ = [
     "campaign",
     "compare",
     "demo",
+    "explain_training",
     "info",
     "plan",
     "reference",

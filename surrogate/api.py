@@ -8,26 +8,35 @@ raises a `systems.errors.SurromdError` whose message is one line.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.data.shipped import weights_path
-from surrogate.progress import progress_bar
 from surrogate.verbs.compare import compare
 from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
 from surrogate.verbs.reference import plan, reference
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.scene_listing import systems, tell
-from systems.errors import InputError, UnknownNameError, nearest
-from systems.trajectory.claim import Claim
+from surrogate.verbs.scene_listing import systems
+from surrogate.verbs.train import explain_training, train
+from systems.errors import InputError
 from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison
 
-__all__ = ["campaign", "compare", "demo", "info", "plan", "reference", "rollout", "systems", "train", "windows"]
+__all__ = [
+    "campaign",
+    "compare",
+    "demo",
+    "explain_training",
+    "info",
+    "plan",
+    "reference",
+    "rollout",
+    "systems",
+    "train",
+    "windows",
+]
 
 
 def demo(
@@ -143,124 +152,3 @@ def windows(
         out.unlink()
         raise
     return out
-
-
-def train(
-    references: Trajectories,
-    out: PathLike,
-    *,
-    arch: str = "lam-slide",
-    config: PathLike | None = None,
-    budget_s: Quantity | None = None,
-    steps: int | None = None,
-    start_from: PathLike | None = None,
-    validation: Trajectories | None = None,
-    time_reversal: bool = False,
-    rare_draws: float = 0.0,
-    rare_kinds: bool = False,
-    hydrogens: str | None = None,
-    entities: str | None = None,
-    graph: bool = False,
-    longest_lag_ps: Quantity | None = None,
-    seed: int = 0,
-    device: str = "auto",
-    resume: bool = False,
-    overwrite: bool = False,
-    quiet: bool = False,
-) -> Path:
-    """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
-
-    `arch`: lam-slide; painet or its decoder alone, egnn, which learn from velocities (a reference made with
-    --save-velocities and natural hydrogen masses); or a baseline that is fitted in one go: frozen, constant-velocity,
-    resampling, normal-modes, msm. The others end after `budget_s` seconds of training or `steps` optimiser steps over
-    all stages, whichever is given. `config`: a TOML file of model settings. `start_from`: weights (name or file) whose
-    second stage is trained further, with their configuration. `validation`: trajectories that the curves are measured
-    on; without any it is the last twentieth of each. A stretch of motion that would be both trained on and validated
-    on is refused. `time_reversal` shows every other window backwards,
-    right for a reference in equilibrium; `rare_draws` is the share of windows drawn for a rare state they show
-    (surrogate.data.rarity), `rare_kinds` also tells the network which, and learns how often each comes.
-    `hydrogens` 'placed': lam-slide learns heavy atoms alone, and rollouts get their hydrogens from the reference's
-    local geometry; `entities` 'residue': of peptides, whose residues are then what it codes; both as in `config`.
-    `graph`: lam-slide knows atoms by their bonds, so that references may be of many molecules and the weights cover
-    unseen ones that look like them (surrogate.sampling.coverage); trajectories in `validation` of molecules that are
-    not trained on hold those out whole; each atom is then a latent of its own, or, with `atoms.latents = "set"` in
-    `config`, an autoencoder codes them as it does for one molecule. `longest_lag_ps`: lam-slide learns every spacing of
-    frames from that of the references to this one, and takes it as an input. Beside `out`, a
-    CSV holds the training curves and, until done, files the state that `resume` goes on from; at the end the curves are
-    drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are usable and, where they
-    are not, what would help (NAME.verdict.json, surrogate.verbs.train_verdict). `device`: 'auto', 'cpu' or 'cuda';
-    several devices by torchrun (surrogate.training.devices).
-    Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
-    """
-    from surrogate.verbs.train import FITTED, FORECASTERS, GENERATIVE, TrainingRequest, prepare_training
-
-    architectures = [*GENERATIVE, *FORECASTERS, *FITTED]
-    if arch not in architectures:
-        raise UnknownNameError(
-            f"unknown architecture {arch!r}; known: {', '.join(architectures)}.{nearest(arch, architectures)}"
-        )
-    out = Path(out)
-    request = TrainingRequest(
-        arch=arch,
-        paths=[],
-        held=[],
-        out=out,
-        config=None if config is None else Path(config),
-        budget_s=quantity("budget_s", budget_s),
-        steps=steps,
-        start_from=None if start_from is None else weights_path(start_from),
-        time_reversal=time_reversal,
-        rare_draws=rare_draws,
-        rare_kinds=rare_kinds,
-        hydrogens=hydrogens,
-        entities=entities,
-        graph=graph,
-        longest_lag_ps=quantity("longest_lag_ps", longest_lag_ps),
-        seed=seed,
-        device=device,
-        resume=resume,
-    )
-    request.check()
-    check_outputs([out], [".safetensors"], resume=resume, overwrite=overwrite)
-    states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-    if states and not (resume or overwrite):
-        raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
-    if resume and out.exists() and not states:
-        return out
-    paths = find_trajectories(references, verify=True)
-    held = [] if validation is None else find_trajectories(validation, verify=True)
-    from surrogate.training.devices import choose_device, is_first_process
-
-    prepared = prepare_training(replace(request, paths=paths, held=held, device=choose_device(device)))
-    first = is_first_process()
-    claim = Claim(out) if first else nullcontext()
-    with claim, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar:
-
-        def advance(stage: str, share: float) -> None:
-            if bar is not None:
-                bar(round(1000 * share), 1000, stage)
-
-        try:
-            written = prepared.start(advance)
-        except KeyboardInterrupt:
-            kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-            if not kept:
-                raise KeyboardInterrupt("no training state had been saved yet") from None
-            raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
-    curves = out.with_suffix(".csv")
-    if curves.exists() and is_first_process():
-        from surrogate.training.loss_curves import plot_curves
-
-        plot_curves(curves)
-    if arch not in FITTED and is_first_process():
-        from surrogate.verbs.train_verdict import judge_training, write_verdict
-
-        try:
-            verdict = judge_training(written)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
-        write_verdict(written, verdict)
-        if not quiet:
-            for line in verdict.lines():
-                tell(written.name, line)
-    return written

@@ -17,12 +17,10 @@ from surrogate.cli.options import (
     AtomsOpt,
     DeviceOpt,
     EnergyEveryOpt,
-    EntitiesOpt,
     FailOn,
     ForceOpt,
     Guard,
     GuardOpt,
-    HydrogensOpt,
     JsonOpt,
     MdBetweenOpt,
     OverwriteOpt,
@@ -258,34 +256,25 @@ def train(
     references: Annotated[
         list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write, .safetensors.")],
-    arch: ArchOpt = "lam-slide",
-    config: Annotated[Path | None, typer.Option("--config", help="TOML of model and training settings.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Weights to write, .safetensors.")] = None,
+    arch: ArchOpt = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help=literal("TOML with tables [model] and [training]; see --explain."))
+    ] = None,
     budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
     start_from: Annotated[
         str | None, typer.Option("--from", help="Weights whose second stage is trained further: a name or a file.")
     ] = None,
     validation: ValidationOpt = None,
-    time_reversal: Annotated[
-        bool, typer.Option("--time-reversal", help="Show windows backwards too: right for MD in equilibrium.")
-    ] = False,
-    rare_draws: Annotated[
-        float, typer.Option("--rare-draws", help="Share of windows drawn for a rare state, weighted down by as much.")
-    ] = 0.0,
-    rare_kinds: Annotated[
-        bool, typer.Option("--rare-kinds", help="Tell the network the rare state, and learn how often each comes.")
-    ] = False,
-    hydrogens: HydrogensOpt = None,
-    entities: EntitiesOpt = None,
-    graph: Annotated[
-        bool, typer.Option("--graph", help="Know atoms by their bonds: one model for many molecules, and unseen ones.")
-    ] = False,
     longest_lag: Annotated[
         str | None, typer.Option("--longest-lag", help="Learn every frame spacing up to this one, such as 1ns.")
     ] = None,
     device: DeviceOpt = "auto",
     seed: SeedOpt = 0,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print the configuration filled in for these references; train nothing.")
+    ] = False,
     resume: ResumeOpt = False,
     overwrite: OverwriteOpt = False,
     quiet: QuietOpt = False,
@@ -294,6 +283,14 @@ def train(
     """Train a surrogate on reference trajectories."""
     from surrogate import api
 
+    longest_lag_ps = None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag")
+    if explain:
+        typer.echo(
+            api.explain_training(references, arch=arch, config=config, start_from=start_from, validation=validation,
+                                 longest_lag_ps=longest_lag_ps), nl=False)  # fmt: skip
+        return
+    if out is None:
+        raise typer.BadParameter("name the weights to write: -o w.safetensors", param_hint="--out")
     written = api.train(
         references,
         out,
@@ -303,13 +300,7 @@ def train(
         steps=steps,
         start_from=start_from,
         validation=validation,
-        time_reversal=time_reversal,
-        rare_draws=rare_draws,
-        rare_kinds=rare_kinds,
-        hydrogens=hydrogens,
-        entities=entities,
-        graph=graph,
-        longest_lag_ps=None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag"),
+        longest_lag_ps=longest_lag_ps,
         seed=seed,
         device=device,
         resume=resume,

@@ -51,16 +51,6 @@ class Guard(StrEnum):
     fallback = "fallback"
 
 
-class Hydrogens(StrEnum):
-    modelled = "modelled"
-    placed = "placed"
-
-
-class Entities(StrEnum):
-    atom = "atom"
-    residue = "residue"
-
-
 class Atoms(StrEnum):
     all = "all"
     heavy = "heavy"
@@ -72,11 +62,8 @@ SceneArg = Annotated[
 SaveVelocitiesOpt = Annotated[bool, typer.Option("--save-velocities", help="Keep them with each frame (.h5).")]
 SaveForcesOpt = Annotated[bool, typer.Option("--save-forces", help="Keep them with each frame (.h5).")]
 ArchOpt = Annotated[
-    str,
-    typer.Option(
-        "--arch",
-        help="lam-slide, painet, egnn; baselines: frozen, constant-velocity, resampling, normal-modes, msm.",
-    ),
+    str | None,
+    typer.Option("--arch", help="lam-slide, painet, egnn, a baseline, ... Default: what suits the references."),
 ]
 VelocitiesOpt = Annotated[bool, typer.Option("--velocities", help="Keep velocities, which painet learns from.")]
 ValidationOpt = Annotated[
@@ -94,16 +81,6 @@ EnergyEveryOpt = Annotated[
 MdBetweenOpt = Annotated[str | None, typer.Option("--md-between", help="So much real MD after each chunk.")]
 SelectOpt = Annotated[str | None, typer.Option("--select", help="Atoms to write, in MDTraj's words: backbone.")]
 AtomsOpt = Annotated[Atoms, typer.Option("--atoms", help="Write all atoms or no hydrogens.")]
-HydrogensOpt = Annotated[
-    Hydrogens | None,
-    typer.Option(
-        "--hydrogens", help=literal("placed: learn heavy atoms alone; rollouts get hydrogens. [default: modelled]")
-    ),
-]
-EntitiesOpt = Annotated[
-    Entities | None,
-    typer.Option("--entities", help=literal("residue: of peptides, as units; hydrogens are placed. [default: atom]")),
-]
 ForceOpt = Annotated[bool, typer.Option("--force", help="Roll a scene that leaves the training domain, marked.")]
 WantedTemperatureOpt = Annotated[
     str | None, typer.Option("--temperature", help="Refused if it is not that of the weights.")

@@ -1,43 +1,63 @@
-"""The known architectures: which configuration and which model a weights file's `arch` names."""
+"""The installed architectures: entry points of the group `surromd.architectures`, loaded when they are used."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+import tomllib
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
-from surrogate.models.baselines.model import BASELINES, BaselineConfig
-from surrogate.models.interface import Surrogate
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.heavy_atoms import lam_slide_model
-from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import EgnnForecaster, Painet
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from systems.errors import UnknownNameError, nearest
+from surrogate.models.architecture import Architecture
+from systems.errors import InputError, UnknownNameError, first_line, nearest
+
+GROUP = "surromd.architectures"
 
 
-@dataclass(frozen=True)
-class Architecture:
-    """`config` builds a configuration from a record (InputError for unknown keys), `model` a model from that."""
-
-    config: Callable[[dict[str, Any]], Any]
-    model: Callable[[Any], Surrogate]
+def names() -> list[str]:
+    """Return the names of all installed architectures; none is imported."""
+    return sorted(_found())
 
 
-ARCHITECTURES: dict[str, Architecture] = {
-    LamSlide.arch: Architecture(LamSlideConfig.from_dict, lam_slide_model),
-    PeptideSlide.arch: Architecture(PeptideConfig.from_dict, PeptideSlide),
-    Painet.arch: Architecture(PainetConfig.from_dict, Painet),
-    EgnnForecaster.arch: Architecture(PainetConfig.from_dict, EgnnForecaster),
-    **{kind.arch: Architecture(BaselineConfig.from_dict, kind) for kind in BASELINES},
-}
-
-
+@cache
 def architecture(name: str) -> Architecture:
-    """Return the architecture of this name. Raises UnknownNameError, naming the nearest."""
-    if name not in ARCHITECTURES:
-        raise UnknownNameError(
-            f"unknown architecture {name!r}; known: {', '.join(ARCHITECTURES)}.{nearest(name, list(ARCHITECTURES))}"
-        )
-    return ARCHITECTURES[name]
+    """Return the architecture of this name.
+
+    Raises UnknownNameError, naming the nearest, and InputError where its package cannot be imported or offers
+    something else under that name.
+    """
+    found = _found().get(name)
+    if found is None:
+        raise UnknownNameError(f"unknown architecture {name!r}; known: {', '.join(names())}.{nearest(name, names())}")
+    try:
+        loaded = found.load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"architecture {name!r} ({found.value}) cannot be loaded: {first_line(error)}.") from error
+    if not isinstance(loaded, Architecture) or loaded.name != name:
+        raise InputError(f"architecture {name!r}: {found.value} is no Architecture of this name; correct its package.")
+    return loaded
+
+
+@cache
+def _found() -> dict[str, EntryPoint]:
+    """Return the entry points by name. Raises InputError where two packages offer different ones under one name."""
+    found = {point.name: point for point in _own()}
+    for point in entry_points(group=GROUP):
+        known = found.setdefault(point.name, point)
+        if known.value != point.value:
+            raise InputError(
+                f"two installed packages offer the architecture {point.name!r} ({known.value} and {point.value}); "
+                "uninstall one."
+            )
+    return found
+
+
+def _own() -> list[EntryPoint]:
+    """Return surromd's own entry points of a source tree, which may be used without being installed."""
+    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    if not project.is_file():
+        return []
+    record = tomllib.loads(project.read_text("utf-8")).get("project", {})
+    if record.get("name") != "surromd":
+        return []
+    declared = record.get("entry-points", {}).get(GROUP, {})
+    return [EntryPoint(name, value, GROUP) for name, value in declared.items()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,3 +30,29 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise InputError(f"configuration {path} does not exist.") from None
     except (OSError, ValueError) as error:
         raise InputError(f"configuration {path} is not valid TOML: {error}.") from error
+
+
+def toml_text(record: dict[str, Any], table: str = "") -> str:
+    """Return a record as TOML that `read_toml` takes back; keys whose value is None are left out.
+
+    Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
+    """
+    kept = {key: value for key, value in record.items() if value is not None}
+    lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
+    text = "".join(f"{line}\n" for line in lines)
+    if table and (lines or not kept):
+        text = f"[{table}]\n{text}"
+    for key, value in kept.items():
+        if isinstance(value, dict):
+            text += ("\n" if text else "") + toml_text(value, f"{table}.{key}" if table else key)
+    return text
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        pairs = [f"{key} = {_inline(each)}" for key, each in value.items() if each is not None]
+        return "{" + ", ".join(pairs) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_inline(each) for each in value) + "]"
+    # JSON's texts, booleans and finite numbers are TOML's.
+    return json.dumps(value)

@@ -1,221 +1,252 @@
-"""One training per architecture: what the verb `train` reads, sets up and starts."""
+"""The verb `train`: an architecture and settings that suit the references, then the training and its verdict."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
+from surrogate.data.shipped import weights_path
+from surrogate.models.registry import architecture, names
+from surrogate.progress import progress_bar
+from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from surrogate.verbs.scene_listing import tell
 from systems.errors import InputError
+from systems.trajectory.claim import Claim
+from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
-    from surrogate.data.frames import TrainingFrames
-
-T = TypeVar("T")
-# (stage, share of all that is to be done) -> None
-AdvanceFn = Callable[[str, float], None]
-# Names on the command line, what each needs: checked before torch is imported.
-GENERATIVE = ("lam-slide",)
-FORECASTERS = ("painet", "egnn")
-FITTED = ("frozen", "constant-velocity", "resampling", "normal-modes", "msm")
+    from surrogate.data.references import References
+    from surrogate.training.trainer import Choice, Trainer, TrainingRequest
 
 
 @dataclass(frozen=True)
-class TrainingRequest:
-    """What `api.train` was asked for, checked as far as names and numbers go."""
+class _Plan:
+    """What will be trained and how. `why`: one line for the architecture and one for each setting that was chosen."""
 
-    arch: str
-    paths: list[Path]
-    # Trajectories that are held out whole, for validation.
-    held: list[Path]
-    out: Path
-    config: Path | None
-    budget_s: float | None
-    steps: int | None
-    start_from: Path | None
-    time_reversal: bool
-    rare_draws: float
-    rare_kinds: bool
-    # 'modelled' or 'placed', 'atom' or 'residue'; None is what the configuration says.
-    hydrogens: str | None
-    entities: str | None
-    graph: bool
-    longest_lag_ps: float | None
-    seed: int
-    device: str
-    resume: bool
+    trainer: Trainer
+    references: References
+    request: TrainingRequest
+    choices: tuple[Choice, ...]
+    why: str
 
-    def check(self) -> None:
-        """Raise InputError for options that mean nothing to this architecture."""
-        if self.arch in FITTED:
-            given = {"--budget": self.budget_s, "--steps": self.steps, "--config": self.config}
-            self._refuse([k for k, v in given.items() if v is not None], "is fitted in one go")
-        elif self.budget_s is None and self.steps is None:
-            raise InputError("say how long to train: --budget 30min or --steps 10000.")
-        if self.arch in GENERATIVE:
-            if self.steps is not None and self.steps < 2:
-                raise InputError("--steps must be at least 2: one for each stage.")
-            if self.start_from is not None and self.config is not None:
-                raise InputError("--from takes the configuration of its weights; leave --config out.")
-            settings = {"--graph": self.graph, "--longest-lag": self.longest_lag_ps, "--hydrogens": self.hydrogens,
-                        "--entities": self.entities}  # fmt: skip
-            told = [k for k, v in settings.items() if v]
-            if self.start_from is not None and told:
-                raise InputError(f"--from takes the configuration of its weights; leave {' and '.join(told)} out.")
-        else:
-            others = {"--from": self.start_from, "--time-reversal": self.time_reversal, "--rare-draws": self.rare_draws,
-                      "--rare-kinds": self.rare_kinds, "--hydrogens": self.hydrogens, "--entities": self.entities,
-                      "--graph": self.graph, "--longest-lag": self.longest_lag_ps}  # fmt: skip
-            self._refuse([k for k, v in others.items() if v], "does not know it")
-
-    def _refuse(self, options: list[str], why: str) -> None:
-        if options:
-            raise InputError(f"{', '.join(options)}: {self.arch} {why}; leave it out.")
+    def lines(self) -> list[str]:
+        return [f"arch = {self.request.arch}: {self.why}", *(choice.line() for choice in self.choices)]
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A training whose input has been read and found fit: `start(advance)` does it and returns the weights written."""
+def train(
+    references: Trajectories,
+    out: PathLike,
+    *,
+    arch: str | None = None,
+    config: PathLike | None = None,
+    budget_s: Quantity | None = None,
+    steps: int | None = None,
+    start_from: PathLike | None = None,
+    validation: Trajectories | None = None,
+    longest_lag_ps: Quantity | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+) -> Path:
+    """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
-    scene: str
-    start: Callable[[AdvanceFn], Path]
+    Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
+    reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
+    `arch`: an installed architecture (`surrogate.models.registry.names`): lam-slide; lam-slide-peptides; painet or its
+    decoder alone, egnn, which learn from velocities (a reference made with --save-velocities and natural hydrogen
+    masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
+    others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
+    `config`: a TOML file with tables [model] and [training]. `start_from`: weights (name or file) whose second stage is
+    trained further, with their configuration. `validation`: trajectories that the curves are measured on; without any
+    it is the last twentieth of each; molecules that are in `validation` alone are held out whole. A stretch of motion
+    that would be both trained on and validated on is refused. `longest_lag_ps`: every spacing of frames from that of
+    the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun
+    (surrogate.training.devices).
 
-def prepare_training(request: TrainingRequest) -> Prepared:
-    """Read the frames and settings of a training. Errors are those of `api.train`."""
-    if request.arch in GENERATIVE:
-        return _lam_slide(request)
-    return _forecaster(request) if request.arch in FORECASTERS else _fitted(request)
+    Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
+    end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are
+    usable and, where they are not, what would help (NAME.verdict.json, surrogate.verbs.train_verdict).
+    Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
+    """
+    out = Path(out)
+    asked = _asked(arch, out, config, budget_s, steps, start_from, longest_lag_ps)
+    asked = replace(asked, seed=seed, resume=resume)
+    if asked.arch:
+        _trainer(asked.arch).check(asked)
+    check_outputs([out], [".safetensors"], resume=resume, overwrite=overwrite)
+    states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+    if states and not (resume or overwrite):
+        raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
+    if resume and out.exists() and not states:
+        return out
+    plan = _plan(references, validation, replace(asked, device=_device(device)))
+    from surrogate.training.devices import is_first_process
 
+    first = is_first_process()
+    prepared = plan.trainer.prepare(plan.references, plan.request)
+    if first and not quiet:
+        for line in plan.lines():
+            tell(out.name, line)
+    claim = Claim(out) if first else nullcontext()
+    with claim, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
 
-def _lam_slide(request: TrainingRequest) -> Prepared:
-    from surrogate.data.molecules import FrameSets, collect_sets
-    from surrogate.data.weights import load_weights
-    from surrogate.models.lam_slide.config import LamSlideConfig
-    from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
+        def advance(stage: str, share: float) -> None:
+            if bar is not None:
+                bar(round(1000 * share), 1000, stage)
 
-    start = None
-    record, training = _read_config(request)
-    if request.start_from is not None:
-        start = load_weights(request.start_from)
-        if start.model.arch != request.arch:
-            raise InputError(f"{request.start_from} holds {start.model.arch}, not {request.arch}.")
-        model_config = start.model.config
-    else:
-        graph = request.graph or record.get("graph")
-        model_config = LamSlideConfig.of_many(record) if graph else LamSlideConfig.from_dict(record)
-    told: dict[str, Any] = {"hydrogens": request.hydrogens, "entities": request.entities}
-    model_config = replace(model_config, **{key: value for key, value in told.items() if value})
-    if model_config.graph:
-        sets = collect_sets(request.paths, held=request.held, spool=request.out.parent)
-    else:
-        sets = FrameSets((read_frames(request, canonical=model_config.canonical),))
-    for frames in sets.trained:  # too short a reference is refused before the first stage has been trained
-        for validation in (False, True):
-            frames.window_starts(model_config.approximator.chunk_frames, validation=validation)
-    steps = request.steps
-    alone = start is not None or model_config.latents_are_atoms  # stage two: nothing else is to be trained
-    first = None if steps is None else 0 if alone else max(1, round(steps * STAGE_ONE_SHARE))
-    asked = {
-        "budget_s": request.budget_s,
-        "stage_one_steps": first,
-        "stage_two_steps": None if steps is None or first is None else steps - first,
-        "seed": request.seed,
-        "device": request.device,
-        "time_reversal": request.time_reversal,
-        "rare_draws": request.rare_draws,
-        "rare_kinds": request.rare_kinds,
-        "longest_lag_ps": request.longest_lag_ps,
-    }
-    settings = _settings(TrainingConfig, request, training, asked)
-    share_one = 0.0 if alone else STAGE_ONE_SHARE
-
-    def run(advance: AdvanceFn) -> Path:
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
-
-        return train_lam_slide(
-            sets, request.out, model_config, settings, start=start, resume=request.resume, progress=report
-        )
-
-    return Prepared(sets.names, run)
-
-
-def _forecaster(request: TrainingRequest) -> Prepared:
-    from surrogate.models.painet.config import PainetConfig
-    from surrogate.models.painet.model import EgnnForecaster, Painet
-    from surrogate.models.painet.trainer import PainetTraining, train_painet
-
-    record, training = _read_config(request)
-    model_config = PainetConfig.from_dict(record)
-    asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
-    settings = _settings(PainetTraining, request, training, asked)
-    frames = read_frames(request, canonical=False, velocities=True)
-    span = model_config.n_new * model_config.frame_stride
-    frames.window_starts(2 * span + 1, validation=False)
-    frames.window_starts(span + 1, validation=True)
-    kind = EgnnForecaster if request.arch == EgnnForecaster.arch else Painet
-
-    def run(advance: AdvanceFn) -> Path:
-        def report(stage: str, share: float, metrics: dict[str, float]) -> None:
-            advance(stage, share)
-
-        return train_painet(
-            frames, request.out, model_config, settings, model_class=kind, resume=request.resume, progress=report
-        )
-
-    return Prepared(frames.scene.name, run)
+        written = prepared.start(advance)
+    if first:
+        _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
+    return written
 
 
-def _read_config(request: TrainingRequest) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the model's settings in the configuration file and its table `training`; both empty without a file."""
-    from surrogate.models.settings import read_toml
+def explain_training(
+    references: Trajectories,
+    *,
+    arch: str | None = None,
+    config: PathLike | None = None,
+    start_from: PathLike | None = None,
+    validation: Trajectories | None = None,
+    longest_lag_ps: Quantity | None = None,
+) -> str:
+    """Return the configuration file, filled in, that a training on these references would use; nothing is trained.
 
-    record = {} if request.config is None else read_toml(request.config)
-    training = record.pop("training", {})
-    if not isinstance(training, dict):
-        raise InputError(f"{request.config}: training is a table, [training], not {training!r}.")
-    return record, training
+    Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
+    """
+    asked = _asked(arch, Path("explained.safetensors"), config, None, None, start_from, longest_lag_ps)
+    # Whatever the budget is: it belongs to the command.
+    plan = _plan(references, validation, asked, explained=True)
+    from surrogate.models.settings import toml_text
+
+    head = "".join(f"# {line}\n" for line in plan.lines())
+    tables = plan.trainer.settings(plan.request).tables()
+    if start_from is not None:
+        tables.pop("model", None)
+    return head + toml_text({"arch": plan.request.arch, **tables})
 
 
-def _settings(kind: type[T], request: TrainingRequest, training: dict[str, Any], asked: dict[str, Any]) -> T:
-    """Return a training's settings from the file's and those `asked` for, which the file may not hold as well."""
-    from surrogate.models.settings import build
+def _asked(
+    arch: str | None, out: Path, config: PathLike | None, budget_s: Quantity | None, steps: int | None,
+    start_from: PathLike | None, longest_lag_ps: Quantity | None,
+) -> TrainingRequest:  # fmt: skip
+    """Return the request with the tables of the configuration file; `arch` is empty where nothing names one."""
+    from surrogate.training.trainer import TrainingRequest
 
-    if twice := sorted(asked.keys() & training):
-        raise InputError(f"{request.config}: training.{twice[0]} is set on the command line, not in this file.")
-    return build(kind, {**training, **asked}, "training.")
+    record = _read_config(config)
+    named = record.get("arch", arch)
+    if arch is not None and named != arch:
+        raise InputError(f"{config} is for {named}, the command asks for {arch}; leave one of the two out.")
+    start = None if start_from is None else weights_path(start_from)
+    if named is None and start is not None:
+        from surrogate.data.weights import read_header
 
-
-def _fitted(request: TrainingRequest) -> Prepared:
-    from surrogate.models.baselines.trainer import fit_baseline
-
-    frames = read_frames(request, canonical=True)
-    return Prepared(
-        frames.scene.name, lambda advance: fit_baseline(request.arch, frames, request.out, seed=request.seed)
+        named = read_header(start).arch
+    if named is not None:
+        architecture(named)
+    return TrainingRequest(
+        arch=named or "",
+        out=out,
+        budget_s=quantity("budget_s", budget_s),
+        steps=steps,
+        start_from=start,
+        longest_lag_ps=quantity("longest_lag_ps", longest_lag_ps),
+        model=record["model"],
+        training=record["training"],
     )
 
 
-def read_frames(request: TrainingRequest, *, canonical: bool, velocities: bool = False) -> TrainingFrames:
-    """Return the frames of one windows file or of trajectories, as the architecture wants them."""
-    from surrogate.data.frames import collect_frames, is_windows, load_frames
+def _read_config(config: PathLike | None) -> dict[str, Any]:
+    """Return `arch`, where it is named, and the tables `model` and `training` of a configuration file."""
+    from surrogate.models.settings import read_toml
 
-    if not any(is_windows(path) for path in request.paths):
-        frames = collect_frames(
-            request.paths, canonical=canonical, velocities=velocities, held=request.held, spool=request.out.parent
-        )
-        frames.refuse_leaks()
-        return frames
-    if request.held:
-        raise InputError("--validation needs trajectories to train on; a windows file keeps its own split.")
-    if len(request.paths) > 1:
-        raise InputError("give either trajectories or one windows file to train on.")
-    frames = load_frames(request.paths[0])
-    if velocities and frames.velocities is None:
+    record = {} if config is None else read_toml(config)
+    for table in ("model", "training"):
+        if not isinstance(record.setdefault(table, {}), dict):
+            raise InputError(f"{config}: {table} is a table, [{table}], not {record[table]!r}.")
+    if not isinstance(record.get("arch", ""), str):
+        raise InputError(f"{config}: arch is the name of an architecture, not {record['arch']!r}.")
+    if unknown := sorted(record.keys() - {"arch", "model", "training"}):
         raise InputError(
-            f"{request.paths[0]} holds no velocities, which {request.arch} learns from; make it with "
-            "`surromd windows --velocities`."
+            f"{config}: unknown key {unknown[0]}; a configuration holds arch and the tables [model] and [training] "
+            f"(such as model.{unknown[0]})."
         )
-    frames.refuse_leaks()
-    return frames
+    return record
+
+
+def _trainer(name: str) -> Trainer:
+    trainer: Trainer = architecture(name).trainer()
+    return trainer
+
+
+def _device(name: str) -> str:
+    from surrogate.training.devices import choose_device
+
+    return choose_device(name)
+
+
+def _plan(references: Trajectories, validation: Trajectories | None, asked: TrainingRequest, *,
+          explained: bool = False) -> _Plan:  # fmt: skip
+    """Find the references and choose what is not asked for."""
+    from surrogate.data.references import References
+
+    paths = find_trajectories(references, verify=True)
+    held = [] if validation is None else find_trajectories(validation, verify=True)
+    found = References(tuple(paths), tuple(held), spool=asked.out.parent)
+    why = "asked for"
+    if not asked.arch:
+        name, why = _suited(found)
+        asked = replace(asked, arch=name)
+    trainer = _trainer(asked.arch)
+    if not explained:
+        trainer.check(asked)
+    choices = trainer.choose(found, asked)
+    return _Plan(trainer, found, asked.with_choices(choices), choices, why)
+
+
+def _suited(references: References) -> tuple[str, str]:
+    """Return the name of the architecture that suits the references best, and why."""
+    survey = references.survey()
+    fits = [(fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
+    if not fits:
+        raise InputError("no installed architecture suits these references by itself; name one with --arch.")
+    best, name = max(fits, key=lambda found: found[0].rank)
+    return name, best.reason
+
+
+@contextmanager
+def _said_when_stopped(out: Path) -> Iterator[None]:
+    """Say, when a training is interrupted, what of it is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+        if not kept:
+            raise KeyboardInterrupt("no training state had been saved yet") from None
+        raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
+
+
+def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
+    """Draw the curves and try the weights; say what they are good for."""
+    curves = written.with_suffix(".csv")
+    if curves.exists():
+        from surrogate.training.loss_curves import plot_curves
+
+        plot_curves(curves)
+    if fitted:
+        return
+    from surrogate.verbs.train_verdict import judge_training, write_verdict
+
+    try:
+        verdict = judge_training(written)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
+    write_verdict(written, verdict)
+    if not quiet:
+        for line in verdict.lines():
+            tell(written.name, line)

@@ -187,7 +187,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
 
     found = _nearer_weights(weights)
     if _hydrogens_could_be_placed(weights) and 2 * rolled.n_with_hydrogen >= rolled.n_stretched:
-        found.append("hydrogens placed about the heavy atoms instead of learned (--hydrogens placed)")
+        found.append('hydrogens placed about the heavy atoms instead of learned (model.hydrogens = "placed")')
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
     rows = list(stages.values())[-1] if stages else []
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")

@@ -13,7 +13,7 @@ import pytest
 from command_line import run
 from systems.trajectory.codec import open_trajectory
 
-TINY = "n_new = 4\nwidth = 16\nn_heads = 2\nhead_dim = 8\nn_decoder_layers = 1\n"
+TINY = "[model]\nn_new = 4\nwidth = 16\nn_heads = 2\nhead_dim = 8\nn_decoder_layers = 1\n"
 
 
 def done(*arguments: str) -> Any:
@@ -83,8 +83,8 @@ def test_a_baseline_is_fitted_and_rolls_out(tmp_path: Path, moving: Path, arch: 
 def test_what_an_architecture_cannot_use_is_refused(tmp_path: Path, moving: Path) -> None:
     out = ["-o", str(tmp_path / "m.safetensors")]
     assert "Did you mean 'painet'?" in refusal("train", str(moving), "--arch", "painte", "--steps", "4", *out)
-    assert "--rare-draws" in refusal("train", str(moving), "--arch", "painet", "--steps", "4", "--rare-draws", "0.5",
-                                     *out)  # fmt: skip
+    assert "--longest-lag" in refusal("train", str(moving), "--arch", "painet", "--steps", "4", "--longest-lag", "1ps",
+                                      *out)  # fmt: skip
     assert "--budget" in refusal("train", str(moving), "--arch", "msm", "--budget", "1min", *out)
     assert "--budget 30min" in refusal("train", str(moving), "--arch", "painet", *out)
     still = str(tmp_path / "still.h5")

@@ -94,8 +94,8 @@ def test_training_data_are_the_complete_runs_with_the_right_hashes(finished: Pat
 def test_one_trains_on_a_campaign_s_folder(finished: Path, tmp_path: Path) -> None:
     settings = tmp_path / "small.toml"
     settings.write_text(
-        "[autoencoder]\nlatent_dim = 12\nwidth = 64\nhead_dim = 16\nrandom_identifiers = 0.0\n"
-        "[approximator]\nchunk_frames = 2\nwidth = 64\nn_layers = 1\nn_heads = 2\nauxiliary_frames = 1\n"
+        "[model.autoencoder]\nlatent_dim = 12\nwidth = 64\nhead_dim = 16\nrandom_identifiers = 0.0\n"
+        "[model.approximator]\nchunk_frames = 2\nwidth = 64\nn_layers = 1\nn_heads = 2\nauxiliary_frames = 1\n"
     )
     out = tmp_path / "w.safetensors"
     trained = run("train", str(finished), "-o", str(out), "--steps", "4", "--config", str(settings), "--quiet")

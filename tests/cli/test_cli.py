@@ -315,14 +315,14 @@ def test_ctrl_c_says_what_is_kept_and_resume_goes_on(here: Path) -> None:
 
 
 TINY = """
-[autoencoder]
+[model.autoencoder]
 latent_dim = 8
 width = 16
 n_heads = 2
 head_dim = 8
 identifier_dim = 8
 
-[approximator]
+[model.approximator]
 chunk_frames = 8
 width = 16
 n_layers = 1
@@ -364,14 +364,14 @@ def test_training_twice_needs_overwrite(here: Path, tiny_weights: Path, short_ru
 
 
 def test_a_reference_too_short_to_train_on_leaves_nothing(here: Path, short_run: Path) -> None:
-    (here / "long.toml").write_text("[approximator]\nchunk_frames = 64\n")
+    (here / "long.toml").write_text("[model.approximator]\nchunk_frames = 64\n")
     message = refused(run("train", str(short_run), "--config", "long.toml", "--steps", "6", "-o", "w.safetensors"))
     assert "64 frames" in message
     assert [p.name for p in here.iterdir()] == ["long.toml"]
 
 
 def test_an_unknown_setting_is_named_with_its_nearest(here: Path, short_run: Path) -> None:
-    (here / "typo.toml").write_text("[approximator]\nchunk_frame = 64\n")
+    (here / "typo.toml").write_text("[model.approximator]\nchunk_frame = 64\n")
     message = refused(run("train", str(short_run), "--config", "typo.toml", "--steps", "6", "-o", "w.safetensors"))
     assert "Did you mean 'chunk_frames'?" in message
 

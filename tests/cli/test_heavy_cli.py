@@ -1,4 +1,4 @@
-"""`train --hydrogens placed` and `--entities residue`, and what `rollout --atoms` writes of such weights."""
+"""Training with hydrogens placed and of residues, and what `rollout --atoms` writes of such weights."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-@pytest.mark.parametrize("option", [("--hydrogens", "placed"), ("--entities", "residue")])
-def test_weights_of_heavy_atoms_roll_all_atoms(folder: Path, option: tuple[str, str]) -> None:
-    weights, out = str(folder / f"{option[1]}.safetensors"), folder / f"{option[1]}.h5"
-    common = ["--config", str(folder / "small.toml"), "--steps", "20", "-q"]
-    done = run("train", str(folder / "ref.h5"), "-o", weights, *common, *option)
+@pytest.mark.parametrize("setting", [("hydrogens", "placed"), ("entities", "residue")])
+def test_weights_of_heavy_atoms_roll_all_atoms(folder: Path, setting: tuple[str, str]) -> None:
+    key, value = setting
+    weights, out, config = str(folder / f"{value}.safetensors"), folder / f"{value}.h5", folder / f"{value}.toml"
+    config.write_text(f'[model]\n{key} = "{value}"\n' + (folder / "small.toml").read_text())
+    done = run("train", str(folder / "ref.h5"), "-o", weights, "--config", str(config), "--steps", "20", "-q")
     assert done.exit_code == 0, done.stderr
-    config = json.loads(run("info", weights, "--json").stdout)["config"]
-    assert config[option[0].removeprefix("--")] == option[1]
+    assert json.loads(run("info", weights, "--json").stdout)["config"][key] == value
     scene = load("alanine-dipeptide")
     for atoms, n_atoms in (("all", scene.n_atoms), ("heavy", len(scene.heavy_idx))):
         rolled = run("rollout", "alanine-dipeptide", "--weights", weights, "--time", "9ps", "-o", str(out), "--guard",
@@ -43,15 +43,20 @@ def test_weights_of_heavy_atoms_roll_all_atoms(folder: Path, option: tuple[str, 
                   "4", "-q", "--overwrite")  # fmt: skip
     assert further.exit_code == 0, further.stderr
     refused = run("train", str(folder / "ref.h5"), "-o", str(folder / "g.safetensors"), "--from", weights, "--steps",
-                  "4", *option)  # fmt: skip
+                  "4", "--config", str(config))  # fmt: skip
     assert refused.exit_code == 1
-    assert f"leave {option[0]} out" in refused.stderr
+    assert "leave [model] of --config out" in refused.stderr
 
 
 def test_other_architectures_take_neither(folder: Path) -> None:
-    for option in (["--hydrogens", "placed"], ["--entities", "residue"]):
+    for name in ("placed", "residue"):
+        config = folder / f"egnn-{name}.toml"
+        config.write_text('[model]\nhydrogens = "placed"\n' if name == "placed" else '[model]\nentities = "residue"\n')
         refused = run("train", str(folder / "ref.h5"), "-o", str(folder / "p.safetensors"), "--arch", "egnn", "--steps",
-                      "4", *option)  # fmt: skip
+                      "4", "--config", str(config))  # fmt: skip
         assert refused.exit_code == 1
-        assert option[0] in refused.stderr
-    assert run("train", str(folder / "ref.h5"), "-o", "x.safetensors", "--hydrogens", "some").exit_code == 2
+        assert "unknown key" in refused.stderr
+    config.write_text('[model]\nhydrogens = "some"\n')
+    refused = run("train", str(folder / "ref.h5"), "-o", str(folder / "x.safetensors"), "--steps", "4", "--config",
+                  str(config))  # fmt: skip
+    assert refused.exit_code == 1 and "choose modelled or placed" in refused.stderr

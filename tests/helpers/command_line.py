@@ -6,11 +6,11 @@ from typer.testing import CliRunner, Result
 
 # A LaM-SLidE for `train --config`.
 SMALL_LAM_SLIDE = """
-[autoencoder]
+[model.autoencoder]
 latent_dim = 12
 width = 32
 head_dim = 8
-[approximator]
+[model.approximator]
 chunk_frames = 4
 width = 32
 n_layers = 1

@@ -44,12 +44,12 @@ platform = "Reference"
 out = "c"
 """
 TINY = """
-[autoencoder]
+[model.autoencoder]
 latent_dim = 8
 width = 32
 head_dim = 16
 random_identifiers = 0.0
-[approximator]
+[model.approximator]
 chunk_frames = 2
 width = 32
 n_layers = 1

@@ -2,7 +2,7 @@
 REF... --test REF...`.
 
 Three LaM-SLidE of alanine dipeptide (or another peptide with phi and psi) are trained for the same time: of all atoms,
-of heavy atoms whose hydrogens are placed (`train --hydrogens placed`), and of residues (`train --entities residue`).
+of heavy atoms whose hydrogens are placed (`hydrogens = "placed"`), and of residues (`entities = "residue"`).
 Each draws one chunk from frames of a trajectory that it never saw, beside MD from the same frames (see
 `surrogate.bench.lag_errors`), and is timed. What is finished in FOLDER is not done again.
 """

@@ -213,12 +213,3 @@ def pick(noise: Tensor, n: Tensor) -> Tensor:
     """Turn normal noise into an index below `n`, of the same shape, each as likely."""
     share = torch.special.ndtr(noise.double())
     return torch.minimum((share * n).long(), n - 1)
-
-
-BASELINES: tuple[type[Baseline], ...] = (
-    FrozenFrame,
-    ConstantVelocity,
-    TrainingFrameResampling,
-    NormalModes,
-    MarkovStateModel,
-)

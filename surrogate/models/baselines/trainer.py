@@ -11,9 +11,9 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data.frames import TrainingFrames
+from surrogate.data.references import References
 from surrogate.data.weights import save_weights
 from surrogate.models.baselines.model import (
-    BASELINES,
     Baseline,
     BaselineConfig,
     ConstantVelocity,
@@ -23,6 +23,7 @@ from surrogate.models.baselines.model import (
     TrainingFrameResampling,
 )
 from surrogate.training.provenance import provenance_of, training_domain
+from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
 
 N_KEPT_FRAMES = 4000
@@ -37,7 +38,7 @@ def fit_baseline(arch: str, frames: TrainingFrames, out: str | Path, *, n_new: i
 
     Raises InputError when the frames are not in the canonical pose that the baseline needs, or too few.
     """
-    (kind,) = (b for b in BASELINES if b.arch == arch)
+    (kind,) = (b for b in FITS if b.arch == arch)
     if kind.fitted and not frames.canonical:
         raise InputError(f"{arch} is fitted to canonical frames; make the windows without --no-canonical.")
     model = FITS[kind](frames, n_new, np.random.default_rng(seed))
@@ -158,3 +159,20 @@ FITS: dict[type[Baseline], Callable[[TrainingFrames, int, np.random.Generator], 
     NormalModes: fit_normal_modes,
     MarkovStateModel: fit_markov_state_model,
 }
+
+
+class BaselineTrainer(Trainer):
+    """Fits a baseline in one go; there is nothing to set."""
+
+    fitted = True
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`."""
+        return Settings(None, None)
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`."""
+        frames = references.frames(canonical=True)
+        return Prepared(
+            frames.scene.name, lambda advance: fit_baseline(request.arch, frames, request.out, seed=request.seed)
+        )

@@ -68,7 +68,7 @@ class TrainingConfig:
     # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
     longest_lag_ps: float | None = None
     # What rollouts take from the reference (models.stiff): 'held', the bonds that it holds rigid; 'drawn', the width of
-    # its other bonds and of its angles too; 'modelled', nothing. A --graph model holds bonds to hydrogen by itself.
+    # its other bonds and of its angles too; 'modelled', nothing. A model of many molecules holds them by itself.
     stiff: str = "held"
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ def train_lam_slide(
     if not model_config.graph:
         stiff = _stiff_terms(frames.trained[0] if isinstance(frames, FrameSets) else frames, config, start)
     elif config.stiff == "drawn":
-        raise InputError("training.stiff = 'drawn' is for one molecule; leave it out with --graph.")
+        raise InputError("training.stiff = 'drawn' is for one molecule; leave it out where model.graph = true.")
     if model_config.on_heavy_atoms:
         heavy = on_heavy_atoms(frames, model_config, start, several_lags=config.longest_lag_ps is not None)
         frames, model_config, start = heavy.frames, heavy.config, heavy.start
@@ -178,7 +178,9 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
         raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
     if not model_config.graph:
         if len(sets.trained) > 1 or sets.unseen:
-            raise InputError(f"{sets.names}: a model of several molecules knows atoms by their bonds; add --graph.")
+            raise InputError(
+                f"{sets.names}: a model of several molecules knows atoms by their bonds; set model.graph = true."
+            )
         residues = model_config.residues
         n, what = (first.scene.n_atoms, "atoms") if residues is None else (len(residues.types), "residues")
         if n > model_config.autoencoder.identifier_pool:
@@ -189,7 +191,7 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
     if config.longest_lag_ps is not None:
         told = replace(told, lag_range_ps=(first.lag_ps, config.longest_lag_ps))
     if (model_config.graph or told.lag_range_ps) and (config.rare_draws or config.rare_kinds or told.rare_kinds):
-        raise InputError("rare windows are told of one molecule at one lag; leave --rare-draws and --rare-kinds out.")
+        raise InputError("rare windows are told of one molecule at one lag; leave rare_draws and rare_kinds out.")
     if config.rare_kinds and not told.rare_kinds:
         told = replace(told, rare_kinds=rare_kinds(first, told.chunk_frames))
     return replace(model_config, approximator=told)

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
+from surrogate.data.references import References
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
+from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
 
 
@@ -209,3 +211,33 @@ def forecast_errors(model: Painet, structure: Structure, windows: StateWindows) 
         "frozen_a_mse_a2": float(100.0 * (x[:, None] - x_true).square().mean()),
         "validation_velocity_nm_ps": float((v_new[:, -1] - v_true).square().mean().sqrt()),
     }
+
+
+class PainetTrainer(Trainer):
+    """Trains PAINET, or its decoder alone, as `model_class` says."""
+
+    def __init__(self, model_class: type[Painet]) -> None:
+        self.model_class = model_class
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`. Frame spacing and bath are the reference's (`for_frames`)."""
+        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
+        training = request.settings(PainetTraining, asked)
+        settled = frozenset({*asked, "lag_ps", "temperature_k", "friction_per_ps"})
+        return Settings(PainetConfig.from_dict(request.model), training, settled)
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`. Raises InputError for references without velocities."""
+        settings = self.settings(request)
+        frames = references.frames(canonical=False, velocities=True)
+        span = settings.model.n_new * settings.model.frame_stride
+        frames.window_starts(2 * span + 1, validation=False)
+        frames.window_starts(span + 1, validation=True)
+
+        def run(advance: AdvanceFn) -> Path:
+            return train_painet(
+                frames, request.out, settings.model, settings.training, model_class=self.model_class,
+                resume=request.resume, progress=lambda stage, share, metrics: advance(stage, share),
+            )  # fmt: skip
+
+        return Prepared(frames.scene.name, run)

@@ -226,7 +226,7 @@ def test_mixtures_that_no_model_can_learn_are_refused(
     with pytest.raises(InputError, match="350"):
         collect_sets([ethanol, write(smiles("CCC"), "propane-hot", kelvin=350.0)])
     sets = collect_sets([ethanol, propane])
-    with pytest.raises(InputError, match="--graph"):
+    with pytest.raises(InputError, match="graph = true"):
         train_lam_slide(sets, tmp_path / "x.safetensors", small_model_config, QUICK)
     with pytest.raises(InputError, match="rare"):
         train_lam_slide(sets, tmp_path / "x.safetensors", graph_config, replace(QUICK, rare_kinds=True))

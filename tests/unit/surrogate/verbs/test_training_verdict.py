@@ -19,11 +19,11 @@ from systems.scene import Scene
 from systems.trajectory.codec import open_writer
 
 SMALL = """
-[autoencoder]
+[model.autoencoder]
 latent_dim = 12
 width = 64
 head_dim = 16
-[approximator]
+[model.approximator]
 chunk_frames = 8
 width = 64
 n_layers = 2
@@ -59,7 +59,7 @@ def test_too_short_a_training_is_called_unusable_and_told_what_would_help(
     assert "autoencoder 2 steps, flow 8 steps; validation error" in said and "not usable as it is" in said
     advice = " ".join(verdict["advice"])
     assert "--from alanine-dipeptide" in advice, "shipped weights know this molecule under these conditions"
-    assert "--hydrogens placed" in advice and "more minutes" in advice and "800 frames are few" in advice
+    assert 'hydrogens = "placed"' in advice and "more minutes" in advice and "800 frames are few" in advice
     assert out.exists() and not list(tmp_path.glob("*.h5"))
 
 

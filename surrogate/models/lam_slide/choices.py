@@ -1,0 +1,175 @@
+"""The training of LaM-SLidE as the verb `train` sees it: what suits the references, all settings, and the start."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from surrogate.data.features.hydrogen_shapes import hydrogen_sites
+from surrogate.data.features.residue_layout import residue_layout
+from surrogate.data.molecules import FrameSets
+from surrogate.data.rarity import rare_kinds
+from surrogate.data.references import References
+from surrogate.data.weights import load_weights, read_header
+from surrogate.models.architecture import Survey
+from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
+from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
+from systems.errors import InputError
+from systems.scene import Scene
+from systems.selection import part_of
+
+# Frames from which on rare states are weighted in a further training: fewer do not tell how often they come.
+_FRAMES_FOR_RARE = 50_000
+# Of the recipes whose results README states.
+_MANY_BATCH = 32
+_RARE_DRAWS = 0.3
+_SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
+
+
+class LamSlideTrainer(Trainer):
+    """One molecule at one spacing of frames keeps the defaults wherever these take it."""
+
+    goes_on = True
+    learns_lags = True
+
+    def check(self, request: TrainingRequest) -> None:
+        """See `Trainer.check`."""
+        super().check(request)
+        if request.steps is not None and request.steps < 2:
+            raise InputError("--steps must be at least 2: one for each stage.")
+        if request.start_from is not None:
+            if request.longest_lag_ps is not None:
+                raise InputError("--from takes the configuration of its weights; leave --longest-lag out.")
+            if request.model:
+                raise InputError("--from takes the configuration of its weights; leave [model] of --config out.")
+            found = read_header(request.start_from).arch
+            if found != request.arch:
+                raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
+
+    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+        """See `Trainer.choose`."""
+        survey, found = references.survey(), list[Choice]()
+        if request.start_from is not None:
+            found = _rare_states(references, survey, self.settings(request).model)
+        else:
+            many = bool(request.model.get("graph", not survey.one_molecule))
+            lags = request.longest_lag_ps or request.training.get("longest_lag_ps")
+            if many:
+                found += [
+                    Choice("model.graph", True, f"{_names(survey)}: atoms are known by their bonds"),
+                    Choice("training.stage_two_batch", _MANY_BATCH, "as measured for many molecules"),
+                ]
+            else:
+                found += _entities(survey.scenes[0], request, placed=not lags)
+            if (many or lags) and survey.equilibrium:
+                found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+        return tuple(choice for choice in found if not _is_set(choice.key, request))
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`."""
+        if request.start_from is not None:
+            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
+        elif request.model.get("graph"):
+            model = LamSlideConfig.of_many(request.model)
+        else:
+            model = LamSlideConfig.from_dict(request.model)
+        steps, first = request.steps, None
+        if steps is not None:
+            first = 0 if _alone(request, model) else max(1, round(steps * STAGE_ONE_SHARE))
+        asked: dict[str, Any] = {
+            "budget_s": request.budget_s,
+            "stage_one_steps": first,
+            "stage_two_steps": None if steps is None or first is None else steps - first,
+            "seed": request.seed,
+            "device": request.device,
+        }
+        if request.longest_lag_ps is not None:
+            asked["longest_lag_ps"] = request.longest_lag_ps
+        return Settings(model, request.settings(TrainingConfig, asked), _SETTLED)
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`."""
+        settings = self.settings(request)
+        model: LamSlideConfig = settings.model
+        start = None if request.start_from is None else load_weights(request.start_from)
+        if model.graph:
+            sets = references.sets()
+        else:
+            sets = FrameSets((references.frames(canonical=model.canonical),))
+        for frames in sets.trained:  # too short a reference is refused before the first stage has been trained
+            for validation in (False, True):
+                frames.window_starts(model.approximator.chunk_frames, validation=validation)
+        share_one = 0.0 if _alone(request, model) else STAGE_ONE_SHARE
+
+        def run(advance: AdvanceFn) -> Path:
+            def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+                advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
+
+            return train_lam_slide(
+                sets, request.out, model, settings.training, start=start, resume=request.resume, progress=report
+            )
+
+        return Prepared(sets.names, run)
+
+
+def _alone(request: TrainingRequest, model: LamSlideConfig) -> bool:
+    """Return whether stage two is all that is trained."""
+    return request.start_from is not None or model.latents_are_atoms
+
+
+def _is_set(key: str, request: TrainingRequest) -> bool:
+    """Return whether the configuration file holds this key already."""
+    found: Any = {"model": request.model, "training": request.training}
+    for name in key.split("."):
+        if not isinstance(found, dict) or name not in found:
+            return False
+        found = found[name]
+    return True
+
+
+def _names(survey: Survey) -> str:
+    n = len(survey.scenes) + len(survey.unseen)
+    return f"{n} molecule{'s' if n > 1 else ''}"
+
+
+def _entities(scene: Scene, request: TrainingRequest, *, placed: bool) -> list[Choice]:
+    """Return what an identifier stands for, where there are more atoms than identifiers."""
+    given = request.model.get("autoencoder", {})
+    pool = given.get("identifier_pool", asdict(AutoencoderConfig())["identifier_pool"])
+    told = {"hydrogens", "entities"} & request.model.keys()
+    if scene.n_atoms <= pool or told:
+        return []
+    many = f"{scene.n_atoms} atoms, more than {pool} identifiers"
+    heavy = len(scene.heavy_idx)
+    if placed and _works(hydrogen_sites, scene):
+        if _works(residue_layout, part_of(scene, scene.heavy_idx)) and len(scene.residue_names) <= pool:
+            return [Choice("model.entities", "residue", f"{many}; a peptide: residues, with hydrogens placed")]
+        if heavy <= pool:
+            return [Choice("model.hydrogens", "placed", f"{many}; {heavy} heavy ones, hydrogens placed about them")]
+    return [Choice("model.autoencoder.identifier_pool", scene.n_atoms, many)]
+
+
+def _works(find: Any, scene: Scene) -> bool:
+    try:
+        find(scene)
+    except InputError:
+        return False
+    return True
+
+
+def _rare_states(references: References, survey: Survey, model: LamSlideConfig) -> list[Choice]:
+    """Return how rare states are weighted in a further training of one molecule at one lag, where it shows any."""
+    told = model.approximator
+    if model.graph or told.lag_range_ps or survey.n_frames < _FRAMES_FOR_RARE or not survey.one_molecule:
+        return []
+    try:
+        n = len(rare_kinds(references.frames(canonical=model.canonical), told.chunk_frames))
+    except InputError:
+        return []
+    why = f"{n} kinds of rare windows in {survey.n_frames} frames"
+    return [
+        Choice("training.rare_kinds", True, f"{why}, known to the network"),
+        Choice("training.rare_draws", _RARE_DRAWS, "rare windows drawn more often, each weighted down by as much"),
+    ]

@@ -1,0 +1,53 @@
+"""The training of the model of peptides as the verb `train` sees it: what suits the references, settings, start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from surrogate.data.references import References
+from surrogate.models.peptides.model import PeptideConfig
+from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
+from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
+
+# Share of the longest trajectory that a window may span: its end is held out.
+_SPAN = 0.9
+
+
+class PeptideTrainer(Trainer):
+    """One flow for peptides of any sequence and any spacing of frames."""
+
+    learns_lags = True
+
+    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+        """See `Trainer.choose`."""
+        survey, known = references.survey(), PeptideConfig()
+        found = []
+        if "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
+            found.append(Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
+        if "longest_ps" not in request.model:
+            reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
+            if request.longest_lag_ps is not None:
+                found.append(Choice("model.longest_ps", request.longest_lag_ps, "--longest-lag"))
+            elif reach < known.longest_ps:
+                found.append(Choice("model.longest_ps", reach, "as far as every reference reaches"))
+        if "time_reversal" not in request.training and survey.equilibrium:
+            found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+        return tuple(found)
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`."""
+        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
+        training = request.settings(PeptideTraining, asked)
+        return Settings(PeptideConfig.from_dict(request.model), training, frozenset(asked))
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`."""
+        settings, sets = self.settings(request), references.sets()
+
+        def run(advance: AdvanceFn) -> Path:
+            return train_peptides(
+                sets.trained, request.out, settings.model, settings.training, unseen=sets.unseen,
+                resume=request.resume, progress=lambda stage, share, metrics: advance(stage, share),
+            )  # fmt: skip
+
+        return Prepared(sets.names, run)
