@@ -145,8 +145,13 @@ class Scene:
             residues.append(topology.addResidue(name, chains[chain_id], resid))
         atoms = []
         for name, symbol, res in zip(self.atom_names, self.elements, self.residue_of_atom, strict=True):
-            element = None if symbol == PARTICLE else app.Element.getBySymbol(symbol)
-            atoms.append(topology.addAtom(name, element, residues[res]))
+            try:
+                element = None if symbol == PARTICLE else app.Element.getBySymbol(symbol)
+                atoms.append(topology.addAtom(name, element, residues[res]))
+            except KeyError:
+                raise InputError(f"Scene {self.name!r}: atom {name} is of no element, but {symbol!r}.") from None
+            except ValueError:  # as OpenMM found it
+                break
         if [a.index for a in topology.atoms()] != list(range(self.n_atoms)):
             raise InputError(f"Scene {self.name!r}: atoms of one residue or chain are not contiguous.")
         for (i, j), order in zip(self.bonds.tolist(), self.bond_orders.tolist(), strict=True):

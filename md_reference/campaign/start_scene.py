@@ -29,6 +29,7 @@ class PreparedScene:
 
     def account(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
+        repairs = self.scene.provenance.get("repairs")
         return {
             "n_atoms": self.scene.n_atoms,
             "formula": self.scene.formula,
@@ -36,7 +37,7 @@ class PreparedScene:
             "molecule_key": molecule_key(self.scene),
             "platform": self.platform.name,
             "force": asdict(self.force),
-            "repairs": list(self.scene.provenance.get("repairs", [])),
+            "repairs": list(map(str, repairs)) if isinstance(repairs, list | tuple) else [],
         }
 
 

@@ -99,7 +99,7 @@ def _target(ensemble: str, temperature_k: float) -> float | None:
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
     """Return the summary for people, a line or two."""
-    if "temperature_k" not in summary:
+    if not {"temperature_k", "potential_kj_mol"} <= summary.keys():
         return []
     temperature = summary["temperature_k"]
     parts = [f"temperature {_with_error(temperature, 'K')}"]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from md_reference.run.integrators import integrator_name
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
+from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
@@ -95,6 +97,18 @@ def simulate(
     return out
 
 
+@dataclass(frozen=True)
+class _Stand:
+    """Where a run stands, as its checkpoint says beside what all of them do; while it equilibrates, so far."""
+
+    config: dict[str, Any] = field(default_factory=dict)
+    wall_s: float = 0.0
+    platform: str = ""
+    threads: Annotated[int, range(1, 1025)] = 1
+    steps_into_frame: Annotated[int, range(2**63)] = 0
+    equilibrated_steps: Annotated[int, range(2**63)] | None = None
+
+
 class _Run:
     """One run on its way: what is done, since when, and where its checkpoint goes."""
 
@@ -111,27 +125,31 @@ class _Run:
         self.scene, self.config, self.out = scene, config, out
         self.checkpoint_every_s, self.resumed = checkpoint_every_s, kept is not None
         self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
+        own = {key: self.header[key] for key in self.header.keys() & _Stand.__annotations__.keys()}
+        try:
+            self.stand = built(_Stand, own)
+        except ValueError as error:
+            raise InputError(f"checkpoint {checkpoint_path(out)} cannot be gone on from ({error}).") from error
         if kept is not None:
-            check_same_run(self.header["config"], config, out)
+            check_same_run(self.stand.config, config, out)
         self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
         self.asked_to_stop: Callable[[], bool] = lambda: False
         self.preparing: PreparingFn = lambda _: None
         self.done = int(self.header["files"][0]["n_frames"])
-        self.steps_into_frame = int(self.header.get("steps_into_frame", 0))
-        self.spent_s = float(self.header.get("wall_s", 0.0))
+        self.steps_into_frame = self.stand.steps_into_frame
         self.started = self.saved_at = time.monotonic()
         self.piece = 10
         self.system: Any = None
 
     @property
     def wall_s(self) -> float:
-        return self.spent_s + time.monotonic() - self.started
+        return self.stand.wall_s + time.monotonic() - self.started
 
     def prepare(self, choice: PlatformChoice | None, max_threads: int) -> None:
         """Build the forces and settle the platform."""
         self.system = build_system(self.scene, self.config.force)
         if self.resumed:
-            choice = PlatformChoice(self.header["platform"], self.header["threads"], "as before it was resumed")
+            choice = PlatformChoice(self.stand.platform, self.stand.threads, "as before it was resumed")
         self.choice = choice or measured_platform(
             self.scene,
             self.config.force,
@@ -160,7 +178,7 @@ class _Run:
 
     def engine_at_start(self) -> Engine:
         """Return the engine where the run was left, or at time 0."""
-        if self.resumed and "equilibrated_steps" not in self.header:
+        if self.resumed and self.stand.equilibrated_steps is None:
             engine = self.engine(self.config.ensemble)
             engine.restore(self.blob)
         else:
@@ -201,7 +219,7 @@ class _Run:
 
     def _equilibrate(self, engine: Engine) -> None:
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
-        done = int(self.header.get("equilibrated_steps", 0))
+        done = self.stand.equilibrated_steps or 0
         self.preparing(done / max(n_steps, 1))
         if self.blob:
             engine.restore(self.blob)

@@ -13,11 +13,16 @@ if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison, Judgement
 
 
+def _say(text: str) -> None:
+    """Print text of files, in which nothing steers the terminal."""
+    typer.echo(printable(text))
+
+
 def print_json(value: Any) -> None:
     """Print a value as indented JSON on stdout."""
     import json
 
-    typer.echo(json.dumps(value, indent=2, default=str))
+    _say(json.dumps(value, indent=2, default=str))
 
 
 def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
@@ -27,20 +32,20 @@ def print_pairs(record: dict[str, Any], indent: int = 0) -> None:
     for key, value in shown.items():
         margin = " " * indent
         if isinstance(value, dict):
-            typer.echo(f"{margin}{key}")
+            _say(f"{margin}{key}")
             print_pairs(value, indent + 2)
         elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) or " " in str(v) for v in value):
-            typer.echo(f"{margin}{key}")
+            _say(f"{margin}{key}")
             for entry in value:
-                typer.echo(f"{margin}  {_one_line(entry)}")
+                _say(f"{margin}  {_one_line(entry)}")
         else:
             text = ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else _plain(value)
-            typer.echo(f"{margin}{key:<{width}}  {text}")
+            _say(f"{margin}{key:<{width}}  {text}")
 
 
 def _one_line(entry: Any) -> str:
     if not isinstance(entry, dict):
-        return printable(str(entry))
+        return str(entry)
     if "what" in entry:
         saves = f" ({entry['saves']})" if entry.get("saves") else ""
         return f"{entry['what']}: {entry['why']}{saves}"
@@ -48,7 +53,7 @@ def _one_line(entry: Any) -> str:
 
 
 def _plain(value: Any, digits: int = 6) -> str:
-    return f"{value:.{digits}g}" if isinstance(value, float) else printable(str(value))
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def print_library(entries: list[dict[str, Any]]) -> None:
@@ -58,11 +63,11 @@ def print_library(entries: list[dict[str, Any]]) -> None:
     group = ""
     for entry in entries:
         if entry["group"] != group:
-            typer.echo(f"{chr(10) if group else ''}{entry['group']}")
+            _say(f"{chr(10) if group else ''}{entry['group']}")
             group = entry["group"]
         size = f"{entry['n_atoms']:>4} atoms  {entry['formula']}"
-        typer.echo(f"  {entry['name']:<20} {size:<26} {entry['title']}")
-    typer.echo(f"{chr(10)}{on_demand()}")
+        _say(f"  {entry['name']:<20} {size:<26} {entry['title']}")
+    _say(f"{chr(10)}{on_demand()}")
 
 
 def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
@@ -74,9 +79,9 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
         print_json(records)
     for path, record in zip(paths, records, strict=False):
         if not as_json:
-            typer.echo(f"{path}: {record['summary']}")
+            _say(f"{path}: {record['summary']}")
             for line in record.get("account", []):
-                typer.echo(f"  {line}")
+                _say(f"  {line}")
 
 
 def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool, show_all: bool = False) -> None:
@@ -86,23 +91,23 @@ def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: 
         print_json(result.to_dict())
         return
     for judgement in () if quiet else result.judgements:
-        typer.echo(f"{judgement.account.label}: {judgement.verdict}")
+        _say(f"{judgement.account.label}: {judgement.verdict}")
         for finding in judgement.findings:
-            typer.echo(f"  - {finding}")
+            _say(f"  - {finding}")
         if show_all:
             _print_rows(judgement)
         if judgement.speed_ratio is not None:
-            typer.echo(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
+            _say(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
         for note in judgement.notes:
-            typer.echo(f"  note: {note}")
+            _say(f"  note: {note}")
     for note in () if quiet else result.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"report: {report}")
+        _say(f"note: {note}")
+    _say(f"report: {report}")
 
 
 def _print_rows(judgement: Judgement) -> None:
-    typer.echo(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
+    _say(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
     for row in judgement.rows:
         figures = (row.reference, row.candidate, row.replicate)
         numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
-        typer.echo(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")
+        _say(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")

@@ -70,7 +70,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
 def precision_lines(record: dict[str, Any]) -> list[str]:
     """Return the precision in which a rollout's network was evaluated, and why; nothing of other files."""
     reason = record.get("precision_reason")
-    return [] if reason is None else [f"network in {record['precision']}: {reason}"]
+    return [] if reason is None else [f"network in {record.get('precision')}: {reason}"]
 
 
 def training_lines(record: dict[str, Any]) -> list[str]:
@@ -97,12 +97,13 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
     line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
     if helped:
         reasons = sorted(account["reasons"].items(), key=lambda r: -r[1])
-        line += f" ({_percent(helped / chunks)}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
+        line += f" ({_percent(helped / max(chunks, 1))}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
     lines = [line]
     if account["frames"]:
         done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
         extra = {name: value for name, value in account["seconds"].items() if name != "draw"}
-        shares = ", ".join(f"{name} {_percent(v / account['seconds']['draw'])}" for name, v in extra.items())
+        drawn_s = account["seconds"].get("draw") or math.inf
+        shares = ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in extra.items())
         lines += [
             f"frames that are not the surrogate's first draw: {done}",
             f"cost beside drawing chunks: {shares}",

@@ -91,7 +91,10 @@ def unpacked(data: bytes) -> tuple[dict[str, Any], bytes, bytes]:
     blob = rest[: int(size)] if size.isdigit() else b""
     if hashlib.sha256(text + blob).hexdigest().encode() != digest:
         raise ValueError("its checksum is wrong")
-    return parsed(text), blob, rest[len(blob) :]
+    header = parsed(text)
+    if not isinstance(header, dict):
+        raise ValueError("its header is no table")
+    return header, blob, rest[len(blob) :]
 
 
 def _digest(text: str) -> str:

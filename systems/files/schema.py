@@ -8,7 +8,7 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints, is_typeddict
 
 import numpy as np
 
@@ -27,7 +27,8 @@ def built(cls: type[T], record: Any, where: str = "") -> T:
 
     A list stands for a tuple, nested lists for an array, a whole number for a float, a table for a dataclass; numbers
     are finite and of 64 bits, text is without NUL. `Annotated[int, range(1, 10)]`: one of these numbers;
-    `Annotated[array, (-1, 3)]`: of that shape, where it may also be empty.
+    `Annotated[array, (-1, 3)]`: of that shape, where it may also be empty; `Annotated[float, ...]`: also one that is
+    not finite. A TypedDict is a table that may hold more.
     """
     if not isinstance(record, Mapping):
         raise ValueError(f"{where.rstrip('.') or cls.__name__} must be a table, not {_shown(record)}")
@@ -65,6 +66,10 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
     origin, args = get_origin(hint), get_args(hint)
     if hint is Any:
         return value
+    if is_typeddict(hint):
+        return _table(value, hint, where)
+    if origin is Annotated and args[1] is ...:
+        return value if isinstance(value, float) else fitted(value, args[0], where)
     if origin is Annotated:
         found, shape = fitted(value, args[0], where), args[1]
         if isinstance(shape, range):
@@ -107,6 +112,13 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
     return _refuse(value, hint, where)
 
 
+def _table(value: Any, hint: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict) or not hint.__required_keys__ <= value.keys():
+        raise ValueError(f"{where} must be a table of {', '.join(hint.__annotations__)}, not {_shown(value)}")
+    known = _hints(hint)
+    return {key: fitted(v, known.get(key, Any), f"{where}.{key}") for key, v in value.items()}
+
+
 def _is_whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) < _LARGEST
 
@@ -117,7 +129,7 @@ def _array(value: Any, kind: type[Any], where: str) -> Any:
     whole = issubclass(kind, np.integer)
     try:
         found = np.asarray(value)
-        if found.dtype.kind in ("iu" if whole else "iuf") or not found.size:
+        if found.ndim and (found.dtype.kind in ("iu" if whole else "iuf") or not found.size):
             found = np.array(found, dtype=np.float64 if kind is np.floating else kind)
             if np.isfinite(found).all():
                 return found

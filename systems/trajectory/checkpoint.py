@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from systems.errors import InputError, TrajectoryError
 from systems.files.checksums import packed, unpacked
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
+from systems.files.schema import built
 
 _MAGIC = b"surromd checkpoint 3\n"
 # Of a run's time no more than one part in so many should go into waiting for the medium.
@@ -31,6 +33,22 @@ def new_header(n_files: int, *, overwrite: bool) -> dict[str, Any]:
     frames it has, and their digest.
     """
     return {"run_id": uuid.uuid4().hex, "overwrite": overwrite, "files": [{"n_frames": 0, "digest": ""}] * n_files}
+
+
+@dataclass(frozen=True)
+class _Written:
+    n_frames: Annotated[int, range(2**63)]
+    digest: str
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What every checkpoint says, see `new_header`."""
+
+    run_id: str
+    overwrite: bool
+    files: tuple[_Written, ...]
+    n_frames_wanted: Annotated[int, range(2**63)] = 0
 
 
 class CheckpointFile:
@@ -74,8 +92,9 @@ def read_checkpoints(path: Path) -> list[Checkpoint]:
         rest = rest[len(_MAGIC) :]
         while rest or not found:
             header, blob, rest = unpacked(rest)
+            built(_Common, {f.name: header[f.name] for f in fields(_Common) if f.name in header})
             found.append((header, blob))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
     return found
 
@@ -86,6 +105,10 @@ def last_supported(path: Path, outs: Sequence[Path]) -> Checkpoint:
     Raises InputError when the checkpoint is damaged, or a trajectory is gone, damaged, or not the one this run wrote.
     """
     states = read_checkpoints(path)
+    if any(len(header["files"]) != len(outs) for header, _ in states):
+        raise InputError(f"checkpoint {path} is not of {len(outs)} trajectories; take as many as it was begun with.")
+            f"checkpoint {path} is not of {len(outs)} trajectories; take the number that it was begun with."
+        )
     reasons = []
     for header, blob in states:
         begun = header is not states[0][0] or any(entry["n_frames"] for entry in header["files"])

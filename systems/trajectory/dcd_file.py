@@ -41,6 +41,7 @@ from systems.trajectory.frame_store import (
     damage_reported,
     get_json,
     open_hdf5,
+    read_record,
     read_run_id,
 )
 from systems.trajectory.hdf5_file import check_read, read_checksums, read_columns
@@ -185,7 +186,7 @@ class DcdReader(TrajectoryReader):
                 self.n_frames = consistent_length(file, meta)
                 self.time_ps, self.flags, self.chunk_idx, self.scalars = read_columns(file, meta, self.n_frames)
                 self.checksums, self.run_id = read_checksums(file, self.n_frames), read_run_id(file)
-                self.record = get_json(file, "surromd/record")
+                self.record = read_record(file)
                 self.scene = Scene.from_dict(get_json(file, "surromd/scene"))
             _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
             if top is not None:

@@ -25,10 +25,11 @@ from systems.errors import InputError, StorageError, TrajectoryError, first_line
 from systems.files.atomic_file import AtomicFile, journal_path
 from systems.files.checksums import checksum_rows, frame_checksums, frames_digest, sealed, unsealed
 from systems.files.outside import UNREADABLE, open_checked
-from systems.files.schema import parsed
+from systems.files.schema import fitted, parsed
 from systems.files.whole_file import create_whole, refuse_existing, storage_error
 from systems.scene import Scene
 from systems.trajectory.base import FrameBlock
+from systems.trajectory.record import Record
 
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048
@@ -103,6 +104,12 @@ def get_json(file: h5py.File, name: str) -> Any:
     """Return the JSON value of a text dataset. Raises KeyError or ValueError when it is missing or damaged."""
     text = file[name][()].decode("ascii")
     return parsed(unsealed(text) if CHECKSUMS in file else text)
+
+
+def read_record(file: h5py.File) -> dict[str, Any]:
+    """Return the record of a trajectory. Raises KeyError or ValueError when it is missing, damaged or none."""
+    record: dict[str, Any] = fitted(get_json(file, "surromd/record"), Record, "record")
+    return record
 
 
 def create_store(
@@ -256,7 +263,7 @@ class FrameStore:
         run_id = self.file["surromd/run_id"]
         self._atomic.key = (run_id.id.get_offset(), run_id.dtype.itemsize)
         self.scene = Scene.from_dict(get_json(self.file, "surromd/scene"))
-        self.record: dict[str, Any] = get_json(self.file, "surromd/record")
+        self.record = read_record(self.file)
         self.n_frames = consistent_length(self.file, self.path)
         self._columns.update({name: self.file[name] for name in column_names(self.file)})
         if not {"time", "surromd/chunk_idx"} <= set(self._columns):

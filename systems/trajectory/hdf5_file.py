@@ -45,6 +45,7 @@ from systems.trajectory.frame_store import (
     get_json,
     open_hdf5,
     program_version,
+    read_record,
     read_run_id,
 )
 from systems.trajectory.topology_file import refuse_other_topology, topology_path, write_topology
@@ -144,7 +145,7 @@ class Hdf5Reader(TrajectoryReader):
         self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
         self.checksums, self.run_id = read_checksums(self._file, self.n_frames), read_run_id(self._file)
         self.times_known = "surromd" in self._file or "time" in self._file
-        self.record = get_json(self._file, "surromd/record") if "surromd" in self._file else {}
+        self.record = read_record(self._file) if "surromd" in self._file else {}
         self.scene = self._read_scene()
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
