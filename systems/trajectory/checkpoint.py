@@ -107,8 +107,6 @@ def last_supported(path: Path, outs: Sequence[Path]) -> Checkpoint:
     states = read_checkpoints(path)
     if any(len(header["files"]) != len(outs) for header, _ in states):
         raise InputError(f"checkpoint {path} is not of {len(outs)} trajectories; take as many as it was begun with.")
-            f"checkpoint {path} is not of {len(outs)} trajectories; take the number that it was begun with."
-        )
     reasons = []
     for header, blob in states:
         begun = header is not states[0][0] or any(entry["n_frames"] for entry in header["files"])
