@@ -203,6 +203,10 @@ class AtomicFile:
             os.close(self._fd)
         self._fd = self._journal_fd = -1
 
+    def __del__(self) -> None:
+        # A reader's is h5py's alone, which does not close what it is given.
+        self.close()
+
     def __enter__(self) -> AtomicFile:
         return self
 

@@ -8,8 +8,13 @@ table.
 from __future__ import annotations
 
 import errno
+import multiprocessing
+import os
+import signal
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +25,7 @@ import pytest
 from disk_model import LOSSES, NO_SPACE, Disk, watched
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.simulate import MDConfig, simulate
+from loop_device import cut, mounted, new_image
 from surrogate.data.weights import Weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import StorageError, SurromdError
@@ -225,12 +231,44 @@ def test_every_operation_that_fails(kind: Kind, code: int, tmp_path: Path, monke
     count(f"{name_of(kind)}: {errno.errorcode[code]}", faults(kind, tmp_path, monkeypatch, code, every=1))
 
 
+@pytest.mark.slow
+def test_power_cut_of_a_real_file_system(kind: Kind, tmp_path: Path) -> None:
+    """An ext4 in a file, copied while the run is stopped at a moment: what the kernel had not yet written is gone."""
+    image = tmp_path / "disk.img"
+    if not new_image(image, 48):
+        pytest.skip("no mkfs.ext4")
+    cuts = []
+    with mounted(image) as folder:
+        if folder is None:
+            pytest.skip("loop devices may not be mounted here")
+        (folder / "run").mkdir()
+        run = multiprocessing.get_context("fork").Process(target=kind.run, args=(folder / "run",))
+        run.start()
+        rng = np.random.default_rng(0)
+        while run.is_alive() and len(cuts) < 40:
+            time.sleep(float(rng.uniform(0.0, 0.06)))
+            with suppress(ProcessLookupError):
+                os.kill(run.pid or 0, signal.SIGSTOP)
+                cuts.append(tmp_path / f"{len(cuts)}.img")
+                cut(image, cuts[-1])
+                os.kill(run.pid or 0, signal.SIGCONT)
+        run.join()
+        assert run.exitcode == 0
+    found = {}
+    for copy in cuts:
+        with mounted(copy) as folder:
+            assert folder is not None
+            if (folder / "run").is_dir():
+                found[copy.stem] = outcome(kind, folder / "run")
+        copy.unlink()
+    count(f"{name_of(kind)}: power cut, ext4 on a loop device", found)
+    assert len(found) > 3
+
+
 def test_the_model_of_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that is renamed before it is forced out may be empty after a power failure; a kill does not touch it."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    import os
-
     with watched(folder, monkeypatch) as disk:
         descriptor = os.open(folder / "a.new", os.O_WRONLY | os.O_CREAT)
         os.pwrite(descriptor, b"x" * 2000, 0)

@@ -10,6 +10,7 @@ from surrogate.judge.report.cards import cards, side_by_side
 from surrogate.judge.report.definitions import DEFINITIONS
 from surrogate.judge.report.wording import GROUP_TITLES, MARKS, STATUS_MARKS, interval, number, per_day, plain
 from surrogate.judge.rows.rows import GROUPS, Row
+from systems.files.outside import printable
 from systems.units import format_time_ps
 
 
@@ -106,5 +107,5 @@ def _list(title: str, entries: Sequence[str]) -> list[str]:
 
 def _text(value: str) -> str:
     """What came from outside must not start a tag or a cell, nor end one."""
-    escaped = value.replace("\\", "\\\\").replace("<", "&lt;").replace("|", "\\|").replace("`", "\\`")
+    escaped = printable(value).replace("\\", "\\\\").replace("<", "&lt;").replace("|", "\\|").replace("`", "\\`")
     return escaped.replace("*", "\\*").replace("_", "\\_").replace("\n", " ")

@@ -683,3 +683,21 @@ def test_file_size_limit_of_the_system(tmp_path: Path, suffix: str, repository: 
     assert n >= 500
     assert f"the {n} frames written before are complete" in run.stdout
     np.testing.assert_allclose(read(path), np.concatenate([frames(100, 22)] * (n // 100)), rtol=3e-7)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the open files of a process are listed by Linux")
+@pytest.mark.parametrize("unfinished", [False, True])
+def test_a_reader_beside_a_journal_leaves_nothing_open(
+    tmp_path: Path, alanine_dipeptide: Scene, unfinished: bool
+) -> None:
+    path = tmp_path / "a.h5"
+    frames = alanine_dipeptide.positions_nm[None].repeat(3, axis=0)
+    with open_writer(path, alanine_dipeptide, {}) as writer:
+        writer.append(frames, [1.0, 2.0, 3.0])
+        if unfinished:
+            whole = path.read_bytes()
+            writer._store._atomic._keep(len(whole), [(0, whole[:8])])
+        with open_trajectory(path) as reader:
+            assert reader.n_frames == 3
+        held = [fd for fd in list(Path("/proc/self/fd").iterdir()) if fd.exists() and fd.samefile(path)]
+        assert len(held) == 1  # the writer's
