@@ -12,7 +12,7 @@ from md_reference.run.integrators import check_ensemble
 from systems.errors import InputError
 from systems.files.outside import check_disk
 from systems.scene import Scene
-from systems.units import whole_steps
+from systems.units import format_time_ps, whole_steps
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,12 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
                 f"{out} was started with {key} = {before.get(key)!r}, not {value!r}; resume with the same settings "
                 "or write to another file."
             )
-    if not isinstance(before["time_ps"], int | float) or config.time_ps < before["time_ps"]:
+    asked_ps = before["time_ps"]
+    if not isinstance(asked_ps, int | float) or config.time_ps < asked_ps:
+        length = format_time_ps(asked_ps) if isinstance(asked_ps, int | float) else repr(asked_ps)
         raise InputError(
-            f"{out} was started for {before['time_ps']} ps and cannot become shorter; resume with as much or more, or "
-            "write to another file."
+            f"{out} was started for {length} and cannot become shorter; resume with as much or more, or write to "
+            "another file."
         )
 
 
