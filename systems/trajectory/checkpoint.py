@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from systems.errors import InputError, TrajectoryError
 from systems.files.checksums import packed, unpacked
+from systems.files.schema import built
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.files.schema import built
 
 _MAGIC = b"surromd checkpoint 3\n"
 # Of a run's time no more than one part in so many should go into waiting for the medium.

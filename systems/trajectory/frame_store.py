@@ -27,9 +27,9 @@ from systems.files.checksums import checksum_rows, frame_checksums, frames_diges
 from systems.files.outside import UNREADABLE, open_checked
 from systems.files.schema import fitted, parsed
 from systems.files.whole_file import create_whole, refuse_existing, storage_error
+from systems.record import Record
 from systems.scene import Scene
 from systems.trajectory.base import FrameBlock
-from systems.trajectory.record import Record
 
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048
