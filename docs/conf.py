@@ -53,6 +53,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Docstrings name arguments and values in single backticks.
 default_role = "code"
+# Typographic dashes would make another thing of --steps.
+smartquotes = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 

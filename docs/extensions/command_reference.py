@@ -11,6 +11,9 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+# Verbs that measure the others come last.
+_MEASURING = ("bench", "stress", "reproduce")
+
 
 def find_command(words: list[str]) -> Any:
     """Return the command that `surromd WORDS` runs, as click has it."""
@@ -30,7 +33,7 @@ def all_commands() -> list[list[str]]:
     for name, command in find_command([]).commands.items():
         inner = getattr(command, "commands", None)
         found += [[name]] if inner is None else [[name, one] for one in inner]
-    return found
+    return sorted(found, key=lambda words: words[0] in _MEASURING)
 
 
 def command_rows(command: Any) -> list[tuple[str, str]]:
@@ -54,6 +57,7 @@ def command_markdown(words: list[str]) -> str:
     command = find_command(words)
     context = command.context_class(command, info_name=" ".join(["surromd", *words]))
     usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ")
+    usage = usage.replace("{", "").replace("}", "")
     said = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
     table = [f"| `{_cell(written)}` | {_text(text)} |" for written, text in command_rows(command)]
     return "\n".join([said, "", "```text", usage, "```", "", "| | |", "|---|---|", *table])

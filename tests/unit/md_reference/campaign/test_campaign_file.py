@@ -212,8 +212,8 @@ def test_the_bench_s_molecules_run_as_in_md17_at_both_temperatures(tmp_path: Pat
     assert {(c.friction_per_ps, c.timestep_ps, c.save_every_ps) for c in aspirin} == {(0.1, 0.0005, 0.02)}
 
 
-def test_the_file_in_the_readme_is_one(tmp_path: Path, repository: Path) -> None:
-    blocks = re.findall(r"```toml\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
+def test_the_file_in_the_manual_is_one(tmp_path: Path, repository: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (repository / "docs" / "campaigns.md").read_text(), re.DOTALL)
     (tmp_path / "pdb").mkdir()
     pdb = (repository / "systems" / "library" / "data" / "alanine-dipeptide.pdb").read_bytes()
     (tmp_path / "pdb" / "a.pdb").write_bytes(pdb)

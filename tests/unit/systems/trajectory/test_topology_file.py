@@ -41,7 +41,7 @@ def longest_bond_angstrom(path: Path, top: Path) -> float:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_the_pdb_beside_a_trajectory_has_its_order(tmp_path: Path, alanine_dipeptide: Scene, suffix: str) -> None:
-    """The line of the README; and the negative control: the PDB of another trajectory shows bonds of many Å."""
+    """The line of the quickstart; and the negative control: the PDB of another trajectory shows bonds of many Å."""
     shuffled = reordered(alanine_dipeptide, np.random.default_rng(0).permutation(alanine_dipeptide.n_atoms))
     write(tmp_path / f"ref{suffix}", alanine_dipeptide)
     write(tmp_path / f"out{suffix}", shuffled)

@@ -1,0 +1,55 @@
+"""The manual's own parts: tables from JSON and from the code, and tutorials without outputs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("sphinx", reason="the manual's libraries are not installed: pip install '.[docs]'")
+
+from command_reference import all_commands, command_markdown
+from result_tables import TABLES, read_table, table_markdown
+
+
+def test_every_table_of_results_can_be_shown_and_is_shown() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in TABLES.parent.glob("*.md"))
+    shown = set(re.findall(r"```\{results\} (\w+)", pages))
+    assert shown == {path.stem for path in TABLES.glob("*.json")}
+    for name in shown:
+        record = read_table(TABLES / f"{name}.json")
+        assert record["command"] in table_markdown(record)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"command": ""}, "lacks command"), ({"rows": [["one"]]}, "the row of 'one' has 1 cells, the head 2")],
+)
+def test_a_table_that_says_too_little_is_refused(tmp_path: Path, wrong: dict, message: str) -> None:
+    record = {"columns": ["a", "b"], "rows": [["1", "2"]], "command": "measure", "machine": "mine"}
+    path = tmp_path / "table.json"
+    path.write_text(json.dumps(record))
+    assert read_table(path) == record
+    path.write_text(json.dumps(record | wrong))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        read_table(path)
+
+
+def test_commands_have_their_options() -> None:
+    names = {" ".join(words) for words in all_commands()}
+    assert {"reference", "rollout", "compare", "train", "bench cost-error"} <= names
+    text = command_markdown(["rollout"])
+    assert "surromd rollout" in text
+    assert "| `--weights " in text
+    assert "\\[required\\]" in text
+
+
+def test_tutorials_are_in_the_manual_and_stripped(repository: Path) -> None:
+    index = (repository / "docs" / "index.md").read_text(encoding="utf-8")
+    notebooks = sorted((repository / "notebooks").glob("*.ipynb"))
+    assert sorted(re.findall(r"^tutorials/(\w+)$", index, re.MULTILINE)) == [path.stem for path in notebooks]
+    for path in notebooks:
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells), f"strip {path.name}"

@@ -1,0 +1,64 @@
+"""README: what it shows works as it stands, what it points to is there, and it stays short."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+MOST_BYTES, LARGEST_FIGURE = 7_000, 200_000
+# What .ci/run does itself: installing, this test suite, the manual.
+ELSEWHERE = re.compile(r"^pip install \S+( && (pytest|sphinx-build .*))?$|^pip install \S+ && ", re.MULTILINE)
+LINK = re.compile(r"\]\(([^)#]+)\)")
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """Return the code blocks of a language."""
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def broken_links(text: str, root: Path) -> list[str]:
+    """Return the links of a page that lead to no file of the repository."""
+    found = LINK.findall(text)
+    return [link for link in found if "://" not in link and not (root / link).exists()]
+
+
+def test_it_is_short(repository: Path) -> None:
+    assert len((repository / "README.md").read_bytes()) < MOST_BYTES
+
+
+def test_its_links_and_figures_are_there(repository: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    assert broken_links(text, repository) == []
+    assert broken_links(text + "[gone](docs/gone.md)", repository) == ["docs/gone.md"]
+    figures = [repository / link for link in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)]
+    assert len(figures) == 2
+    assert all(figure.stat().st_size < LARGEST_FIGURE for figure in figures)
+
+
+def test_only_what_ci_does_itself_is_left_out(repository: Path) -> None:
+    shell = blocks((repository / "README.md").read_text(encoding="utf-8"), "sh")
+    left = [line for block in shell for line in ELSEWHERE.sub("", block).splitlines() if line and line[0] != "#"]
+    assert [line.split()[:2] for line in left] == [
+        ["surromd", verb] for verb in ("demo", "reference", "rollout", "compare")
+    ]
+
+
+@pytest.mark.slow
+def test_its_code_runs(repository: Path, tmp_path: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    programs = [["bash", "-euo", "pipefail", "-c", ELSEWHERE.sub("", block)] for block in blocks(text, "sh")]
+    programs += [[sys.executable, "-c", block] for block in blocks(text, "python")]
+    search = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    written = set()
+    for number, program in enumerate(programs):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        done = subprocess.run(program, cwd=folder, env={**os.environ, "PATH": search}, capture_output=True, text=True)
+        assert done.returncode == 0, f"{program[-1]}\n{done.stdout}\n{done.stderr}"
+        written |= {path.relative_to(folder).as_posix() for path in folder.rglob("*.html")}
+    assert written == {"surromd-demo/report.html", "report.html"}
