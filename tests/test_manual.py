@@ -53,3 +53,10 @@ def test_tutorials_are_in_the_manual_and_stripped(repository: Path) -> None:
     for path in notebooks:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells), f"strip {path.name}"
+
+
+def test_every_public_name_is_in_the_python_reference(repository: Path) -> None:
+    import surrogate
+
+    page = (repository / "docs" / "python.md").read_text(encoding="utf-8")
+    assert not set(surrogate.__all__) - set(re.findall(r"^\.\. auto\w+:: (\w+)$", page, re.MULTILINE))
