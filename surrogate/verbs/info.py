@@ -142,6 +142,7 @@ def _weights(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": "weights",
         "summary": f"{n_parameters / 1e6:.2f} M parameters for {weights.domain.describe()}",
+        "arch": weights.model.arch,
         "hash": weights.hash,
         "parameters": n_parameters,
         "scene": weights.domain.scene.name,

@@ -1,0 +1,116 @@
+"""An architecture of another package, once installed: trained, rolled and described by name, within the contract."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from command_line import run
+from surrogate.models import registry
+from surrogate.models.conformance import SurrogateContract
+from surrogate.models.interface import Surrogate
+from systems.errors import InputError, UnknownNameError
+from systems.library.named_scenes import load
+from systems.trajectory.codec import open_trajectory, open_writer
+
+SOURCE = Path(__file__).parents[1] / "toy_architecture"
+
+
+def forget() -> None:
+    """Let the registry look again at what is installed."""
+    registry._found.cache_clear()
+    registry.architecture.cache_clear()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The toy package, built and installed into a folder of its own, without the network, and that on the path."""
+    folder = tmp_path_factory.mktemp("toy")
+    shutil.copytree(SOURCE, folder / "source")
+    site = folder / "site"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
+               "--disable-pip-version-check", "--target", str(site), str(folder / "source")]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        forget()
+        yield
+    forget()
+    sys.modules.pop("random_walk", None)
+
+
+class TestRandomWalk(SurrogateContract):
+    equivariant = True
+    reflects = True
+    permutes = True
+    noise_is_vectors = True
+    # There is no network whose products bf16 would round.
+    bf16_error = None
+
+    def make(self, n_atoms: int) -> Surrogate:
+        toy = importlib.import_module("random_walk")
+        model = toy.RandomWalk(toy.WalkConfig(n_new=3))
+        with torch.no_grad():
+            model.log_step.copy_(torch.linspace(-5.0, -3.0, 119))
+        return model.eval().requires_grad_(False)
+
+
+def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
+    scene, rng = load("alanine-dipeptide"), np.random.default_rng(0)
+    reference, weights, out = (tmp_path / name for name in ("ref.h5", "w.safetensors", "roll.h5"))
+    with open_writer(reference, scene, {"temperature_k": 300.0}) as writer:
+        width_nm = np.where(np.array(scene.elements) == "H", 0.02, 0.005)[:, None]
+        noise = rng.normal(size=(200, scene.n_atoms, 3))
+        writer.append(scene.positions_nm + width_nm * noise, np.arange(1.0, 201.0))
+    (tmp_path / "walk.toml").write_text('arch = "random-walk"\n[model]\nn_new = 5\n[training]\nbatch = 16\n')
+    told = run("train", str(reference), "--config", str(tmp_path / "walk.toml"), "--steps", "200", "-o", str(weights))
+    assert told.exit_code == 0, told.stderr
+    assert "arch = random-walk" in told.stderr and "walk 200 steps" in told.stderr
+    found = json.loads(run("info", str(weights), "--json").stdout)
+    assert found["arch"] == "random-walk" and found["config"]["n_new"] == 5
+    rolled = run("rollout", "alanine-dipeptide", "--weights", str(weights), "--time", "8ps", "--guard", "off", "-o",
+                 str(out), "-q")  # fmt: skip
+    assert rolled.exit_code == 0, rolled.stderr
+    with open_trajectory(out) as reader:
+        steps = np.diff(reader.read(), axis=0).std(axis=(0, 2))
+        assert reader.n_frames == 8 and reader.record["model"] == "random-walk"
+    hydrogen = np.array(scene.elements) == "H"
+    assert steps[hydrogen].mean() > 2 * steps[~hydrogen].mean(), "it learned that hydrogens shake more"
+    asked = ("--arch", "random-walk", "--steps", "4", "-o", str(tmp_path / "x.safetensors"))
+    for more, said in ((["--longest-lag", "5ps"], "--longest-lag"), (["--from", str(weights)], "--from")):
+        refused = run("train", str(reference), *asked, *more)
+        assert refused.exit_code == 1 and said in refused.stderr
+
+
+def test_it_is_listed_and_a_misspelt_name_meets_it() -> None:
+    assert {"random-walk", "lam-slide", "painet"} <= set(registry.names())
+    with pytest.raises(UnknownNameError, match="Did you mean 'random-walk'"):
+        registry.architecture("random-wlk")
+
+
+def test_a_broken_package_and_a_name_offered_twice_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("broken", "nowhere_at_all:MODEL"), ("random-walk", "elsewhere:MODEL")):
+        info = tmp_path / name / f"{name.replace('-', '_')}_2-1.0.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}-2\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[surromd.architectures]\n{name} = {value}\n")
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(tmp_path / "broken")
+        forget()
+        with pytest.raises(InputError, match=r"'broken' \(nowhere_at_all:MODEL\) cannot be loaded"):
+            registry.architecture("broken")
+        patch.syspath_prepend(tmp_path / "random-walk")
+        forget()
+        with pytest.raises(InputError, match="two installed packages offer the architecture 'random-walk'"):
+            registry.names()
+    forget()
