@@ -111,6 +111,8 @@ PARSERS: dict[str, Callable[[str, str], float]] = {
     "_s": parse_wall_s,
 }
 
+_UNITS = {"_per_ps": "1/ps", "_ps": "ps", "_k": "K", "_da": "Da", "_nm": "nm", "_molar": "M", "_bar": "bar", "_s": "s"}
+
 
 def parser_of(name: str) -> Callable[[str, str], float]:
     """Return what reads the text of a setting by its name (`time_ps`): text and what to call it -> its value inside."""
@@ -119,28 +121,52 @@ def parser_of(name: str) -> Callable[[str, str], float]:
     return next(parse for ending, parse in PARSERS.items() if name.endswith(ending))
 
 
+def _ending(name: str) -> str:
+    return next((ending for ending in PARSERS if name.endswith(ending)), "")
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a setting's name ends in (`ps` of `time_ps`), or an empty string."""
+    return _UNITS.get(_ending(name), "")
+
+
+def stem_of(name: str) -> str:
+    """Return a setting's name without its unit: `time` of `time_ps`."""
+    return name.removesuffix(_ending(name))
+
+
 @overload
-def quantity(name: str, value: Quantity) -> float: ...
+def quantity(name: str, value: Quantity, what: str = ...) -> float: ...
 @overload
-def quantity(name: str, value: None) -> None: ...
-def quantity(name: str, value: Any) -> float | None:
+def quantity(name: str, value: None, what: str = ...) -> None: ...
+def quantity(name: str, value: Any, what: str = "") -> float | None:
     """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
 
-    `value` is a number in that unit or a text with its own, such as '10ns'; None stays None. Raises UnitError for
-    another kind of value, and for a number that is negative or not finite.
+    `value` is a number in that unit or a text with its own, such as '10ns'; None stays None. `what`: how messages call
+    it, by default as it is called. Raises UnitError for another kind of value, and for a number that is negative or not
+    finite.
     """
     if value is None:
         return None
-    ending = next(ending for ending in PARSERS if name.endswith(ending))
+    what = what or name
     if isinstance(value, str):
-        return parser_of(name)(value, name)
-    unit = ending.strip("_").replace("per_", "1/")
+        return parser_of(name)(value, what)
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise UnitError(f"{name} = {value!r} must be a number in {unit}, or a text with its unit.")
+        raise UnitError(f"{what} = {value!r} must be a number in {unit_of(name)}, or a text with its unit.")
     number = float(value)
     if not math.isfinite(number) or number < 0:
-        raise UnitError(f"{name} = {value!r} must be finite and not negative.")
+        raise UnitError(f"{what} = {value!r} must be finite and not negative.")
     return number
+
+
+def format_quantity(name: str, value: float) -> str:
+    """Return the text that `quantity` reads as this value: `10ns` for time_ps = 10000."""
+    ending = _ending(name)
+    if ending == "_ps" and value > 0:
+        return format_time_ps(value).replace(" ", "")
+    if ending == "_per_ps":
+        return f"{value:g}/ps"
+    return f"{value:g}{unit_of(name)}"
 
 
 def format_time_ps(time_ps: float) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogate.cli.options import JsonOpt, Precision, QuietOpt, SeedOpt
+from surrogate.cli.parameters import JsonOpt, Precision, QuietOpt, SeedOpt
 from surrogate.cli.render import print_json
 from systems.units import parse_time_ps, parse_wall_s
 

@@ -11,46 +11,30 @@ import typer
 from typer.core import TyperGroup
 
 from surrogate.cli.bench_verbs import bench, stress
-from surrogate.cli.options import (
+from surrogate.cli.parameters import (
     ArchOpt,
-    Atoms,
-    AtomsOpt,
     DeviceOpt,
-    EnergyEveryOpt,
     FailOn,
-    ForceOpt,
-    Guard,
-    GuardOpt,
     JsonOpt,
-    MdBetweenOpt,
+    OutOpt,
     OverwriteOpt,
-    Precision,
     QuietOpt,
     ResumeOpt,
-    SaveForcesOpt,
-    SaveVelocitiesOpt,
     SceneArg,
     SeedOpt,
-    SelectOpt,
-    Solver,
-    Stiff,
     ValidationOpt,
     VelocitiesOpt,
-    WantedTemperatureOpt,
+    WeightsOpt,
     literal,
-    spread_options,
+    with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
 from surrogate.cli.reproduce_verb import reproduce
-from surrogate.verbs.md_options import MDOptions, Preparation, Replicas
+from surrogate.verbs.options import PlanOptions, ReferenceOptions, RolloutOptions
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
-from systems.units import (
-    parse_temperature_k,
-    parse_time_ps,
-    parse_wall_s,
-)
+from systems.units import parse_time_ps, parse_wall_s
 
 
 class _Group(TyperGroup):
@@ -148,18 +132,12 @@ def systems(
 
 
 @app.command()
-@spread_options
-def plan(
-    scene: SceneArg,
-    *,
-    time: Annotated[str | None, typer.Option("--time", help="Estimate the wall time of a run this long.")] = None,
-    options: MDOptions,
-    as_json: JsonOpt = False,
-) -> None:
+@with_options
+def plan(scene: SceneArg, *, options: PlanOptions, as_json: JsonOpt = False) -> None:
     """What a reference run of SCENE will do, what it skips, why, and what that saves."""
     from surrogate import api
 
-    account = api.plan(scene, time_ps=None if time is None else parse_time_ps(time, "--time"), **options)
+    account = api.plan(scene, options=options)
     if as_json:
         print_json(account)
     else:
@@ -167,41 +145,12 @@ def plan(
 
 
 @app.command()
-@spread_options
-def reference(
-    scene: SceneArg,
-    *,
-    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 10ns.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
-    save_every: Annotated[
-        str | None, typer.Option("--save-every", help=literal("Interval between saved frames. [default: 1ps]"))
-    ] = None,
-    options: MDOptions,
-    save_velocities: SaveVelocitiesOpt = False,
-    save_forces: SaveForcesOpt = False,
-    seed: SeedOpt = 0,
-    resume: ResumeOpt = False,
-    overwrite: OverwriteOpt = False,
-    quiet: QuietOpt = False,
-    as_json: JsonOpt = False,
-) -> None:
+@with_options
+def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_json: JsonOpt = False) -> None:
     """Simulate SCENE with OpenMM and write the trajectory."""
     from surrogate import api
 
-    written = api.reference(
-        scene,
-        out,
-        time_ps=parse_time_ps(time, "--time"),
-        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
-        save_velocities=save_velocities,
-        save_forces=save_forces,
-        seed=seed,
-        resume=resume,
-        overwrite=overwrite,
-        quiet=quiet,
-        **options,
-    )
-    print_written(written, as_json, quiet)
+    print_written(api.reference(scene, out, options=options), as_json, options.quiet)
 
 
 @app.command()
@@ -314,75 +263,14 @@ def train(
 
 
 @app.command()
-@spread_options
+@with_options
 def rollout(
-    scene: SceneArg,
-    *,
-    weights: Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")],
-    time: Annotated[str, typer.Option("--time", help="Simulated time, such as 100ns.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")],
-    save_every: Annotated[
-        str | None, typer.Option("--save-every", help="Default: the interval of the weights.")
-    ] = None,
-    lag: Annotated[
-        str | None, typer.Option("--lag", help="Of one step, of weights for several. Default: --save-every if it fits.")
-    ] = None,
-    replicas: Replicas = 1,
-    solver: Annotated[
-        Solver | None, typer.Option("--solver", help="fitted: for 2 to 10 steps. Default: the one that suits.")
-    ] = None,
-    solver_steps: Annotated[int | None, typer.Option("--steps", min=1, help="Solver steps per chunk.")] = None,
-    precision: Annotated[Precision, typer.Option("--precision", help="Of the network.")] = Precision.auto,
-    compile_: Annotated[
-        bool, typer.Option("--compile", help="Compile the network: a minute, a C++ compiler; for long rollouts.")
-    ] = False,
-    stiff: Annotated[
-        Stiff | None, typer.Option("--stiff", help="Bonds and angles. Default: imposed, where the weights know how.")
-    ] = None,
-    guard: GuardOpt = Guard.flag,
-    energy_every: EnergyEveryOpt = 0,
-    md_between: MdBetweenOpt = None,
-    select: SelectOpt = None,
-    atoms: AtomsOpt = Atoms.all,
-    force: ForceOpt = False,
-    temperature: WantedTemperatureOpt = None,
-    preparation: Preparation,
-    seed: SeedOpt = 0,
-    resume: ResumeOpt = False,
-    overwrite: OverwriteOpt = False,
-    quiet: QuietOpt = False,
-    as_json: JsonOpt = False,
+    scene: SceneArg, *, weights: WeightsOpt, out: OutOpt, options: RolloutOptions, as_json: JsonOpt = False
 ) -> None:
     """Roll SCENE forward with a trained surrogate, in chunks."""
     from surrogate import api
 
-    written = api.rollout(
-        scene,
-        weights,
-        out,
-        time_ps=parse_time_ps(time, "--time"),
-        save_every_ps=None if save_every is None else parse_time_ps(save_every, "--save-every"),
-        lag_ps=None if lag is None else parse_time_ps(lag, "--lag"),
-        replicas=replicas,
-        seed=seed,
-        solver=None if solver is None else solver.value,
-        solver_steps=solver_steps,
-        precision=precision.value,
-        compile=compile_,
-        stiff=None if stiff is None else stiff.value,
-        guard=guard.value,
-        energy_every=energy_every,
-        md_between_ps=0.0 if md_between is None else parse_time_ps(md_between, "--md-between"),
-        select=select,
-        atoms=atoms.value,
-        force=force,
-        temperature_k=None if temperature is None else parse_temperature_k(temperature, "--temperature"),
-        resume=resume,
-        overwrite=overwrite,
-        quiet=quiet,
-        **preparation,
-    )
-    print_written(written, as_json, quiet)
+    print_written(api.rollout(scene, weights, out, options=options), as_json, options.quiet)
 
 
 @app.command()

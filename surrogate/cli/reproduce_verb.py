@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from surrogate.cli.options import JsonOpt, QuietOpt, ResumeOpt, SeedOpt, literal
+from surrogate.cli.parameters import JsonOpt, QuietOpt, ResumeOpt, SeedOpt, literal
 from surrogate.cli.render import print_json
 from systems.errors import InputError
 from systems.units import parse_time_ps, parse_wall_s

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import tomllib
-from pathlib import Path
 from typing import Any, TypeVar
 
 from systems.errors import InputError
-from systems.files.outside import content
-from systems.files.schema import built, parsed
+from systems.files.schema import built
 
 T = TypeVar("T")
 
@@ -22,18 +19,8 @@ def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
         raise InputError(f"settings: {error}.") from error
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return a TOML file's record. Raises InputError when it is missing or malformed."""
-    try:
-        return dict(parsed(content(Path(path)).decode(), tomllib.loads))
-    except FileNotFoundError:
-        raise InputError(f"configuration {path} does not exist.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"configuration {path} is not valid TOML: {error}.") from error
-
-
 def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record as TOML that `read_toml` takes back; keys whose value is None are left out.
+    """Return a record as the TOML of `systems.files.toml_file.read_toml`; keys whose value is None are left out.
 
     Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
     """

@@ -2,45 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 from surrogate.progress import progress_bar
-from surrogate.verbs.md_options import MDOptions, takes
+from surrogate.verbs.options import PlanOptions, ReferenceOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.verbs.scene_listing import prepare_scene, tell
-from systems.units import Quantity, quantity
+from surrogate.verbs.takes import takes
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig
     from systems.scene import Scene
 
 
-@takes(MDOptions)
-def plan(scene: str | Path | Scene, *, time_ps: Quantity | None = None, **options: Unpack[MDOptions]) -> dict[str, Any]:
+@takes(PlanOptions)
+def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
-    `options`: those of `reference` (surrogate.verbs.md_options.MDOptions). Steps are timed for about a second; with
-    `time_ps` the wall time of a run of that length is estimated. Raises what `reference` raises for settings that
-    cannot be.
+    Steps are timed for about a second; with `time_ps` the wall time of a run of that length is estimated. Raises what
+    `reference` raises for settings that cannot be.
     """
     from md_reference.run.plan import make_plan
 
-    time_ps = quantity("time_ps", time_ps)
     molecule = prepare_scene(scene, options, quiet=False)
-    molecule, config, protocol = _settle(
-        molecule, options, time_ps=1.0 if time_ps is None else time_ps, seed=0, quiet=True
-    )
+    time_ps = 1.0 if options.time_ps is None else options.time_ps
+    molecule, config, protocol = _settle(molecule, options, {"time_ps": time_ps}, quiet=True)
     found = make_plan(
         molecule,
         config.force,
         temperature_k=config.temperature_k,
         friction_per_ps=config.friction_per_ps,
         timestep_ps=config.timestep_ps,
-        platform=options["platform"],
-        replicas=options["replicas"],
-        time_ps=time_ps,
+        platform=options.platform,
+        replicas=options.replicas,
+        time_ps=options.time_ps,
         equilibrate_ps=config.equilibrate_ps,
         ensemble=config.ensemble,
         pressure_bar=config.pressure_bar,
@@ -48,24 +45,9 @@ def plan(scene: str | Path | Scene, *, time_ps: Quantity | None = None, **option
     return found | ({"protocol": protocol} if protocol else {})
 
 
-@takes(MDOptions)
-def reference(
-    scene: str | Path | Scene,
-    out: str | Path,
-    *,
-    time_ps: Quantity,
-    save_every_ps: Quantity | None = None,
-    save_velocities: bool = False,
-    save_forces: bool = False,
-    seed: int = 0,
-    resume: bool = False,
-    overwrite: bool = False,
-    quiet: bool = False,
-    **options: Unpack[MDOptions],
-) -> list[Path]:
+@takes(ReferenceOptions)
+def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOptions) -> list[Path]:
     """Simulate a scene with OpenMM and return the trajectories written; each record ends with a `summary` of its run.
-
-    `options` are those of surrogate.verbs.md_options.MDOptions, listed in this function's signature.
 
     `ensemble`: 'nvt' (Langevin middle integrator), 'nve' (velocity Verlet) or 'npt' (Monte Carlo barostat at
     `pressure_bar`; periodic scenes only). `save_velocities` (nm/ps) and `save_forces` (kJ/mol/nm) need an .h5.
@@ -84,21 +66,17 @@ def reference(
     """
     from md_reference.run.replicas import replica_paths, simulate_replicas
 
-    time_ps, save_every_ps = quantity("time_ps", time_ps), quantity("save_every_ps", save_every_ps)
-    replicas = options["replicas"]
-    outs = replica_paths(Path(out), replicas)
-    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
-    molecule = prepare_scene(scene, options, quiet=quiet)
-    molecule, config, protocol = _settle(
-        molecule, options, time_ps=time_ps, save_every_ps=save_every_ps, seed=seed, quiet=quiet
-    )
+    outs = replica_paths(Path(out), options.replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
+    molecule = prepare_scene(scene, options, quiet=options.quiet)
+    molecule, config, protocol = _settle(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
-    if protocol and not quiet:
+    if protocol and not options.quiet:
         tell(molecule.name, protocol)
-    label = f"OpenMM {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
+    label = f"OpenMM {molecule.name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
     with (
         accounted_outputs(outs, resumable="the same command with --resume goes on"),
-        progress_bar(label, quiet=quiet, ps_per_frame=config.save_every_ps) as progress,
+        progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
 
         def preparing(share: float) -> None:
@@ -107,28 +85,18 @@ def reference(
 
         return simulate_replicas(
             molecule,
-            replace(
-                config,
-                save_velocities=save_velocities or config.save_velocities,
-                save_forces=save_forces or config.save_forces,
-            ),
+            config,
             outs,
-            resume=resume,
-            overwrite=overwrite,
+            resume=options.resume,
+            overwrite=options.overwrite,
             progress=progress,
             preparing=preparing,
-            announce=None if quiet else lambda line: tell(molecule.name, line),
+            announce=None if options.quiet else lambda line: tell(molecule.name, line),
         )
 
 
 def _settle(
-    scene: Scene,
-    options: MDOptions,
-    *,
-    time_ps: float,
-    save_every_ps: float | None = None,
-    seed: int,
-    quiet: bool,
+    scene: Scene, options: PlanOptions | ReferenceOptions, length: dict[str, float], *, quiet: bool
 ) -> tuple[Scene, MDConfig, str]:
     """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
 
@@ -142,23 +110,21 @@ def _settle(
     from md_reference.run.defaults import settle
     from md_reference.run.integrators import check_ensemble
 
-    given = {**options, "force_field": at_level(options["level"], options["force_field"])}
-    given |= {"save_every_ps": save_every_ps}
+    given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
-    asked = {name: value for name, value in given.items() if name in settings_of_a_run and value is not None}
-    if options["hydrogen_mass_da"] != "default":
-        asked["hydrogen_mass_da"] = options["hydrogen_mass_da"]
-    settings, protocol = settle(scene, asked, options["protocol"])
-    config = to_config(settings | {"time_ps": time_ps}, seed=seed)
+    asked = {name: value for name, value in given.items() if name in settings_of_a_run}
+    # What is left open, and a switch that is off, leaves the word to the protocol.
+    asked = {name: value for name, value in asked.items() if value is not None and value is not False}
+    seed = asked.pop("seed", 0)
+    if options.hydrogen_mass_da != "default":
+        asked["hydrogen_mass_da"] = options.hydrogen_mass_da
+    settings, protocol = settle(scene, asked, options.protocol)
+    config = to_config(settings | length, seed=seed)
     config = replace(config, force=resolve(scene, config.force))
-    if options["keep_water"]:
+    if options.keep_water:
         require_molecules(config.force)
     dry = scene
-    padding_nm, salt_molar = (
-        quantity("padding_nm", options["padding_nm"]),
-        quantity("ionic_strength_molar", options["ionic_strength_molar"]),
-    )
-    scene = solvate_if_asked(scene, config.force, padding_nm, salt_molar, seed=seed)
+    scene = solvate_if_asked(scene, config.force, options.padding_nm, options.ionic_strength_molar, seed=seed)
     config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
     if not quiet:
         if scene is not dry:

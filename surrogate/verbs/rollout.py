@@ -2,49 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import weights_path
 from surrogate.progress import progress_bar
-from surrogate.verbs.md_options import Preparation, takes
+from surrogate.sampling.config import RolloutConfig
+from surrogate.verbs.options import RolloutOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.verbs.scene_listing import prepare_scene, tell
-from systems.units import Quantity, quantity
+from surrogate.verbs.takes import takes
+from systems.options import part_of
 
 if TYPE_CHECKING:
     from systems.scene import Scene
 
 
-@takes(Preparation)
-def rollout(
-    scene: str | Path | Scene,
-    weights: str | Path,
-    out: str | Path,
-    *,
-    time_ps: Quantity,
-    save_every_ps: Quantity | None = None,
-    lag_ps: Quantity | None = None,
-    replicas: int = 1,
-    seed: int = 0,
-    solver: str | None = None,
-    solver_steps: int | None = None,
-    precision: str = "auto",
-    compile: bool = False,
-    stiff: str | None = None,
-    guard: str = "flag",
-    energy_every: int = 0,
-    md_between_ps: Quantity = 0.0,
-    select: str | None = None,
-    atoms: str = "all",
-    force: bool = False,
-    temperature_k: Quantity | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    quiet: bool = False,
-    **preparation: Unpack[Preparation],
-) -> list[Path]:
+@takes(RolloutOptions)
+def rollout(scene: str | Path | Scene, weights: str | Path, out: str | Path, options: RolloutOptions) -> list[Path]:
     """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
 
     `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
@@ -70,53 +45,33 @@ def rollout(
     """
     from md_reference.run.replicas import replica_paths
 
-    time_ps, save_every_ps = quantity("time_ps", time_ps), quantity("save_every_ps", save_every_ps)
-    lag_ps, md_between_ps = quantity("lag_ps", lag_ps), quantity("md_between_ps", md_between_ps)
-    temperature_k = quantity("temperature_k", temperature_k)
-    outs = replica_paths(Path(out), replicas)
-    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=resume, overwrite=overwrite)
+    outs = replica_paths(Path(out), options.replicas)
+    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
     file = weights_path(weights)
-    molecule = prepare_scene(scene, preparation, quiet=quiet)
+    molecule = prepare_scene(scene, options, quiet=options.quiet)
 
     from surrogate.data.weights import load_weights
     from surrogate.sampling.lags import choose_lag
-    from surrogate.sampling.runner import RolloutConfig
     from surrogate.sampling.runner import rollout as roll
 
-    config = RolloutConfig(
-        time_ps=time_ps,
-        save_every_ps=save_every_ps,
-        lag_ps=lag_ps,
-        seed=seed,
-        solver=solver,
-        precision=precision,
-        compile=compile,
-        stiff=stiff,
-        guard=guard,
-        energy_every=energy_every,
-        md_between_ps=md_between_ps,
-        select=select,
-        atoms=atoms,
-        force=force,
-        temperature_k=temperature_k,
-    )
-    if solver_steps is not None:
-        config = replace(config, solver_steps=solver_steps)
+    config = part_of(options, RolloutConfig)
     loaded = load_weights(file)
-    label = f"surrogate {molecule.name}" + (f" x {replicas}" if replicas > 1 else "")
-    saved_ps = choose_lag(loaded, lag_ps, save_every_ps) if save_every_ps is None else save_every_ps
+    label = f"surrogate {molecule.name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
+    saved_ps = config.save_every_ps
+    if saved_ps is None:
+        saved_ps = choose_lag(loaded, config.lag_ps, None)
     with (
         accounted_outputs(outs, resumable="the same command with --resume goes on"),
         # The verb counts the frames of one replica; all advance together.
-        progress_bar(label, quiet=quiet, ps_per_frame=saved_ps * replicas) as progress,
+        progress_bar(label, quiet=options.quiet, ps_per_frame=saved_ps * len(outs)) as progress,
     ):
         return roll(
             molecule,
             loaded,
             outs,
             config,
-            resume=resume,
-            overwrite=overwrite,
+            resume=options.resume,
+            overwrite=options.overwrite,
             progress=progress,
-            announce=None if quiet else lambda line: tell(molecule.name, line),
+            announce=None if options.quiet else lambda line: tell(molecule.name, line),
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from surrogate.verbs.options import Preparation
 from systems.chemistry.graph import molecule_key
 
 if TYPE_CHECKING:
-    from surrogate.verbs.md_options import Preparation
     from systems.scene import Scene
 
 
@@ -75,15 +76,8 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
     scene = str(scene)
     from systems.source import prepare
 
-    prepared = prepare(
-        scene,
-        ph=options["ph"],
-        keep_ligand=options["keep_ligand"],
-        drop_ligand=options["drop_ligand"],
-        drop_water=options["drop_water"],
-        keep_water=options["keep_water"],
-        cap_breaks=options["cap_breaks"],
-    )
+    switches = {f.name: getattr(options, f.name) for f in fields(Preparation)}
+    prepared = prepare(scene, **switches)
     if not quiet:
         for line in prepared.provenance.get("repairs", []):
             tell(scene, line)

@@ -163,7 +163,7 @@ def _asked(
 
 def _read_config(config: PathLike | None) -> dict[str, Any]:
     """Return `arch`, where it is named, and the tables `model` and `training` of a configuration file."""
-    from surrogate.models.settings import read_toml
+    from systems.files.toml_file import read_toml
 
     record = {} if config is None else read_toml(config)
     for table in ("model", "training"):

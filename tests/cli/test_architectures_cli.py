@@ -57,9 +57,10 @@ def test_a_forecaster_is_trained_and_rolls_out(tmp_path: Path, moving: Path, arc
         assert reader.record["model"] == arch
         assert reader.record["solver"] is None
         assert np.isfinite(reader.read()).all()
-    solver = refusal("rollout", "ethanol", "--weights", weights, "--time", "0.1ps", "--solver", "euler", "-o", "x.h5")
-    assert "no solver" in solver
     bad = tmp_path / "bad.toml"
+    bad.write_text('[sampling]\nsolver = "euler"\n')
+    rolled = ["rollout", "ethanol", "--weights", weights, "--time", "0.1ps", "-o", "x.h5"]
+    assert "no solver" in refusal(*rolled, "--config", str(bad))
     for line, reason in {"steps = 4": "training.steps is set on the command line",
                          "nois = 1": "unknown.*training.nois", "=": "not valid TOML"}.items():  # fmt: skip
         bad.write_text(f"{TINY}[training]\n{line}\n")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from command_line import SMALL_LAM_SLIDE, run
+from command_line import SMALL_LAM_SLIDE, TWO_SOLVER_STEPS, run
 from systems.library.named_scenes import load
 from systems.trajectory.codec import open_trajectory, open_writer
 
@@ -33,9 +33,10 @@ def test_weights_of_heavy_atoms_roll_all_atoms(folder: Path, setting: tuple[str,
     assert done.exit_code == 0, done.stderr
     assert json.loads(run("info", weights, "--json").stdout)["config"][key] == value
     scene = load("alanine-dipeptide")
+    (folder / "coarse.toml").write_text(TWO_SOLVER_STEPS)
     for atoms, n_atoms in (("all", scene.n_atoms), ("heavy", len(scene.heavy_idx))):
         rolled = run("rollout", "alanine-dipeptide", "--weights", weights, "--time", "9ps", "-o", str(out), "--guard",
-                     "off", "--steps", "2", "--atoms", atoms, "--overwrite", "-q")  # fmt: skip
+                     "off", "--config", str(folder / "coarse.toml"), "--atoms", atoms, "--overwrite", "-q")  # fmt: skip
         assert rolled.exit_code == 0, rolled.stderr
         with open_trajectory(out) as reader:
             assert reader.read().shape == (9, n_atoms, 3)

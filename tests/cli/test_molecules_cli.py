@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from command_line import SMALL_LAM_SLIDE, run
+from command_line import SMALL_LAM_SLIDE, TWO_SOLVER_STEPS, run
 from systems.source import prepare
 from systems.trajectory.codec import open_trajectory, open_writer
 
@@ -41,7 +41,10 @@ def test_info_names_all_molecules(folder: Path) -> None:
 
 def test_an_unseen_molecule_rolls_at_the_lag_that_is_kept(folder: Path) -> None:
     out = folder / "ethanol.h5"
-    common = ["--weights", str(folder / "w.safetensors"), "-o", str(out), "--guard", "off", "--steps", "2", "-q"]
+    coarse = folder / "coarse.toml"
+    coarse.write_text(TWO_SOLVER_STEPS)
+    weights = str(folder / "w.safetensors")
+    common = ["--weights", weights, "-o", str(out), "--guard", "off", "--config", str(coarse), "-q"]
     done = run("rollout", "smiles:CCO", *common, "--time", "60ps", "--save-every", "10ps")
     assert done.exit_code == 0, done.stderr
     with open_trajectory(out) as reader:

@@ -18,6 +18,12 @@ n_heads = 2
 auxiliary_frames = 2
 """
 
+# A quick solver for `rollout --config`.
+TWO_SOLVER_STEPS = """
+[sampling]
+solver_steps = 2
+"""
+
 
 def run(*arguments: str) -> Result:
     """Return what `surromd ARGUMENTS` printed and its exit status."""

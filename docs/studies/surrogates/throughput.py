@@ -5,8 +5,9 @@
 operations of matrix products (torch's flop counter), over time, over that peak. Last it samples 30 frames (10 of them
 given) x 32 latents x width 128 x 6 layers in 10 Euler steps (Table 11), by turns with the plain float32 program of
 `bench.plain_network`, which computes the same function; ratios are the median, least and greatest over rounds.
-With `--compile` (needs a C++ compiler) also compiled by torch, as `rollout --compile` runs it; what compiling takes is
-left out. Processor time of all threads over their number, so that a shared machine does not count twice.
+With `--compile` (needs a C++ compiler) also compiled by torch, as `rollout` runs it with `compile`; what
+compiling takes is left out. Processor time of all threads over their number, so that a shared machine does not count
+twice.
 """
 
 from __future__ import annotations

@@ -136,7 +136,8 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
     outs = [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))]
     if not all(out.exists() for out in outs):
         folder.mkdir(parents=True, exist_ok=True)
-        rollout(scene, weights, outs, RolloutConfig(time_ps, lag_ps=FRAMES_PS, seed=1, guard="off"), overwrite=True)
+        config = RolloutConfig(time_ps=time_ps, lag_ps=FRAMES_PS, seed=1, guard="off")
+        rollout(scene, weights, outs, config, overwrite=True)
     rolled = [_thinned([out])[1][0] for out in outs]
     truth, rolled = [angles(turns, x) for x in truth], [angles(turns, x) for x in rolled]
     names = [name for name in scene.residue_names if name not in ("ACE", "NME")]

@@ -484,7 +484,8 @@ def test_settings_that_cannot_be_are_refused(domain: TrainingDomain) -> None:
     for wrong, error, said in (
         ({"guard": "repare"}, UnknownNameError, "Did you mean 'repair'"),
         ({"atoms": "none"}, InputError, "all or heavy"),
-        ({"energy_every": -1}, InputError, "negative"),
+        ({"energy_every": -1}, InputError, "at least 0"),
+        ({"md_between_ps": -1.0}, InputError, "at least 0"),
         ({"solver_steps": 0}, InputError, "at least 1"),
     ):
         with pytest.raises(error, match=said):

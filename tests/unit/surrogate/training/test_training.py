@@ -17,9 +17,9 @@ from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.objectives import flow_loss
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
-from surrogate.models.settings import read_toml
 from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
+from systems.files.toml_file import read_toml
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
 

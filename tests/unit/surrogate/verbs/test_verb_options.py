@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 from typing import Any
 
 import pytest
@@ -14,10 +13,11 @@ from md_reference.campaign.run_options import key_of, read_settings
 from md_reference.run.defaults import defaults
 from surrogate import api
 from surrogate.cli import main
-from surrogate.verbs.md_options import MDOptions, Preparation, flags_of
+from surrogate.verbs.options import PlanOptions, Preparation, ReferenceOptions, RolloutOptions
+from systems.options import options_of
 from systems.source import prepare
 
-FLAGS = {name: flag for name, (_, flag) in flags_of(MDOptions).items()}
+FLAGS = {name: each for name, each in options_of(PlanOptions).items() if name != "time_ps"}
 # How many runs there are, whose settings, and what makes the box: no fields of MDConfig or ForceFieldSpec.
 ELSEWHERE = {"replicas", "level", "protocol", "padding_nm", "ionic_strength_molar"}
 TYPED = {
@@ -50,7 +50,7 @@ def called(monkeypatch: pytest.MonkeyPatch, verb: str, arguments: list[str]) -> 
     seen: dict[str, Any] = {}
 
     def spy(*_: Any, **keywords: Any) -> Any:
-        seen.update(keywords)
+        seen.update(vars(keywords["options"]))
         return {} if verb == "plan" else []
 
     monkeypatch.setattr(api, verb, spy)
@@ -69,17 +69,20 @@ ARGUMENTS = {
 @pytest.mark.parametrize("verb", ["plan", "reference"])
 def test_every_flag_arrives_in_our_units(monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
     assert set(TYPED) == set(FLAGS)
-    typed = [word for name, (text, _) in TYPED.items() for word in (FLAGS[name].flag, text) if word is not None]
+    typed = [word for name, (text, _) in TYPED.items() for word in (FLAGS[name].flags[0], text) if word is not None]
     seen = called(monkeypatch, verb, [*ARGUMENTS[verb], *typed])
     assert {name: seen[name] for name in FLAGS} == pytest.approx({name: value for name, (_, value) in TYPED.items()})
 
 
-@pytest.mark.parametrize(("verb", "options"), [("plan", MDOptions), ("reference", MDOptions), ("rollout", Preparation)])
+@pytest.mark.parametrize(
+    ("verb", "options"), [("plan", PlanOptions), ("reference", ReferenceOptions), ("rollout", RolloutOptions)]
+)
 def test_a_flag_left_out_is_the_keyword_left_out(monkeypatch: pytest.MonkeyPatch, verb: str, options: Any) -> None:
     stated = inspect.signature(getattr(surrogate, verb)).parameters
     seen = called(monkeypatch, verb, ARGUMENTS[verb])
-    for name in flags_of(options):
-        assert seen[name] == stated[name].default, name
+    for name in options_of(options):
+        given = 1.0 if name == "time_ps" and verb != "plan" else stated[name].default
+        assert seen[name] == given, name
         assert stated[name].kind is inspect.Parameter.KEYWORD_ONLY
     assert not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in stated.values())
 
@@ -102,20 +105,21 @@ def test_settings_and_campaigns_have_the_same_names_and_the_help_their_defaults(
     for name, flag in FLAGS.items():
         if name in ELSEWHERE:
             continue
-        key = flag.flag.removeprefix("--").replace("-", "_")
+        key = flag.key
         if name in Preparation.__annotations__:
             assert (key, flag.default) == (name, switches[name].default)
             continue
         # pressure_bar stands with its unit in a campaign's file, where it is a bare number.
         assert key_of(name) == (name if name == "pressure_bar" else key)
-        stated = re.search(r"\[default: (.+)\]$", flag.help)
-        if stated is None:
+        text = flag.shown_default
+        if flag.default is not None and flag.default != "default":
             assert flag.default == known[name], name
             continue
-        text = stated.group(1)
-        value = flag.read(text, flag.flag) if flag.read else type(known[name])(text)
+        value = flag.read(text, name) if flag.read else type(known[name])(text)
         assert value == pytest.approx(known[name]), name
-        assert read_settings({key_of(name): value if name == "pressure_bar" else text}, axes=(), preparation={})
+        assert read_settings(
+            {key_of(name): value if name == "pressure_bar" else text}, axes={}, preparation={}, others=(), where=""
+        )
 
 
 def test_another_default_in_the_help_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:

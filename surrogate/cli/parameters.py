@@ -1,0 +1,136 @@
+"""Types of the command line's arguments and options that several verbs share, with their help."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+from collections.abc import Callable
+from dataclasses import is_dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, cast, get_type_hints
+
+import typer
+
+from systems.options import MissingOptionError, Option, gather, options_of
+
+
+def literal(text: str) -> str:
+    """Return a help text in which brackets are what they look like: typer and rich take `[default: 4fs]` for markup and
+    show nothing of it."""
+    return text.replace("[", "\\[")
+
+
+class FailOn(StrEnum):
+    different = "different"
+    broken = "broken"
+
+
+class Precision(StrEnum):
+    auto = "auto"
+    fp32 = "fp32"
+    bf16 = "bf16"
+
+
+SceneArg = Annotated[
+    str, typer.Argument(metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.")
+]
+ArchOpt = Annotated[
+    str | None,
+    typer.Option("--arch", help="lam-slide, painet, egnn, a baseline, ... Default: what suits the references."),
+]
+VelocitiesOpt = Annotated[bool, typer.Option("--velocities", help="Keep velocities, which painet learns from.")]
+ValidationOpt = Annotated[
+    list[str] | None,
+    typer.Option("--validation", help="Trajectory held out whole; repeatable. Default: the last 5 % of each."),
+]
+DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+WeightsOpt = Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")]
+OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")]
+SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
+ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
+OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
+
+
+def _hush(quiet: bool) -> bool:
+    """Keep the lines of loggers, such as those about charges, from stderr."""
+    logging.getLogger("surromd").setLevel(logging.ERROR if quiet else logging.NOTSET)
+    return quiet
+
+
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.", callback=_hush)]
+JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with an option of the command line for each that its dataclasses of options declare.
+
+    A parameter of such a type (`options: RolloutOptions`) becomes all of them, in its place, and `--config FILE`, which
+    what stands on the command line comes before. Names and units are those of `systems.options`.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    shown: list[inspect.Parameter] = []
+    kinds: dict[str, type] = {}
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        if is_dataclass(hint):
+            kinds[parameter.name] = cast(Any, hint)
+            known = options_of(cast(type, hint)).values()
+            shown += [_parameter(each) for each in known if each.flags]
+            shown.append(_keyword("config", Path | None, None, _CONFIG))
+        else:
+            shown.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        for name, kind in kinds.items():
+            settled = _settled(kind, given)
+            _hush(getattr(settled, "quiet", False))
+            given[name] = settled
+        command(**given)
+
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return run
+
+
+_CONFIG = typer.Option("--config", help="TOML of these options and others, which those given here come before.")
+
+
+def _settled(kind: type, given: dict[str, Any]) -> Any:
+    """Take a dataclass's options out of what the command line gives, and return it."""
+    typed = {name: given.pop(name) for name, found in options_of(kind).items() if found.flags}
+    said = {name: _plain(value) for name, value in typed.items() if value is not None and value != []}
+    try:
+        return gather(kind, said, file=given.pop("config"), naming=lambda found: found.flags[0])
+    except MissingOptionError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(one) for one in value]
+    return value.value if isinstance(value, StrEnum) else value
+
+
+def _keyword(name: str, kind: Any, default: Any, option: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
+
+
+def _parameter(found: Option) -> inspect.Parameter:
+    """Return an option as typer takes it: None where it is left out, so that a file may give it."""
+    kind: Any = str if found.read is not None else found.kind
+    if found.said.choices:
+        enumeration: Any = StrEnum  # called by its functional form, which mypy takes with literal names alone
+        kind = enumeration(found.name, {choice: choice for choice in found.said.choices})
+    default = "required" if found.required else f"default: {text}" if (text := found.shown_default) else ""
+    least, most = found.said.within if kind in (int, float) else (None, None)
+    option = typer.Option(
+        *found.flags,
+        help=literal(f"{found.help} [{default}]" if default else found.help),
+        min=least,
+        max=most,
+        show_default=False,
+    )
+    return _keyword(found.name, (list[kind] if found.many else kind) | None, None, option)

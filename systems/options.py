@@ -1,0 +1,312 @@
+"""Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
+
+From that declaration follow the command line, the signature and the documentation of the Python call, the keys of a
+`config` file, their checks, and the manual's tables. A name ends in its unit (`time_ps`), which the command line and
+files leave out: there a value carries it (`time = "10ns"`). Imports no library, so that the command's help is quick.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+from systems.errors import InputError, UnknownNameError, nearest
+from systems.units import format_quantity, parser_of, quantity, stem_of, unit_of
+
+T = TypeVar("T")
+_KEY = "option"
+_SCALARS = (bool, int, float, str, Path)
+
+
+class MissingOptionError(InputError):
+    """An option that has no default is given nowhere. `option` is the first of these."""
+
+    def __init__(self, option: Option, naming: Callable[[Option], str]) -> None:
+        super().__init__(f"{naming(option)} is missing: {option.help}")
+        self.option = option
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a field's metadata says of an option; see `option`."""
+
+    help: str
+    choices: tuple[str, ...]
+    within: tuple[float | None, float | None]
+    read: Callable[[str, str], Any] | None
+    unset: str
+    words: tuple[str, ...] | None
+    section: str
+
+
+def option(
+    help: str,
+    default: Any = MISSING,
+    *,
+    choices: Sequence[str] = (),
+    within: tuple[float | None, float | None] = (None, None),
+    read: Callable[[str, str], Any] | None = None,
+    unset: str = "",
+    words: Sequence[str] | None = (),
+    section: str = "",
+) -> Any:
+    """Return a dataclass field that is an option.
+
+    `help`: one sentence. Without a `default` it must be given. `choices`: the values that there are; `within`: bounds
+    of a number. `read(text, what)` returns the value of a text where the unit in the name does not say how. `unset`:
+    what the default comes to, for the help. `words`: how the command line calls it, where that is not its name without
+    the unit, and a letter for it; None keeps it off the command line. `section`: the table of a `config` file that it
+    stands in, which keeps it off the command line, too.
+    """
+    words = None if words is None or section else tuple(words)
+    said = Declaration(help, tuple(choices), within, read, unset, words, section)
+    return field(default=default, metadata={_KEY: said})
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a dataclass: its declaration, and the field's name, type and default (MISSING: it must be given)."""
+
+    name: str
+    hint: Any
+    default: Any
+    said: Declaration
+
+    @property
+    def help(self) -> str:
+        return self.said.help
+
+    @property
+    def section(self) -> str:
+        return self.said.section
+
+    @property
+    def required(self) -> bool:
+        return self.default is MISSING
+
+    @property
+    def key(self) -> str:
+        """The name in a file: without unit."""
+        return self.said.words[0].replace("-", "_") if self.said.words else stem_of(self.name)
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """The names on the command line; none where it is not there."""
+        if self.said.words is None:
+            return ()
+        words = self.said.words or (self.key.replace("_", "-"),)
+        return tuple(f"{'-' if len(word) == 1 else '--'}{word}" for word in words)
+
+    @property
+    def unit(self) -> str:
+        return unit_of(self.name) if self.kind is float else ""
+
+    @property
+    def many(self) -> bool:
+        """Whether it takes several values."""
+        return any(get_origin(hint) in (list, tuple, Sequence) for hint in _members(self.hint))
+
+    @property
+    def kind(self) -> type:
+        """The type of one value: bool, int, float, str or Path; dict for a table of a file."""
+        for hint in _members(self.hint):
+            found = get_args(hint)[0] if get_origin(hint) in (list, tuple, Sequence) else hint
+            found = _members(found)[0]
+            if found in _SCALARS:
+                return cast(type, found)
+            if get_origin(found) is Literal:
+                return str
+        return dict
+
+    @property
+    def read(self) -> Callable[[str, str], Any] | None:
+        """What reads a text of it: (text, what to call it) -> value in our unit. None where a text is the value."""
+        return self.said.read or (parser_of(self.name) if self.unit else None)
+
+    @property
+    def shown_default(self) -> str:
+        """The default as the help states it; empty where there is none to state."""
+        if self.said.unset or self.required or self.default is None or self.default is False or self.default == ():
+            return self.said.unset
+        if self.unit and not isinstance(self.default, str):
+            return format_quantity(self.name, self.default)
+        return ", ".join(map(str, self.default)) if isinstance(self.default, tuple) else str(self.default)
+
+    def value(self, given: Any, what: str) -> Any:
+        """Return what is given for it, checked and in our unit. Raises UnitError, UnknownNameError or InputError, which
+        call it `what`."""
+        if hasattr(given, "item") and not getattr(given, "ndim", 1):
+            given = given.item()
+        if self.read is not None and (given is not None or type(None) not in get_args(self.hint)):
+            several = self.many and isinstance(given, list | tuple)
+            value: Any = [self._read(one, what) for one in given] if several else self._read(given, what)
+        else:
+            from systems.files.schema import fitted
+
+            try:
+                value = fitted(given, self.hint, what)
+            except ValueError as error:
+                raise InputError(f"{error}.") from None
+        self.check(value, what)
+        return value
+
+    def _read(self, given: Any, what: str) -> Any:
+        if given is None or given == self.default:
+            return given
+        if isinstance(given, str):
+            return cast(Callable[[str, str], Any], self.read)(given, what)
+        return quantity(self.name, given, what)
+
+    def check(self, value: Any, what: str) -> None:
+        """Raise UnknownNameError or InputError where a value is none of the choices, or outside the bounds."""
+        for one in value if isinstance(value, list | tuple) else (value,):
+            choices, (least, most) = self.said.choices, self.said.within
+            if choices and one is not None and one not in choices:
+                raise UnknownNameError(
+                    f"{what} {one!r} is unknown; choose {_listed(choices)}.{nearest(str(one), list(choices))}"
+                )
+            if isinstance(one, bool) or not isinstance(one, int | float):
+                continue
+            if least is not None and one < least:
+                raise InputError(f"{what} {one!r} must be at least {least:g}.")
+            if most is not None and one > most:
+                raise InputError(f"{what} {one!r} must be at most {most:g}.")
+
+
+def _members(hint: Any) -> list[Any]:
+    """Return the types of a union, or the one type that a hint is."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return [one for kind in get_args(hint) if kind is not types.NoneType for one in _members(kind)]
+    return [hint]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def options_of(kind: type) -> dict[str, Option]:
+    """Return the options of a dataclass by name, in order."""
+    return _options_of(kind)
+
+
+@cache
+def _options_of(kind: Hashable) -> dict[str, Option]:
+    hints = get_type_hints(cast(type, kind))
+    return {f.name: Option(f.name, hints[f.name], f.default, f.metadata[_KEY])
+            for f in fields(cast(Any, kind)) if _KEY in f.metadata}  # fmt: skip
+
+
+def check_options(settings: Any) -> None:
+    """Raise UnknownNameError or InputError for a value of a dataclass that its declaration does not allow."""
+    for name, found in options_of(type(settings)).items():
+        found.check(getattr(settings, name), name)
+
+
+def gather(
+    kind: type[T],
+    given: Mapping[str, Any],
+    *,
+    file: str | Path | None = None,
+    naming: Callable[[Option], str] = attrgetter("name"),
+) -> T:
+    """Return the dataclass `kind` of the options that are `given`, before those of a TOML `file`, before the defaults.
+
+    `naming` says what to call an option in a message. Raises MissingOptionError, InputError for an unknown name (with
+    the nearest) and what `Option.value` raises.
+    """
+    known = options_of(kind)
+    values = {} if file is None else read_options(kind, file)
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"there is no option {name!r}.{nearest(name, list(known))}")
+        values[name] = known[name].value(value, naming(known[name]))
+    for name, found in known.items():
+        if found.required and name not in values:
+            raise MissingOptionError(found, naming)
+    return kind(**values)
+
+
+def read_options(kind: type, file: str | Path) -> dict[str, Any]:
+    """Return the options that a TOML file gives, by name, in our units. Raises InputError, which names file and key."""
+    from systems.files.toml_file import read_toml
+
+    known = options_of(kind)
+    sections = {found.section for found in known.values()} - {""}
+    record = read_toml(file)
+    tables: dict[str, Any] = {"": {key: value for key, value in record.items() if key not in sections}}
+    tables |= {section: record[section] for section in sections if section in record}
+    values: dict[str, Any] = {}
+    for section, table in tables.items():
+        where = f"{file}: {section}." if section else f"{file}: "
+        if not isinstance(table, dict):
+            raise InputError(f"{file}: {section} is a table, [{section}], not {table!r}.")
+        keys = {found.key: name for name, found in known.items() if found.section == section}
+        for key, value in table.items():
+            name = keys.get(key.replace("-", "_"))
+            if name is None:
+                raise InputError(f"{where}unknown key {key!r}.{_meant(key, section, known)}")
+            bare = known[name].unit and isinstance(value, int | float) and not isinstance(value, bool)
+            values[name] = known[name].value(str(value) if bare else value, f"{where}{key}")
+    return values
+
+
+def _meant(key: str, section: str, known: Mapping[str, Option]) -> str:
+    """Return what a key that is not known may have been meant for."""
+    for found in known.values():
+        if found.section != section and found.key == key:
+            return f" It stands in [{found.section}]." if found.section else " It stands before the first table."
+    here = [found.key for found in known.values() if found.section == section]
+    return nearest(key, here) or f" Known: {', '.join(sorted(here))}."
+
+
+def part_of(settings: Any, kind: type[T]) -> T:
+    """Return the dataclass `kind` of the fields that `settings`, which has all of them, holds."""
+    return kind(**{f.name: getattr(settings, f.name) for f in fields(cast(Any, kind)) if f.init})
+
+
+@dataclass(frozen=True)
+class OptionRow:
+    """An option as a table of the manual shows it. `flag` is empty for those of a `config` file alone, whose table
+    `section` is; `name` is the keyword in Python, `key` the name in a file."""
+
+    name: str
+    flag: str
+    key: str
+    section: str
+    unit: str
+    default: str
+    choices: tuple[str, ...]
+    help: str
+
+
+def option_rows(kind: type) -> list[OptionRow]:
+    """Return the options of a dataclass as rows of a table; 'required' stands for the default of those without."""
+    if not is_dataclass(kind):
+        raise TypeError(f"{kind!r} is no dataclass of options")
+    return [
+        OptionRow(
+            name=found.name,
+            flag=", ".join(found.flags),
+            key=found.key,
+            section=found.section,
+            unit=found.unit,
+            default="required" if found.required else found.shown_default,
+            choices=found.said.choices,
+            help=found.help,
+        )
+        for found in options_of(kind).values()
+    ]
+
+
+def flag_of(name: str) -> str:
+    """Return how the command line calls an option of this name, where nothing else is declared.
+
+    >>> flag_of("save_every_ps") == "-" * 2 + "save-every"
+    True
+    """
+    return f"--{stem_of(name).replace('_', '-')}"
