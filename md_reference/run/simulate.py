@@ -28,11 +28,11 @@ from systems.trajectory.checkpoint import (
     Checkpoint,
     CheckpointFile,
     checkpoint_path,
+    claimed_outputs,
     last_supported,
     new_header,
     writer_at,
 )
-from systems.trajectory.claim import claimed_outputs
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 

@@ -32,12 +32,12 @@ from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     CheckpointFile,
     checkpoint_path,
+    claimed_outputs,
     last_supported,
     new_header,
     read_checkpoints,
     writer_at,
 )
-from systems.trajectory.claim import claimed_outputs
 from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:

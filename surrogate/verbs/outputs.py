@@ -9,8 +9,7 @@ from pathlib import Path
 
 from md_reference.campaign.manifest import campaign_folder, campaign_trajectories
 from systems.errors import InputError
-from systems.trajectory.checkpoint import checkpoint_path
-from systems.trajectory.claim import frames_in
+from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.topology_file import refuse_foreign_topology
 
 PathLike = str | Path

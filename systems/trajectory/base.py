@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,34 +15,11 @@ import numpy.typing as npt
 from systems.errors import InputError, TrajectoryError
 from systems.files.checksums import Checksums, frames_digest
 from systems.scene import Scene
+from systems.trajectory.claim import Claim
+from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
+from systems.trajectory.frame_store import FrameStore
 
-if TYPE_CHECKING:
-    from systems.trajectory.claim import Claim
-    from systems.trajectory.frame_store import FrameStore
-
-Float32Array = npt.NDArray[np.float32]
-Float64Array = npt.NDArray[np.float64]
 _VERIFIED_AT_ONCE = 4096
-
-
-@dataclass(frozen=True, eq=False)
-class FrameBlock:
-    """Frames that belong together, checked: positions `(n, n_atoms, 3)` float32 nm, series `(n,)`.
-
-    Where they are kept: velocities and forces `(n, n_atoms, 3)` float32, box vectors `(n, 3, 3)`.
-    """
-
-    positions_nm: Float32Array
-    time_ps: Float64Array
-    flags: npt.NDArray[np.uint16] | None
-    chunk_idx: npt.NDArray[np.int32]
-    scalars: dict[str, Float64Array]
-    velocities_nm_ps: Float32Array | None = None
-    forces_kj_mol_nm: Float32Array | None = None
-    cell_nm: Float64Array | None = None
-
-    def __len__(self) -> int:
-        return len(self.time_ps)
 
 
 class TrajectoryWriter(ABC):

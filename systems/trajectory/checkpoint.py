@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from systems.errors import InputError, TrajectoryError
+from systems.errors import InputError, StorageError, SurromdError, TrajectoryError
 from systems.files.checksums import packed, unpacked
 from systems.files.schema import built
-from systems.files.whole_file import create_whole
+from systems.files.whole_file import create_whole, refuse_existing, storage_error
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
+from systems.trajectory.claim import Claim
+from systems.trajectory.codec import companions, open_trajectory, open_writer
 
 _MAGIC = b"surromd checkpoint 3\n"
 # Of a run's time no more than one part in so many should go into waiting for the medium.
@@ -123,8 +126,6 @@ def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str,
 
     Without frames it begins anew: when `resumed`, what lies there is the run's own, or may be replaced.
     """
-    from systems.trajectory.codec import open_writer
-
     n_frames = header["files"][k]["n_frames"]
     how: dict[str, Any] = {"append": True} if n_frames else {"overwrite": resumed or header["overwrite"]}
     writer = open_writer(out, scene, record, columns=columns, run_id=header["run_id"], claimed=True, **how)
@@ -140,8 +141,6 @@ def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str,
 
 def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> str:
     """Return why a trajectory does not hold what a checkpoint has seen of it, or nothing."""
-    from systems.trajectory.codec import open_trajectory
-
     if not begun and (header["overwrite"] or not out.exists()):
         return ""
     if not out.exists():
@@ -161,3 +160,51 @@ def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> s
     except TrajectoryError as error:
         return str(error).rstrip(".")
     return ""
+
+
+@contextmanager
+def claimed_outputs(
+    outs: Sequence[Path],
+    *,
+    may_exist: bool,
+    patience_s: float = 0.0,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[None]:
+    """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
+
+    What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
+    Raises what `Claim` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another file
+    lies in the place of the checkpoint, StorageError for an OSError of the run's own.
+    """
+    with ExitStack() as stack:
+        for out in outs:
+            stack.enter_context(Claim(out, patience_s=patience_s, stopped=stopped))
+        refuse_foreign(checkpoint_path(outs[0]))
+        for out in outs:
+            refuse_existing(out, may_exist)
+        before = {member for out in outs for member in family(out) if member.exists()}
+        try:
+            yield
+        except BaseException as error:
+            resumable = isinstance(error, KeyboardInterrupt | StorageError) and checkpoint_path(outs[0]).exists()
+            for out in outs if not resumable else ():
+                with suppress(SurromdError, OSError):  # what cannot be read may hold frames
+                    if not frames_in(out):
+                        for member in set(family(out)) - before:
+                            member.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise storage_error(outs[0], error, "the frames written before are complete and readable") from error
+            raise
+
+
+def family(out: Path) -> list[Path]:
+    """Return the paths of a trajectory and of what is written beside it."""
+    return [out, checkpoint_path(out), *companions(out)]
+
+
+def frames_in(out: Path) -> int:
+    """Return how many frames a trajectory holds, 0 where it is not there. Raises TrajectoryError."""
+    if not out.exists():
+        return 0
+    with open_trajectory(out) as reader:
+        return reader.n_frames

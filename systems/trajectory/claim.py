@@ -1,18 +1,17 @@
-"""The right to write an output: one process has it, from start to end, and sweeps what it made in vain."""
+"""The right to write an output: one process has it, from start to end."""
 
 from __future__ import annotations
 
 import errno
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from systems.errors import StorageError, SurromdError, TrajectoryError
-from systems.files.whole_file import refuse_existing, storage_error
-from systems.trajectory.checkpoint import checkpoint_path, refuse_foreign
+from systems.errors import TrajectoryError
+from systems.files.whole_file import storage_error
 
 _ASK_EVERY_S = 0.5
 
@@ -76,55 +75,3 @@ class Claim:
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
                  trace: TracebackType | None) -> None:  # fmt: skip
         self.close()
-
-
-@contextmanager
-def claimed_outputs(
-    outs: Sequence[Path],
-    *,
-    may_exist: bool,
-    patience_s: float = 0.0,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Iterator[None]:
-    """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
-
-    What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
-    Raises what `Claim` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another file
-    lies in the place of the checkpoint, StorageError for an OSError of the run's own.
-    """
-    with ExitStack() as stack:
-        for out in outs:
-            stack.enter_context(Claim(out, patience_s=patience_s, stopped=stopped))
-        refuse_foreign(checkpoint_path(outs[0]))
-        for out in outs:
-            refuse_existing(out, may_exist)
-        before = {member for out in outs for member in family(out) if member.exists()}
-        try:
-            yield
-        except BaseException as error:
-            resumable = isinstance(error, KeyboardInterrupt | StorageError) and checkpoint_path(outs[0]).exists()
-            for out in outs if not resumable else ():
-                with suppress(SurromdError, OSError):  # what cannot be read may hold frames
-                    if not frames_in(out):
-                        for member in set(family(out)) - before:
-                            member.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                raise storage_error(outs[0], error, "the frames written before are complete and readable") from error
-            raise
-
-
-def family(out: Path) -> list[Path]:
-    """Return the paths of a trajectory and of what is written beside it."""
-    from systems.trajectory.codec import companions
-
-    return [out, checkpoint_path(out), *companions(out)]
-
-
-def frames_in(out: Path) -> int:
-    """Return how many frames a trajectory holds, 0 where it is not there. Raises TrajectoryError."""
-    from systems.trajectory.codec import open_trajectory
-
-    if not out.exists():
-        return 0
-    with open_trajectory(out) as reader:
-        return reader.n_frames

@@ -10,7 +10,9 @@ from typing import Any
 from systems.errors import InputError, TrajectoryError
 from systems.files.atomic_file import journal_path
 from systems.scene import Scene
-from systems.trajectory.base import FrameBlock, TrajectoryReader, TrajectoryWriter
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
+from systems.trajectory.claim import Claim
+from systems.trajectory.frame_block import FrameBlock
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
 
@@ -51,7 +53,6 @@ def open_writer(
         raise InputError(f"{path}: a DCD holds positions only; write an .h5 to keep {' and '.join(columns)}.")
     if path.suffix.lower() not in (*_HDF5, ".dcd"):
         raise InputError(f"{path}: trajectories are written as .h5 or .dcd, not {path.suffix or 'without a suffix'!r}.")
-    from systems.trajectory.claim import Claim
     from systems.trajectory.dcd_file import DcdWriter
     from systems.trajectory.hdf5_file import Hdf5Writer
 
@@ -106,12 +107,12 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         from systems.trajectory.dcd_file import DcdReader
 
         return DcdReader(path, top)
-    from systems.trajectory.from_mdtraj import is_mdtraj_format
+    from systems.trajectory.foreign_scenes import is_mdtraj_format
 
     if is_mdtraj_format(path) and not is_hdf5:
-        from systems.trajectory.mdtraj_file import MdtrajReader
+        from systems.trajectory.foreign_readers import MdtrajReader
 
         return MdtrajReader(path, top)
-    from systems.trajectory.from_mdanalysis import MdanalysisReader
+    from systems.trajectory.foreign_readers import MdanalysisReader
 
     return MdanalysisReader(path, top)

@@ -16,13 +16,7 @@ import numpy.typing as npt
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
 from systems.scene import Scene
-from systems.trajectory.base import (
-    Float32Array,
-    FrameBlock,
-    TrajectoryReader,
-    TrajectoryWriter,
-    check_same_topology,
-)
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
 from systems.trajectory.dcd_layout import (
     DcdLayout,
     cell_blocks,
@@ -31,6 +25,7 @@ from systems.trajectory.dcd_layout import (
     step_fields,
     title_bytes,
 )
+from systems.trajectory.frame_block import Float32Array, FrameBlock
 from systems.trajectory.frame_store import (
     CELLS,
     FRAMES,
@@ -246,7 +241,7 @@ def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, complet
 
 
 def _scene_from_top(top: Path, path: Path, n_atoms: int) -> Scene:
-    from systems.trajectory.from_mdtraj import scene_from_structure
+    from systems.trajectory.foreign_scenes import scene_from_structure
 
     scene = scene_from_structure(top, name=path.stem)
     if scene.n_atoms != n_atoms:

@@ -18,7 +18,7 @@ from systems.chemistry.cell_shape import lengths_and_angles
 from systems.chemistry.cell_shape import read_cells as cells_of
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory.base import FrameBlock
+from systems.trajectory.frame_block import FrameBlock
 from systems.trajectory.frame_store import EDGES, add_column
 
 PER_ATOM = ("velocities", "forces")

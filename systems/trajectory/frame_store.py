@@ -29,7 +29,7 @@ from systems.files.schema import fitted, parsed
 from systems.files.whole_file import create_whole, refuse_existing, storage_error
 from systems.record import Record
 from systems.scene import Scene
-from systems.trajectory.base import FrameBlock
+from systems.trajectory.frame_block import FrameBlock
 
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048

@@ -22,15 +22,9 @@ from systems.errors import InputError, TrajectoryError
 from systems.files.checksums import Checksums, check_frames_read, frame_checksums
 from systems.files.whole_file import refuse_existing
 from systems.scene import Scene
-from systems.trajectory.base import (
-    Float32Array,
-    Float64Array,
-    FrameBlock,
-    TrajectoryReader,
-    TrajectoryWriter,
-    check_same_topology,
-)
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
 from systems.trajectory.extra_columns import PER_ATOM, check_wanted, extra_values, lay_out_extras, read_cells
+from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
 from systems.trajectory.frame_store import (
     CELLS,
     CHECKSUMS,
@@ -155,7 +149,7 @@ class Hdf5Reader(TrajectoryReader):
             return Scene.from_dict(get_json(self._file, "surromd/scene"))
         if "topology" not in self._file or self.n_frames == 0:
             return None
-        from systems.trajectory.from_mdtraj import scene_from_topology_json
+        from systems.trajectory.foreign_scenes import scene_from_topology_json
 
         return scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
 

@@ -16,7 +16,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 pytestmark = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184

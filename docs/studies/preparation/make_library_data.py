@@ -14,7 +14,7 @@ from pathlib import Path
 
 from systems.library.catalogue import ENTRIES, Entry
 from systems.scene import Scene
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 
 def make(entry: Entry) -> list[Path]:

@@ -19,7 +19,7 @@ from systems.errors import OutOfDomainError, SurromdError
 from systems.scene import Scene
 from systems.selection import part_of, reordered
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights

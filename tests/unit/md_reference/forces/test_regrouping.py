@@ -17,7 +17,7 @@ from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
 from systems.source import prepare
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 SPECS = {
     "ff14SB": ForceFieldSpec(),

@@ -25,7 +25,7 @@ from systems.chemistry.limits import limits_from_frames
 from systems.chemistry.validity import CHIRALITY, ENERGY, INVALID, geometry_from_frames
 from systems.errors import InputError, SimulationError, UnknownNameError
 from systems.scene import Scene
-from systems.trajectory.claim import frames_in
+from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
 
 LAG_PS, N_NEW = 0.1, 8

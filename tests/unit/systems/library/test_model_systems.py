@@ -14,7 +14,7 @@ from systems.errors import InputError, OutOfDomainError
 from systems.library.particles import N_BODY, double_well, harmonic_oscillator, n_body, particles
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 SCENES = {"harmonic": harmonic_oscillator, "double-well": double_well} | {
     name: (lambda name=name: n_body(name, 7)) for name in N_BODY

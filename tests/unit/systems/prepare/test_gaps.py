@@ -12,7 +12,7 @@ from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
 from systems.scene import Scene
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 
 def _without(scene: Scene, numbers: tuple[str, ...], folder: Path, *, hydrogens: bool = True) -> str:

@@ -14,7 +14,7 @@ from systems.prepare.bonding import find_bonds
 from systems.prepare.heterogens import is_water
 from systems.prepare.read.records import AtomRecord
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.startswith("ATOM"))

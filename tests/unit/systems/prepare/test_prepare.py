@@ -19,7 +19,7 @@ from systems.library import named_scenes
 from systems.prepare.peptide import parse_sequence
 from systems.scene import Scene
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 RESIDUES = [ALA2.residue_names[r] for r in ALA2.residue_of_atom]

@@ -22,7 +22,7 @@ from systems.prepare.read.records import AtomRecord
 from systems.prepare.read.structure_text import read_structure
 from systems.prepare.repair import _with_usual_lengths, complete
 from systems.source import prepare
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"

@@ -13,7 +13,7 @@ from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.converted import to_mdanalysis, to_mdtraj
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 
 def write(path: Path, scene: Scene, times: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from systems.chemistry.cell_shape import box_vectors, lengths_and_angles, volume
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 N = 5
 # A truncated octahedron's kind of cell: three lengths, three angles, all different.

@@ -24,7 +24,7 @@ from systems.files import atomic_file
 from systems.scene import Scene
 from systems.trajectory import frame_store, hdf5_file
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.pdb_text import pdb_text
+from systems.trajectory.topology_file import pdb_text
 
 SUFFIXES = (".h5", ".dcd")
 RECORD = {"kind": "reference", "timestep_ps": 0.004, "save_every_ps": 1.0, "seed": 7, "completed": False}

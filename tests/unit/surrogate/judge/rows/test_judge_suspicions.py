@@ -154,7 +154,7 @@ NUMBERED = [((0, 1, 2), ("1", "2", "3")), ((0, 5, 6), ("0", "5", "6")), ((7, 8, 
 def test_residues_that_were_never_numbered_count_from_one(numbers: tuple[int, ...], expected: tuple[str, ...]) -> None:
     import mdtraj
 
-    from systems.trajectory.from_mdtraj import scene_from_mdtraj_topology
+    from systems.trajectory.foreign_scenes import scene_from_mdtraj_topology
 
     topology = mdtraj.Topology()
     chain = topology.add_chain()

@@ -1,7 +1,12 @@
-"""Trajectories of other programs through MDTraj's readers."""
+"""Trajectories of other programs, through the readers of MDTraj and of MDAnalysis.
+
+Each reads formats that the other does not: LH5, HOOMD XML, Desmond and PDBx the first; H5MD, XYZ, LAMMPS, TNG, GSD and
+DL_POLY the second. What both read MDTraj reads, block by block.
+"""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +15,22 @@ import numpy as np
 from systems.chemistry.cell_shape import read_cells
 from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.trajectory.base import Float32Array, Float64Array, TrajectoryReader
-from systems.trajectory.from_mdtraj import scene_from_mdtraj_topology, scene_from_structure
+from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.foreign_scenes import (
+    MDANALYSIS_FORMATS,
+    scene_from_mdtraj_topology,
+    scene_from_structure,
+    scene_from_universe,
+)
+from systems.trajectory.frame_block import Float32Array, Float64Array
 
 _STREAMED = (".xtc", ".trr", ".nc", ".ncdf", ".netcdf")
 _WITH_TOPOLOGY = (".pdb", ".gz", ".pdbx", ".cif", ".mmcif", ".gro", ".mol2", ".arc", ".lh5", ".hoomdxml")
 _WITH_TIMES = (".gro", ".lh5", ".dtr", ".stk", ".ncrst")
 _PASS_FRAMES = 4096
+# Of MDAnalysis' formats those that name their atoms.
+_XYZ_LIKE = (".xyz", ".extxyz", ".gsd", ".txyz", ".pqr", ".dump", ".lammpsdump", ".history", ".config")
+_NM = 0.1
 
 
 class MdtrajReader(TrajectoryReader):
@@ -126,3 +140,72 @@ class MdtrajReader(TrajectoryReader):
         if self._file is not None:
             self._file.close()
         self._file = None
+
+
+class MdanalysisReader(TrajectoryReader):
+    """A format of MDAnalysis, read frame by frame. Raises TrajectoryError; InputError for a `top` that does not fit."""
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        import MDAnalysis
+        from MDAnalysis.coordinates.core import get_reader_for
+
+        self.path = path
+        if not path.exists():
+            raise TrajectoryError(f"{path} does not exist.")
+        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        suffix = path.suffix.lower()
+        format_ = MDANALYSIS_FORMATS.get(suffix)
+        stated = None
+        if top is not None:
+            stated = scene_from_structure(top, name=path.stem)
+        elif suffix in _XYZ_LIKE:
+            stated = scene_from_universe(path, name=path.stem)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                kind = get_reader_for(str(path), format=format_)
+                size = {} if stated is None else {"n_atoms": stated.n_atoms}
+                self._reader: Any = kind(str(path), convert_units=True, **size)
+                self.n_frames, self.n_atoms = int(self._reader.n_frames), int(self._reader.n_atoms)
+                self.time_ps, self.times_known = self._times()
+        except (ValueError, TypeError) as error:
+            hint = "; an ASE file is converted by `ase convert x.traj x.xyz`" if suffix == ".traj" else ""
+            raise TrajectoryError(
+                f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {first_line(error)}{hint}."
+            ) from error
+        except Exception as error:  # each of its readers raises its own kinds
+            raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error
+        if stated is not None and stated.n_atoms != self.n_atoms:
+            self.close()
+            raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
+        self.scene = stated if stated is None or not self.n_frames else stated.with_positions(self._read(0, 1, 1)[0])
+
+    def _times(self) -> tuple[Float64Array, bool]:
+        known = True
+        times = np.empty(self.n_frames)
+        for k, frame in enumerate(self._reader):
+            known = known and ("time" in frame.data or "dt" in frame.data)
+            times[k] = frame.time if known else float(k)
+        return times, known
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
+        for k, frame in enumerate(self._frames(start, stop, stride)):
+            out[k] = frame.positions * np.float32(_NM)
+        return out
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        cells = [frame.triclinic_dimensions for frame in self._frames(start, stop, stride)]
+        if any(c is None or not np.any(c) for c in cells):
+            return None
+        return np.asarray(cells, dtype=np.float64).reshape(-1, 3, 3) * _NM
+
+    def _frames(self, start: int, stop: int, stride: int) -> Any:
+        if self._reader is None:
+            raise InputError(f"{self.path} is closed.")
+        return (self._reader[k] for k in range(start, stop, stride))
+
+    def close(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None

@@ -1,9 +1,11 @@
-"""Scenes from MDTraj topologies and from the structure files that MDTraj reads."""
+"""Scenes from topologies of MDTraj and MDAnalysis, and from the structure and topology files that either reads."""
 
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,15 @@ import numpy.typing as npt
 
 from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.distance_bonds import with_bonds_by_distance
-from systems.chemistry.element_data import atomic_weight_da
+from systems.chemistry.element_data import atomic_weight_da, element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import parsed
 from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
+
+# What stands in a file name where MDAnalysis would not know the format by itself.
+MDANALYSIS_FORMATS = {".h5": "H5MD", ".hdf5": "H5MD", ".h5md": "H5MD", ".extxyz": "XYZ", ".dump": "LAMMPSDUMP"}
+_NM = 0.1
 
 
 def scene_from_mdtraj_topology(
@@ -105,8 +111,6 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
     if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
         topology = _bare_topology(top)
         if topology is None:
-            from systems.trajectory.from_mdanalysis import scene_from_universe
-
             return scene_from_universe(top, name=name)
         return scene_from_mdtraj_topology(topology, np.zeros((topology.n_atoms, 3)), name=name, source=top.name)
     try:
@@ -123,6 +127,58 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
             elements = [r.element for r in records]
     scene = scene_from_mdtraj_topology(topology, structure.xyz[0], name=name, source=top.name, elements=elements)
     return with_bonds_by_distance(scene)
+
+
+def scene_from_universe(top: Path, *, name: str) -> Scene:
+    """Return the Scene of a topology that MDAnalysis reads (TPR, GSD, XYZ, LAMMPS data, ...).
+
+    Bonds are the file's, or by covalent radii where it holds none; positions are zero where it holds none. Raises
+    InputError when it cannot be read, or an element is not known.
+    """
+    import MDAnalysis
+
+    format_ = MDANALYSIS_FORMATS.get(top.suffix.lower())
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            universe = MDAnalysis.Universe(str(top), **({} if format_ is None else {"topology_format": format_}))
+    except Exception as error:  # each of its parsers raises its own kinds
+        raise InputError(f"{top} cannot be read as a topology: {first_line(error)}.") from error
+    atoms = universe.atoms
+    has_positions = hasattr(universe, "trajectory") and universe.trajectory.n_frames > 0
+    positions = np.asarray(atoms.positions, dtype=np.float64) * _NM if has_positions else np.zeros((len(atoms), 3))
+    names = [str(x) for x in _values(atoms, "names", _values(atoms, "types", ["X"] * len(atoms)))]
+    residues = [str(x) for x in _values(atoms.residues, "resnames", ["UNK"] * len(atoms.residues))]
+    of_atom = np.asarray(atoms.resindices, dtype=np.int64)
+    of_atom = np.unique(of_atom, return_inverse=True)[1].astype(np.int64)
+    written = [str(x) for x in _values(atoms, "elements", [""] * len(atoms))]
+    elements = []
+    for i, (atom, element) in enumerate(zip(names, written, strict=True)):
+        # XYZ files hold symbols or PDB names: CA in capitals is an alpha carbon, which MDAnalysis takes for calcium.
+        guessed = "xyz" in top.suffix.lower() and len(element) == 2 and atom.isupper() and atom not in ("CL", "BR")
+        symbol = element_symbol(atom, residues[of_atom[i]], "" if guessed else element)
+        if symbol is None:
+            raise InputError(f"{top}: the element of atom {i} ({atom}) is not known; give a PDB file with --top.")
+        elements.append(symbol)
+    bonds = np.empty((0, 2), dtype=np.int64)
+    if hasattr(atoms, "bonds"):
+        bonds = np.unique(np.sort(np.asarray(atoms.bonds.to_indices()).reshape(-1, 2), axis=1), axis=0).astype(np.int64)
+    scene = Scene(
+        name=name,
+        atom_names=tuple(names),
+        elements=tuple(elements),
+        residue_of_atom=of_atom,
+        residue_names=tuple(residues),
+        residue_ids=tuple(str(x) for x in _values(atoms.residues, "resids", range(1, len(residues) + 1))),
+        chain_of_residue=("A",) * len(residues),
+        bonds=bonds,
+        bond_orders=np.zeros(len(bonds)),
+        formal_charges=np.zeros(len(elements), dtype=np.int64),
+        masses_da=np.array([atomic_weight_da(e) for e in elements]),
+        positions_nm=positions,
+        provenance={"source": top.name},
+    )
+    return _with_orders(with_bonds_by_distance(scene))
 
 
 def _bare_topology(top: Path) -> Any:
@@ -160,3 +216,18 @@ def _order(bond: Any) -> float:
 def _chain_id(chain: Any) -> str:
     given = getattr(chain, "chain_id", None)
     return str(given) if given else chr(ord("A") + chain.index % 26)
+
+
+def _with_orders(scene: Scene) -> Scene:
+    try:
+        orders, charges = perceive(list(scene.elements), scene.bonds)
+    except ValenceError:
+        return scene
+    return replace(scene, bond_orders=orders, formal_charges=charges)
+
+
+def _values(group: Any, name: str, otherwise: Any) -> Any:
+    try:
+        return getattr(group, name)
+    except Exception:  # MDAnalysis' NoDataError: the topology does not say
+        return otherwise
