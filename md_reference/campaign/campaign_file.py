@@ -163,7 +163,7 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
         raise InputError(f"{len(runs)} runs are too many, {_MOST_RUNS} at most; write several campaigns.")
     return Campaign(
         name=head.name or path.stem,
-        folder=folder if folder is not None else path.parent / (head.out or path.stem),
+        folder=path.parent / (head.out or path.stem) if folder is None else Path(fitted(str(folder), str, "out")),
         seed=head.seed,
         scenes=tuple(scenes),
         runs=tuple(runs),

@@ -29,6 +29,8 @@ def check_outputs(
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other.")
     for path in paths:
+        if "\0" in str(path):
+            raise InputError(f"{str(path)!r} is no name for a file: it holds a NUL.")
         if path.suffix.lower() not in suffixes:
             raise InputError(f"{path}: the output must end in {' or '.join(suffixes)}.")
         if not path.parent.is_dir():
