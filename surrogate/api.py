@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.data.shipped import weights_path
 from surrogate.verbs.compare import compare
-from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from surrogate.verbs.options import CampaignOptions, DemoOptions, PathLike, Trajectories, WindowsOptions
+from surrogate.verbs.outputs import check_outputs, find_trajectories
 from surrogate.verbs.reference import plan, reference
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.scene_listing import systems
+from surrogate.verbs.takes import takes
 from surrogate.verbs.train import explain_training, train
 from systems.errors import InputError
-from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison
@@ -39,21 +40,13 @@ __all__ = [
 ]
 
 
-def demo(
-    out_dir: PathLike = "surromd-demo",
-    *,
-    reference_ps: Quantity = 3_000.0,
-    rollout_ps: Quantity = 2_500.0,
-    rollout_replicas: int = 8,
-    seed: int = 0,
-    quiet: bool = False,
-) -> Comparison:
+@takes(DemoOptions)
+def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Comparison:
     """The whole way on alanine dipeptide: two OpenMM runs, longer rollouts with shipped weights, the comparison.
 
     Writes reference_r0.h5, reference_r1.h5 (the replicate), surrogate_r0.h5, ..., report.html and report.json into
     `out_dir`, replacing those of an earlier demo.
     """
-    reference_ps, rollout_ps = quantity("reference_ps", reference_ps), quantity("rollout_ps", rollout_ps)
     folder = Path(out_dir)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,33 +55,18 @@ def demo(
     name = "alanine-dipeptide"
     weights_path(name)  # missing weights are noticed before anything is simulated
     try:
-        truth, replicate = reference(
-            name, folder / "reference.h5", time_ps=reference_ps, replicas=2, seed=seed, overwrite=True, quiet=quiet
-        )
-        rolled = rollout(
-            name,
-            name,
-            folder / "surrogate.h5",
-            time_ps=rollout_ps,
-            replicas=rollout_replicas,
-            seed=seed,
-            overwrite=True,
-            quiet=quiet,
-        )
+        shared = {"seed": options.seed, "quiet": options.quiet, "overwrite": True}
+        out = folder / "reference.h5"
+        truth, replicate = reference(name, out, time_ps=options.reference_ps, replicas=2, **shared)
+        out, n = folder / "surrogate.h5", options.rollout_replicas
+        rolled = rollout(name, name, out, time_ps=options.rollout_ps, replicas=n, **shared)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
     return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)
 
 
-def campaign(
-    file: PathLike,
-    *,
-    out: PathLike | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    dry_run: bool = False,
-    quiet: bool = False,
-) -> dict[str, Any]:
+@takes(CampaignOptions)
+def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOptions) -> dict[str, Any]:
     """Simulate many scenes, temperatures and replicas as a TOML file says, on Dask, and return `info` of the folder.
 
     Runs on `workers` processes of this machine (one per core), on a Dask `scheduler` (tcp://host:port), or on the jobs
@@ -100,9 +78,9 @@ def campaign(
     from surrogate.verbs.campaign import list_runs, run_campaign
 
     asked = read_campaign(file, folder=out)
-    if dry_run:
+    if options.dry_run:
         return list_runs(asked)
-    return run_campaign(asked, workers=workers, scheduler=scheduler, quiet=quiet)
+    return run_campaign(asked, workers=options.workers, scheduler=options.scheduler, quiet=options.quiet)
 
 
 def info(path: PathLike) -> dict[str, Any]:
@@ -123,16 +101,8 @@ def info(path: PathLike) -> dict[str, Any]:
     return describe_file(Path(path))
 
 
-def windows(
-    references: Trajectories,
-    out: PathLike,
-    *,
-    validation: Trajectories | None = None,
-    canonical: bool = True,
-    velocities: bool = False,
-    overwrite: bool = False,
-    quiet: bool = False,
-) -> Path:
+@takes(WindowsOptions)
+def windows(references: Trajectories, out: PathLike, options: WindowsOptions) -> Path:
     """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
 
     They may be larger than memory. `validation`: trajectories held out whole; without any, the last twentieth of each
@@ -142,10 +112,11 @@ def windows(
     from surrogate.data.frames import load_frames, write_windows
 
     out = Path(out)
-    check_outputs([out], [".h5"], overwrite=overwrite)
+    check_outputs([out], [".h5"], overwrite=options.overwrite)
     paths = find_trajectories(references, verify=True)
-    held = [] if validation is None else find_trajectories(validation, verify=True)
-    write_windows(paths, out, canonical=canonical and not velocities, velocities=velocities, held=held)
+    held = [] if options.validation is None else find_trajectories(options.validation, verify=True)
+    canonical = options.canonical and not options.velocities
+    write_windows(paths, out, canonical=canonical, velocities=options.velocities, held=held)
     try:
         load_frames(out).refuse_leaks()
     except InputError:

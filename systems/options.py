@@ -160,7 +160,7 @@ class Option:
             return given
         if isinstance(given, str):
             return cast(Callable[[str, str], Any], self.read)(given, what)
-        return quantity(self.name, given, what)
+        return quantity(self.name, given, what) if self.unit else given
 
     def check(self, value: Any, what: str) -> None:
         """Raise UnknownNameError or InputError where a value is none of the choices, or outside the bounds."""

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from surrogate import __version__
 from surrogate.cli.bench_verbs import bench, stress
 from surrogate.cli.parameters import (
     ArchOpt,
     DeviceOpt,
-    FailOn,
     JsonOpt,
     OutOpt,
     OverwriteOpt,
@@ -23,17 +24,26 @@ from surrogate.cli.parameters import (
     SceneArg,
     SeedOpt,
     ValidationOpt,
-    VelocitiesOpt,
     WeightsOpt,
     literal,
     with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
 from surrogate.cli.reproduce_verb import reproduce
-from surrogate.verbs.options import PlanOptions, ReferenceOptions, RolloutOptions
+from surrogate.verbs.options import (
+    CampaignOptions,
+    CompareOptions,
+    DemoOptions,
+    PlanOptions,
+    Quiet,
+    ReferenceOptions,
+    RolloutOptions,
+    WindowsOptions,
+)
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
+from systems.options import option
 from systems.units import parse_time_ps, parse_wall_s
 
 
@@ -84,10 +94,15 @@ def _os_error(error: OSError) -> str:
     return str(error)
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"surromd {__version__}")
+        raise typer.Exit()
+
+
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Reference MD with OpenMM, learned surrogate rollouts, and a judge that compares the two.",
@@ -99,19 +114,27 @@ app.command()(stress)
 app.command()(reproduce)
 
 
+@app.callback()
+def _surromd(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.", callback=_version)] = False,
+) -> None:
+    """Take the options that belong to no verb."""
+
+
 @app.command()
+@with_options
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the report.")] = Path(
         "surromd-demo"
     ),
-    seed: SeedOpt = 0,
-    quiet: QuietOpt = False,
+    *,
+    options: DemoOptions,
 ) -> None:
     """The whole way on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
     from surrogate import api
 
-    result = api.demo(out, seed=seed, quiet=quiet)
-    print_comparison(result, out / "report.html", as_json=False, quiet=quiet)
+    result = api.demo(out, options=options)
+    print_comparison(result, out / "report.html", as_json=False, quiet=options.quiet)
 
 
 @app.command()
@@ -154,24 +177,23 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
 
 
 @app.command()
+@with_options
 def campaign(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder, instead of the one that FILE names.")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes here; one per core.")] = None,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Of Dask, such as tcp://host:8786.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and start nothing.")] = False,
-    quiet: QuietOpt = False,
+    *,
+    options: CampaignOptions,
     as_json: JsonOpt = False,
 ) -> None:
     """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run it again to go on."""
     from surrogate import api
 
-    result = api.campaign(file, out=out, workers=workers, scheduler=scheduler, dry_run=dry_run, quiet=quiet)
+    result = api.campaign(file, out, options=options)
     if as_json:
         print_json(result)
-    elif dry_run:
+    elif options.dry_run:
         print_pairs(result)
-    elif not quiet:
+    elif not options.quiet:
         typer.echo(f"{result['file']}: {result['summary']}")
     if result.get("failed"):
         for name, reason in result["failed"].items():
@@ -180,24 +202,20 @@ def campaign(
 
 
 @app.command()
+@with_options
 def windows(
     references: Annotated[
         list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
     ],
+    *,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
-    validation: ValidationOpt = None,
-    velocities: VelocitiesOpt = False,
-    overwrite: OverwriteOpt = False,
-    quiet: QuietOpt = False,
+    options: WindowsOptions,
     as_json: JsonOpt = False,
 ) -> None:
     """Turn reference trajectories into training data: one compact file."""
     from surrogate import api
 
-    written = api.windows(
-        references, out, validation=validation, velocities=velocities, overwrite=overwrite, quiet=quiet
-    )
-    print_written([written], as_json, quiet)
+    print_written([api.windows(references, out, options=options)], as_json, options.quiet)
 
 
 @app.command()
@@ -273,7 +291,18 @@ def rollout(
     print_written(api.rollout(scene, weights, out, options=options), as_json, options.quiet)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CompareShown(Quiet, CompareOptions):
+    """What `compare` can be told, and what the command does about its result."""
+
+    show_all: bool = option("Print every row, not the verdict alone.", False, words=("all",))
+    fail_on: str | None = option(
+        "Exit 1 when a candidate is judged so, or worse.", None, choices=("different", "broken")
+    )
+
+
 @app.command()
+@with_options
 def compare(
     reference: Annotated[str, typer.Argument(metavar="REF", help="The truth: a file, folder, 'glob' or a,b,c.")],
     candidates: Annotated[
@@ -282,44 +311,17 @@ def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; .json, .md go beside it.")] = Path(
         "report.html"
     ),
-    replicate: Annotated[str | None, typer.Option("--replicate", help="Another run of the truth: the floor.")] = None,
-    top: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--top", help="Topology of files without one: once for all, or for REF, each TRAJ, the replicate."
-        ),
-    ] = None,
-    lag: Annotated[
-        list[str] | None,
-        typer.Option("--lag", help="Time between frames, where a file does not say; as --top. '-' leaves one out."),
-    ] = None,
-    energies: Annotated[
-        bool, typer.Option("--energies", help="Energies of every k-th frame too, by the reference's force field.")
-    ] = False,
-    show_all: Annotated[bool, typer.Option("--all", help="Print every row, not the verdict alone.")] = False,
-    fail_on: Annotated[
-        FailOn | None, typer.Option("--fail-on", help="Exit 1 when a candidate is judged so, or worse.")
-    ] = None,
-    overwrite: OverwriteOpt = False,
-    quiet: QuietOpt = False,
+    *,
+    options: CompareShown,
     as_json: JsonOpt = False,
 ) -> None:
     """Judge trajectories against a reference: is it right, how wrong is it, what did it cost?"""
     from surrogate import api
 
-    result = api.compare(
-        reference,
-        candidates,
-        out,
-        replicate=replicate,
-        top=None if not top else [None if x == "-" else x for x in top],
-        lag_ps=None if not lag else [None if x == "-" else parse_time_ps(x, "--lag") for x in lag],
-        energies=energies,
-        overwrite=overwrite,
-    )
-    print_comparison(result, out, as_json=as_json, quiet=quiet, show_all=show_all)
-    bad = {FailOn.different: ("different", "broken"), FailOn.broken: ("broken",)}
-    if fail_on is not None and any(j.status in bad[fail_on] for j in result.judgements):
+    result = api.compare(reference, candidates, out, options=options)
+    print_comparison(result, out, as_json=as_json, quiet=options.quiet, show_all=options.show_all)
+    bad = {"different": ("different", "broken"), "broken": ("broken",)}
+    if options.fail_on is not None and any(j.status in bad[options.fail_on] for j in result.judgements):
         raise typer.Exit(1)
 
 

@@ -22,31 +22,44 @@ def literal(text: str) -> str:
     return text.replace("[", "\\[")
 
 
-class FailOn(StrEnum):
-    different = "different"
-    broken = "broken"
-
-
 class Precision(StrEnum):
     auto = "auto"
     fp32 = "fp32"
     bf16 = "bf16"
 
 
+def _scenes(incomplete: str) -> list[str]:
+    """Return the library's names that begin so, for a shell that completes the word."""
+    from systems.library.named_scenes import names
+
+    return [name for name in names() if name.startswith(incomplete)]
+
+
+def _weights(incomplete: str) -> list[str]:
+    from surrogate.data.shipped import shipped_weights
+
+    return [name for name in shipped_weights() if name.startswith(incomplete)]
+
+
 SceneArg = Annotated[
-    str, typer.Argument(metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.")
+    str,
+    typer.Argument(
+        metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.", autocompletion=_scenes
+    ),
 ]
 ArchOpt = Annotated[
     str | None,
     typer.Option("--arch", help="lam-slide, painet, egnn, a baseline, ... Default: what suits the references."),
 ]
-VelocitiesOpt = Annotated[bool, typer.Option("--velocities", help="Keep velocities, which painet learns from.")]
 ValidationOpt = Annotated[
     list[str] | None,
     typer.Option("--validation", help="Trajectory held out whole; repeatable. Default: the last 5 % of each."),
 ]
 DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
-WeightsOpt = Annotated[str, typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.")]
+WeightsOpt = Annotated[
+    str,
+    typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.", autocompletion=_weights),
+]
 OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")]
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
 ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]

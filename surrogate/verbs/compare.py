@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from surrogate.verbs.options import CompareOptions, PathLike, Trajectories
+from surrogate.verbs.outputs import check_outputs, find_trajectories
+from surrogate.verbs.takes import takes
 from systems.errors import InputError
-from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,17 +20,13 @@ if TYPE_CHECKING:
     from systems.scene import Scene
 
 
+@takes(CompareOptions)
 def compare(
     reference: Trajectories,
     candidates: PathLike | Sequence[Trajectories],
     out_html: PathLike | None = None,
     *,
-    replicate: Trajectories | None = None,
-    top: PathLike | Sequence[PathLike | None] | None = None,
-    lag_ps: Quantity | Sequence[Quantity | None] | None = None,
-    labels: str | Sequence[str] | None = None,
-    energies: bool = False,
-    overwrite: bool = False,
+    options: CompareOptions,
 ) -> Comparison:
     """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
@@ -47,18 +44,18 @@ def compare(
 
     if isinstance(candidates, str | Path):
         candidates = [candidates]
-    labels = [labels] if isinstance(labels, str) else labels
+    labels = [options.labels] if isinstance(options.labels, str) else options.labels
     if not candidates:
         raise InputError("Nothing to compare: name at least one trajectory besides the reference.")
     if labels is not None and len(labels) != len(candidates):
         raise InputError(f"{len(labels)} labels for {len(candidates)} candidates.")
     if out_html is not None:
         page = Path(out_html)
-        check_outputs([page], [".html"], overwrite=overwrite)
-        check_outputs([page.with_suffix(".json"), page.with_suffix(".md")], [".json", ".md"], overwrite=overwrite)
-    n = 1 + len(candidates) + (replicate is not None)
-    tops = _one_each("top", top, n)
-    lags = [None if x is None else quantity("lag_ps", x) for x in _one_each("lag_ps", lag_ps, n)]
+        check_outputs([page], [".html"], overwrite=options.overwrite)
+        beside = [page.with_suffix(".json"), page.with_suffix(".md")]
+        check_outputs(beside, [".json", ".md"], overwrite=options.overwrite)
+    n = 1 + len(candidates) + (options.replicate is not None)
+    tops, lags = _one_each("top", options.top, n), _one_each("lag_ps", options.lag_ps, n)
     truth = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
     others = [
         load_ensemble(
@@ -71,9 +68,9 @@ def compare(
         for k, candidate in enumerate(candidates)
     ]
     floor = None
-    if replicate is not None:
-        floor = load_ensemble(find_trajectories(replicate), template=truth.scene, top=tops[-1], lag_ps=lags[-1])
-    energy_fn = _relaxed_energy(truth.scene, truth.record) if energies else None
+    if options.replicate is not None:
+        floor = load_ensemble(find_trajectories(options.replicate), template=truth.scene, top=tops[-1], lag_ps=lags[-1])
+    energy_fn = _relaxed_energy(truth.scene, truth.record) if options.energies else None
     result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
     if out_html is not None:
         from surrogate.judge.report.report import write_report

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from surrogate.sampling.config import RolloutConfig
 from systems.options import OptionRow, option, option_rows
-from systems.units import Quantity, parse_mass_da
+from systems.units import Quantity, parse_mass_da, parse_time_ps
+
+PathLike = str | Path
+# A file, a folder, a glob, a comma-separated list, or a sequence of these: replicas of each other.
+Trajectories = PathLike | Sequence[PathLike]
 
 
 def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
     """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
     return None if text in ("natural", "none") else parse_mass_da(text, what)
+
+
+def _one_or_none(text: str, what: str) -> str | None:
+    return None if text == "-" else text
+
+
+def _parse_lag_ps(text: str, what: str) -> float | None:
+    return None if text == "-" else parse_time_ps(text, what)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,11 +127,62 @@ class RolloutOptions(Quiet, Overwriting, Resuming, Preparation, Replicated, Roll
     """What `rollout` can be told."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions(Quiet):
+    """What `campaign` can be told beside its file."""
+
+    workers: int | None = option("Processes here.", None, within=(1, None), unset="one per core")
+    scheduler: str | None = option("Of Dask, such as tcp://host:8786.", None)
+    dry_run: bool = option("List the runs and start nothing.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowsOptions(Quiet, Overwriting):
+    """What `windows` can be told."""
+
+    validation: Trajectories | None = option(
+        "Trajectory held out whole; repeatable.", None, unset="the last 5 % of each"
+    )
+    velocities: bool = option("Keep velocities, which painet learns from.", False)
+    canonical: bool = option("Superpose frames on one pose, unless velocities are kept.", True, words=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(Overwriting):
+    """What `compare` can be told. Of `top` and `lag_ps` one stands for all, or there is one for the reference, each
+    candidate and the replicate, in this order, None where the file says it itself."""
+
+    replicate: Trajectories | None = option("Another run of the truth: the floor.", None)
+    top: PathLike | Sequence[PathLike | None] | None = option(
+        "Topology of files without one: once for all, or for REF, each TRAJ, the replicate.", None, read=_one_or_none
+    )
+    lag_ps: float | Sequence[float | None] | None = option(
+        "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
+        None,
+        read=_parse_lag_ps,
+    )
+    labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
+    energies: bool = option("Energies of every k-th frame too, by the reference's force field.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(Quiet, Seeded):
+    """What `demo` can be told."""
+
+    reference_ps: float = option("Of each of two OpenMM runs.", 3_000.0, words=None)
+    rollout_ps: float = option("Of each rollout.", 2_500.0, words=None)
+    rollout_replicas: int = option("Rollouts side by side.", 8, within=(1, None), words=None)
+
+
 # By the verb's name in Python.
 VERB_OPTIONS: dict[str, type] = {
+    "demo": DemoOptions,
     "plan": PlanOptions,
     "reference": ReferenceOptions,
+    "campaign": CampaignOptions,
+    "windows": WindowsOptions,
     "rollout": RolloutOptions,
+    "compare": CompareOptions,
 }
 
 

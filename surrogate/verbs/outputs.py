@@ -8,13 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from md_reference.campaign.manifest import campaign_folder, campaign_trajectories
+from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.topology_file import refuse_foreign_topology
 
-PathLike = str | Path
-# A file, a folder, a glob, a comma-separated list, or a sequence of these: replicas of each other.
-Trajectories = PathLike | Sequence[PathLike]
 TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from surrogate.data.shipped import weights_path
 from surrogate.models.registry import architecture, names
 from surrogate.progress import progress_bar
-from surrogate.verbs.outputs import PathLike, Trajectories, check_outputs, find_trajectories
+from surrogate.verbs.options import PathLike, Trajectories
+from surrogate.verbs.outputs import check_outputs, find_trajectories
 from surrogate.verbs.scene_listing import tell
 from systems.errors import InputError
 from systems.trajectory.claim import Claim

@@ -70,7 +70,8 @@ def test_each_file_has_its_topology_and_time(
     )
     arguments = ["compare", "a.xtc", "b.h5", "--top", "a.pdb", "--top", "-", "--lag", "1ps", "--lag", "-", "--quiet"]
     assert RUNNER.invoke(app, arguments).exit_code == 0
-    assert (seen["top"], seen["lag_ps"]) == (["a.pdb", None], [1.0, None])
+    options = vars(seen["options"])
+    assert (options["top"], options["lag_ps"]) == (["a.pdb", None], [1.0, None])
 
 
 def test_what_cannot_be_read_says_what_is_missing(files: list[Path], tmp_path: Path) -> None:

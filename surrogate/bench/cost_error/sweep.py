@@ -30,7 +30,8 @@ from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.verbs.outputs import Trajectories, find_trajectories
+from surrogate.verbs.options import Trajectories
+from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError, StorageError, SurromdError
 from systems.units import parse_time_ps
 

@@ -1,0 +1,42 @@
+"""What the command says to a shell: its version, and how a word can go on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+import surrogate
+from command_line import run
+
+
+def test_version() -> None:
+    done = run("--version")
+    assert done.exit_code == 0
+    assert done.stdout == f"surromd {surrogate.__version__}\n"
+
+
+def completed(words: str) -> list[str]:
+    """Return what bash is told for the last of these words."""
+    state = {"_SURROMD_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    done = subprocess.run([sys.executable, "-m", "surrogate.cli.main"], capture_output=True, text=True,
+                          env=os.environ | state)  # fmt: skip
+    assert not done.stderr
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("surromd roll", ["rollout"]),
+        ("surromd rollout alanine-dip", ["alanine-dipeptide"]),
+        ("surromd rollout alanine-dipeptide --weights alanine-dipeptide-p", ["alanine-dipeptide-painet"]),
+        ("surromd rollout alanine-dipeptide --guard re", ["resample", "repair"]),
+        ("surromd rollout alanine-dipeptide --save-e", ["--save-every"]),
+        ("surromd rollout alanine-dipeptide --solv", []),
+    ],
+)
+def test_a_shell_completes(words: str, said: list[str]) -> None:
+    assert completed(words) == said
