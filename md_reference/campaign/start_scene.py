@@ -62,15 +62,7 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
         of_water = {key: value for key, value in spec.preparation.items() if key not in switches}
         scene = solvate(scene, force, seed=seed, **of_water)
     system = build_system(scene, force)
-    platform = measured_platform(
-        scene,
-        force,
-        requested=config.platform,
-        temperature_k=config.temperature_k,
-        friction_per_ps=config.friction_per_ps,
-        timestep_ps=config.timestep_ps,
-        system=lambda: system,
-    )
+    platform = measured_platform(scene, replace(config, force=force), system=lambda: system)
     prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
     record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
 

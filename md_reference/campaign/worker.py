@@ -151,22 +151,25 @@ def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> di
 def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     from md_reference.campaign.start_scene import load_prepared
     from md_reference.run.simulate import simulate
+    from systems.trajectory.claim import Claim
     from systems.trajectory.codec import companions, open_trajectory
     from systems.trajectory.topology_file import topology_path
 
-    def report(done: int, _: int) -> None:
-        session.frames[task.run.name] = done
+    def report(done: int, total: int, note: str | None = None) -> None:
+        if note is None:
+            session.frames[task.run.name] = done
 
     prepared = load_prepared(scene_path(folder, task.run.scene))
     config = replace(task.run.config, force=prepared.force)
     out = folder / task.run.file
     out.parent.mkdir(parents=True, exist_ok=True)
+    # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
+    Claim(out, patience_s=_CLAIM_PATIENCE_S, stopped=session.should_stop).close()
     simulate(
         prepared.scene,
         config,
         out,
         resume=True,
-        patience_s=_CLAIM_PATIENCE_S,
         progress=report,
         checkpoint_every_s=task.checkpoint_every_s,
         choice=prepared.platform,

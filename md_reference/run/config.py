@@ -16,24 +16,30 @@ from systems.units import format_time_ps, whole_steps
 
 
 @dataclass(frozen=True)
-class MDConfig:
-    """One run. Times in ps, temperature in K, friction in 1/ps.
+class Conditions:
+    """What acts on a scene, and where it is computed. Temperature in K, friction in 1/ps, time step in ps.
 
     `ensemble`: 'nvt' (Langevin middle integrator, Zhang 2019), 'npt' (the same with a Monte Carlo barostat at
-    `pressure_bar`; scenes with a cell only), or 'nve' (velocity Verlet, started from an equilibration in NVT).
+    `pressure_bar`; scenes with a cell only), or 'nve' (velocity Verlet).
     """
 
-    time_ps: float
-    save_every_ps: float = 1.0
+    force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
     temperature_k: float = 300.0
     friction_per_ps: float = 1.0
     timestep_ps: float = 0.004
-    equilibrate_ps: float = 100.0
-    seed: int = 0
-    platform: str = "auto"
-    force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
     ensemble: str = "nvt"
     pressure_bar: float = 1.0
+    seed: int = 0
+    platform: str = "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDConfig(Conditions):
+    """One run under these conditions. Times in ps; 'nve' starts from an equilibration in NVT."""
+
+    time_ps: float
+    save_every_ps: float = 1.0
+    equilibrate_ps: float = 100.0
     save_velocities: bool = False
     save_forces: bool = False
 

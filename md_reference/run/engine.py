@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
@@ -49,47 +49,46 @@ def one_line(error: Exception) -> str:
 class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
-    `system`: what `build_system` returned for this scene and spec, where it is there already; a barostat is added to
-    it. Virtual sites are placed here and appear nowhere else. Raises what `build_system` and `check_ensemble` raise,
-    and SimulationError when the platform cannot run the scene.
+    `threads`: of the CPU platform, where they are settled. `native_gb`: see `build_system`. `system`: what that
+    returned for this scene and these forces, where it is there already; a barostat is added to it. Virtual sites are
+    placed here and appear nowhere else. Raises what `build_system` and `check_ensemble` raise, and SimulationError when
+    the platform cannot run the scene.
     """
 
     def __init__(
         self,
         scene: Scene,
-        spec: ForceFieldSpec,
+        conditions: Conditions,
         *,
-        temperature_k: float = 300.0,
-        friction_per_ps: float = 1.0,
-        timestep_ps: float = 0.004,
-        seed: int = 0,
-        platform: str = "auto",
         threads: int | None = None,
         native_gb: bool = True,
-        ensemble: str = "nvt",
-        pressure_bar: float = 1.0,
         system: Any = None,
     ) -> None:
         import openmm
 
-        self.ensemble = check_ensemble(ensemble, scene)
+        self.ensemble = check_ensemble(conditions.ensemble, scene)
         self.scene = scene
-        self.spec = spec
-        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
+        self.spec = conditions.force
+        choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")
         self.platform_name, self.threads = choice.name, threads or choice.threads
-        self._system = build_system(scene, spec, native_gb=native_gb) if system is None else system
+        self._system = build_system(scene, self.spec, native_gb=native_gb) if system is None else system
         # OpenMM reads a seed of 0 as "choose one from the clock".
-        self._seed = seed % (2**31 - 1) + 1
-        self._temperature_k = temperature_k
+        self._seed = conditions.seed % (2**31 - 1) + 1
+        self._temperature_k = conditions.temperature_k
         if self.ensemble == "npt":
-            add_barostat(self._system, pressure_bar=pressure_bar, temperature_k=temperature_k, seed=self._seed)
+            add_barostat(
+                self._system,
+                pressure_bar=conditions.pressure_bar,
+                temperature_k=self._temperature_k,
+                seed=self._seed,
+            )
         self._integrator = make_integrator(
             scene,
             self._system,
             self.ensemble,
-            temperature_k=temperature_k,
-            friction_per_ps=friction_per_ps,
-            timestep_ps=timestep_ps,
+            temperature_k=self._temperature_k,
+            friction_per_ps=conditions.friction_per_ps,
+            timestep_ps=conditions.timestep_ps,
         )
         self._integrator.setRandomNumberSeed(self._seed)
         properties = platform_properties(self.platform_name, self.threads)

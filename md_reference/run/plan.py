@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from md_reference.forces.forcefield import build_system, resolve
@@ -71,30 +71,15 @@ class Plan:
         return asdict(self)
 
 
-def make_plan(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    *,
-    temperature_k: float = 300.0,
-    friction_per_ps: float = 1.0,
-    timestep_ps: float = 0.004,
-    platform: str = "auto",
-    replicas: int = 1,
-    time_ps: float | None = None,
-    equilibrate_ps: float = 100.0,
-    ensemble: str = "nvt",
-    pressure_bar: float = 1.0,
-    save_velocities: bool = False,
-    measure_s: float = 0.3,
-) -> Plan:
-    """Return the plan of a run with these settings (units as in `simulate.MDConfig`).
+def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: float = 0.3) -> Plan:
+    """Return the plan of a run with these settings; one whose `time_ps` is 0 has no length yet.
 
     The platform is the one that `reference` would measure. For `measure_s` of wall time each, steps are timed as
     planned and as OpenMM would do it unasked; 0 times nothing, and the size of the scene decides.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    ensemble = check_ensemble(ensemble, scene)
-    spec = resolve(scene, spec)
+    spec = resolve(scene, config.force)
+    config = replace(config, ensemble=check_ensemble(config.ensemble, scene), force=spec)
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
@@ -102,38 +87,28 @@ def make_plan(
     if measure_s > 0:
         choice = measured_platform(
             scene,
-            spec,
-            requested=platform,
-            temperature_k=temperature_k,
-            friction_per_ps=friction_per_ps,
-            timestep_ps=timestep_ps,
+            config,
             max_threads=max(1, cores // side_by_side),
             side_by_side=side_by_side,
             system=lambda: system,
         )
     else:
-        choice = choose_platform(scene.n_atoms, platform, born=spec.solvent != "vacuum")
+        choice = choose_platform(scene.n_atoms, config.platform, born=spec.solvent != "vacuum")
     planned = default = None
     if measure_s > 0:
-        bath = (temperature_k, friction_per_ps, timestep_ps)
-        planned, relaxed_nm = _time_step_s(scene, spec, bath, measure_s, choice)
+        planned, relaxed_nm = _time_step_s(scene, config, measure_s, choice)
         if spec.force_field not in ("gfn2-xtb", "model"):
             alone = PlatformChoice("CPU", 1, "OpenMM's own")
-            default, _ = _time_step_s(scene, spec, bath, measure_s, alone, relaxed_nm=relaxed_nm)
-    wall_s = None
-    if planned is not None and time_ps is not None:
-        wall_s = math.ceil(replicas / cores) * (time_ps + equilibrate_ps) / timestep_ps * planned
-    integrator = _integrator(scene, ensemble, timestep_ps, temperature_k, friction_per_ps, pressure_bar)
+            default, _ = _time_step_s(scene, config, measure_s, alone, relaxed_nm=relaxed_nm)
+    wall_s = _wall_s(config, replicas, planned) if config.time_ps else None
     return Plan(
-        line=plan_line(
-            scene, spec, choice, integrator=integrator, timestep_ps=timestep_ps, step_s=planned, wall_s=wall_s
-        ),
+        line=plan_line(scene, config, choice, step_s=planned, wall_s=wall_s),
         scene=scene.name,
         formula=scene.formula,
         n_atoms=scene.n_atoms,
         force_field=spec.force_field,
         solvent=spec.solvent,
-        integrator=integrator,
+        integrator=_integrator(scene, config),
         platform=choice.name,
         platform_reason=choice.reason,
         timings=tuple(as_records(list(choice.timings))),
@@ -145,40 +120,24 @@ def make_plan(
         constraints=f"{n_constraints} bonds to hydrogen" if n_constraints else "none",
         terms=_terms(system),
         us_per_step=None if planned is None else planned * 1e6,
-        ns_per_day=None if planned is None else timestep_ps * 1e-3 * 86_400.0 / planned,
-        length=None if time_ps is None else format_time_ps(time_ps),
+        ns_per_day=None if planned is None else config.timestep_ps * 1e-3 * 86_400.0 / planned,
+        length=format_time_ps(config.time_ps) if config.time_ps else None,
         wall_s=wall_s,
-        skipped=_skips(scene, spec, ensemble, n_constraints, planned, default, save_velocities=save_velocities),
-        warnings=(*spec.warnings, *_warnings(scene, spec, timestep_ps)),
+        skipped=_skips(scene, config, n_constraints, planned, default),
+        warnings=(*spec.warnings, *_warnings(scene, spec, config.timestep_ps)),
     )
 
 
 def _time_step_s(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    bath: tuple[float, float, float],
-    wall_s: float,
-    choice: PlatformChoice,
-    *,
-    relaxed_nm: FloatArray | None = None,
+    scene: Scene, config: MDConfig, wall_s: float, choice: PlatformChoice, *, relaxed_nm: FloatArray | None = None
 ) -> tuple[float, FloatArray]:
     """Return the seconds of one step, the fastest of all batches measured for `wall_s`, and the positions before them.
 
-    On one core it is processor time, which other work on the machine does not lengthen; `bath`: temperature in K,
-    friction in 1/ps, time step in ps. With `relaxed_nm` OpenMM's own way to the same forces is timed from there: to
-    minimise by it would take minutes from a thousand atoms on.
+    On one core it is processor time, which other work on the machine does not lengthen. With `relaxed_nm` OpenMM's own
+    way to the same forces is timed from there: to minimise by it would take minutes from a thousand atoms on.
     """
-    temperature_k, friction_per_ps, timestep_ps = bath
-    with Engine(
-        scene,
-        spec,
-        temperature_k=temperature_k,
-        friction_per_ps=friction_per_ps,
-        timestep_ps=timestep_ps,
-        platform=choice.name,
-        threads=choice.threads,
-        native_gb=relaxed_nm is None,
-    ) as engine:
+    timed = replace(config, ensemble="nvt", platform=choice.name)
+    with Engine(scene, timed, threads=choice.threads, native_gb=relaxed_nm is None) as engine:
         if relaxed_nm is None:
             engine.minimise(max_iterations=100)
             relaxed_nm = engine.state().positions_nm
@@ -200,31 +159,39 @@ def _time_step_s(
         return fastest, relaxed_nm
 
 
-def _integrator(
-    scene: Scene, ensemble: str, timestep_ps: float, temperature_k: float, friction_per_ps: float, pressure_bar: float
-) -> str:
-    step = f"{timestep_ps * 1000:g} fs"
-    if ensemble == "nve":
+def _wall_s(config: MDConfig, replicas: int, step_s: float | None) -> float | None:
+    """Return the seconds of all replicas, as many at once as there are cores, equilibration included."""
+    if step_s is None:
+        return None
+    rounds = math.ceil(replicas / available_cores())
+    return rounds * (config.time_ps + config.equilibrate_ps) / config.timestep_ps * step_s
+
+
+def _integrator(scene: Scene, config: MDConfig) -> str:
+    step = f"{config.timestep_ps * 1000:g} fs"
+    if config.ensemble == "nve":
         name = {"VelocityVerlet": "velocity Verlet", "SymplecticEuler": "symplectic Euler"}[
-            integrator_name(ensemble, scene)
+            integrator_name("nve", scene)
         ]
-        own = scene.velocities_nm_ps is not None
-        return f"{name}, {step}, no bath (started {'as the scene says' if own else f'at {temperature_k:g} K'})"
-    text = f"Langevin middle, {step}, {temperature_k:g} K, {friction_per_ps:g}/ps"
-    return text + (f"; Monte Carlo barostat at {pressure_bar:g} bar" if ensemble == "npt" else "")
+        started = "as the scene says" if scene.velocities_nm_ps is not None else f"at {config.temperature_k:g} K"
+        return f"{name}, {step}, no bath (started {started})"
+    text = f"Langevin middle, {step}, {config.temperature_k:g} K, {config.friction_per_ps:g}/ps"
+    return text + (f"; Monte Carlo barostat at {config.pressure_bar:g} bar" if config.ensemble == "npt" else "")
 
 
 def plan_line(
     scene: Scene,
-    spec: ForceFieldSpec,
+    config: MDConfig,
     choice: PlatformChoice,
     *,
-    integrator: str,
-    timestep_ps: float,
     step_s: float | None = None,
     wall_s: float | None = None,
 ) -> str:
-    """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known."""
+    """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known.
+
+    `config`: force field and ensemble settled. `step_s`: of one step, `wall_s`: of the whole run, in seconds.
+    """
+    spec = config.force
     periodic = scene.cell_nm is not None
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
     law = spec.force_field if scene.interactions is None else str(scene.interactions.get("kind"))
@@ -233,12 +200,12 @@ def plan_line(
     parts = [
         f"{scene.n_atoms} atoms, {law} in {spec.solvent}{born}",
         f"{choice.name} on {threads} ({choice.reason})",
-        integrator,
+        _integrator(scene, config),
         "bonds to hydrogen rigid" if rigid else "no constraints",
         "PME in a cell" if periodic else "all pairs; no cut-off, cell, PME or barostat without a cell",
     ]
     if step_s is not None:
-        parts.append(f"about {timestep_ps * 1e-3 * 86_400.0 / step_s:.3g} ns/day")
+        parts.append(f"about {config.timestep_ps * 1e-3 * 86_400.0 / step_s:.3g} ns/day")
     if wall_s is not None:
         parts.append(f"about {format_wall(wall_s)}")
     return "; ".join(parts)
@@ -246,24 +213,12 @@ def plan_line(
 
 def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:
     """Return the line of a run whose platform has been chosen, by the timing that chose it."""
-    spec, ensemble = resolve(scene, config.force), check_ensemble(config.ensemble, scene)
+    config = replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
     timed = next(
         (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads)), None
     )
     step_s = None if timed is None else timed * 1e-6
-    rounds = math.ceil(replicas / available_cores())
-    n_steps = (config.time_ps + config.equilibrate_ps) / config.timestep_ps
-    return plan_line(
-        scene,
-        spec,
-        choice,
-        integrator=_integrator(
-            scene, ensemble, config.timestep_ps, config.temperature_k, config.friction_per_ps, config.pressure_bar
-        ),
-        timestep_ps=config.timestep_ps,
-        step_s=step_s,
-        wall_s=None if step_s is None else rounds * n_steps * step_s,
-    )
+    return plan_line(scene, config, choice, step_s=step_s, wall_s=_wall_s(config, replicas, step_s))
 
 
 def _parallel(replicas: int, cores: int, threads: int) -> str:
@@ -291,15 +246,9 @@ def _terms(system: Any) -> dict[str, int]:
 
 
 def _skips(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    ensemble: str,
-    n_constraints: int,
-    planned: float | None,
-    default: float | None,
-    *,
-    save_velocities: bool,
+    scene: Scene, config: MDConfig, n_constraints: int, planned: float | None, default: float | None
 ) -> tuple[Skip, ...]:
+    spec, ensemble = config.force, config.ensemble
     skips = []
     if scene.cell_nm is None:
         skips.append(
@@ -315,7 +264,7 @@ def _skips(
         skips.append(Skip("removal of centre-of-mass motion", why))
     else:
         skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
-    if not save_velocities:
+    if not config.save_velocities:
         skips.append(Skip("velocities on disk", "nobody asked for them (--save-velocities)", "half of the file"))
     skips.append(Skip("energies and copies between saved frames", "nobody keeps them"))
     if spec.solvent == "vacuum":

@@ -10,6 +10,7 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.machine import platforms
 from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
 from systems.errors import UnknownNameError, nearest
@@ -67,23 +68,22 @@ def choose_platform(n_atoms: int, requested: str = "auto", *, born: bool = True)
 
 def measured_platform(
     scene: Scene,
-    spec: ForceFieldSpec,
+    conditions: Conditions,
     *,
-    requested: str = "auto",
-    temperature_k: float = 300.0,
-    friction_per_ps: float = 1.0,
-    timestep_ps: float = 0.004,
     max_threads: int = 1,
     side_by_side: int = 1,
     system: Callable[[], Any] | None = None,
 ) -> PlatformChoice:
     """Return the fastest platform for this scene, timed on it unless one as large has been timed here before.
 
+    `conditions`: the forces settled (`forcefield.resolve`); a platform that they name is kept.
+
     `max_threads`: cores for each of the `side_by_side` replicas, which share a device where there is one. `system`
-    returns the `openmm.System` where the caller has it. A request is kept; with SURROMD_TIMING=off, for quantum
+    returns the `openmm.System` where the caller has it. With SURROMD_TIMING=off, for quantum
     forces, whose program takes all the time, and where nothing can be timed, the size decides.
     Raises UnknownNameError for a platform that is not here, PreparationError for a scene without parameters.
     """
+    spec, requested = conditions.force, conditions.platform
     by_size = _by_size(scene, spec, requested, max_threads)
     if requested not in ("auto", "CPU") or (requested == "CPU" and max_threads == 1) or not measuring_allowed():
         return by_size
@@ -97,7 +97,7 @@ def measured_platform(
         missing.insert(0, ("CPU", 1))  # by which it is seen whether the cores are free
     fresh: list[Timing] = []
     if missing:
-        fresh = _time(scene, spec, missing, system, (temperature_k, friction_per_ps, timestep_ps))
+        fresh = _time(scene, conditions, missing, system)
         remember(key, fresh)
     timings = [
         next((t for t in fresh if (t.platform, t.threads) == c), None)
@@ -169,21 +169,17 @@ def timing_key(scene: Scene, spec: ForceFieldSpec) -> str:
 
 
 def _time(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    candidates: list[tuple[str, int]],
-    system: Callable[[], Any] | None,
-    bath: tuple[float, float, float],
+    scene: Scene, conditions: Conditions, candidates: list[tuple[str, int]], system: Callable[[], Any] | None
 ) -> list[Timing]:
     import openmm
 
-    built = build_system(scene, spec) if system is None else system()
+    built = build_system(scene, conditions.force) if system is None else system()
     n_virtual = built.getNumParticles() - scene.n_atoms
     positions = np.concatenate([scene.positions_nm, np.zeros((n_virtual, 3))])
-    temperature_k, friction_per_ps, timestep_ps = bath
+    temperature_k, timestep_ps = conditions.temperature_k, min(conditions.timestep_ps, _TIMED_STEP_PS)
 
     def integrator() -> Any:
         # A step takes as long at any length; a short one stands the starting positions.
-        return openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, min(timestep_ps, _TIMED_STEP_PS))
+        return openmm.LangevinMiddleIntegrator(temperature_k, conditions.friction_per_ps, timestep_ps)
 
     return time_platforms(built, positions, candidates, integrator, temperature_k=temperature_k)

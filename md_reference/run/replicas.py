@@ -7,7 +7,7 @@ import os
 import queue
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,22 @@ from md_reference.run.config import MDConfig, check_run
 from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
 from md_reference.run.plan import line_of_run
-from md_reference.run.platforms import PlatformChoice, measured_platform
-from md_reference.run.simulate import PreparingFn, checkpoint_path, simulate
+from md_reference.run.platforms import measured_platform
+from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
 
 _MOST_REPLICAS = 10_000
-# (frames done over all replicas, frames in all) -> None
-ProgressFn = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class _Board:
+    """What replicas write and their parent reads: frames done, shares equilibrated (both by replica), last words."""
+
+    done: Any
+    equilibrated: Any
+    errors: Any
 
 
 def replica_paths(out: Path, n_replicas: int) -> list[Path]:
@@ -44,7 +51,6 @@ def simulate_replicas(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
-    preparing: PreparingFn | None = None,
     announce: Callable[[str], None] | None = None,
     workers: int | None = None,
 ) -> list[Path]:
@@ -52,10 +58,9 @@ def simulate_replicas(
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
     small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in
-    one line; `preparing` the share of the equilibration that is done, until there are frames to count. Ctrl-C and
-    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
-    themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
-    stay on disk.
+    one line; `progress` counts the frames of all replicas. Ctrl-C and SIGTERM stop them all with checkpoints:
+    KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises SimulationError with the
+    first replica's reason when the others have ended; finished replicas stay on disk.
     """
     for out in outs:
         check_run(scene, config, out)
@@ -65,26 +70,17 @@ def simulate_replicas(
     fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
     choice = None
     if fresh:
-        choice = measured_platform(
-            scene,
-            resolve(scene, config.force),
-            requested=config.platform,
-            temperature_k=config.temperature_k,
-            friction_per_ps=config.friction_per_ps,
-            timestep_ps=config.timestep_ps,
-            max_threads=max(1, available_cores() // width),
-            side_by_side=width,
-        )
+        settled = replace(config, force=resolve(scene, config.force))
+        choice = measured_platform(scene, settled, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
             announce(line_of_run(scene, config, choice, replicas=len(outs)))
+    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
     if len(outs) == 1:
-        how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
-        return [simulate(scene, configs[0], outs[0], progress=progress, preparing=preparing, **how)]
+        return [simulate(scene, configs[0], outs[0], progress=progress, **how)]
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
-    done = context.Array("Q", len(outs), lock=False)
-    equilibrated = context.Array("d", len(outs), lock=False)
-    errors = context.Queue()
+    board = _Board(context.Array("Q", len(outs), lock=False), context.Array("d", len(outs), lock=False),
+                   context.Queue())  # fmt: skip
     waiting = list(range(len(outs)))
     running: dict[int, Any] = {}
     failures: dict[int, str] = {}
@@ -94,33 +90,22 @@ def simulate_replicas(
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    args = (
-                        scene.to_dict(),
-                        configs[k],
-                        str(outs[k]),
-                        resume,
-                        overwrite,
-                        choice,
-                        done,
-                        equilibrated,
-                        k,
-                        errors,
-                    )
+                    args = (scene.to_dict(), configs[k], str(outs[k]), how, board, k)
                     running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
                     running[k].start()
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
-                n_done = int(sum(done[:]))
-                if n_done == 0 and preparing is not None:
-                    preparing(sum(equilibrated[:]) / len(outs))
+                n_done = int(sum(board.done[:]))
+                if n_done == 0:
+                    tell_preparing(progress, sum(board.equilibrated[:]) / len(outs))
                 elif progress is not None:
                     progress(n_done, config.n_frames * len(outs))
                 for k in [k for k, process in running.items() if not process.is_alive()]:
                     process = running.pop(k)
                     process.join()
                     if process.exitcode != 0:
-                        _collect(errors, reasons, k)
+                        _collect(board.errors, reasons, k)
                         failures[k] = reasons.get(k, f"exit code {process.exitcode}")
         finally:
             for process in running.values():
@@ -143,32 +128,21 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
         pass
 
 
-def _replica(
-    scene: dict[str, Any],
-    config: MDConfig,
-    out: str,
-    resume: bool,
-    overwrite: bool,
-    choice: PlatformChoice | None,
-    done: Any,
-    equilibrated: Any,
-    k: int,
-    errors: Any,
-) -> None:
+def _replica(scene: dict[str, Any], config: MDConfig, out: str, how: dict[str, Any], board: _Board, k: int) -> None:
+    """Run replica `k` in a process of its own; `how`: what else `simulate` takes."""
     end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
 
-    def report(frames: int, _: int) -> None:
-        done[k] = frames
+    def report(done: int, total: int, note: str | None = None) -> None:
+        if note is None:
+            board.done[k] = done
+        else:
+            board.equilibrated[k] = done / total
 
-    def prepare(share: float) -> None:
-        equilibrated[k] = share
-
-    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
     try:
-        simulate(Scene.from_dict(scene), config, out, progress=report, preparing=prepare, **how)
+        simulate(Scene.from_dict(scene), config, out, progress=report, **how)
     except SurromdError as error:
-        errors.put((k, str(error)))
+        board.errors.put((k, str(error)))
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None

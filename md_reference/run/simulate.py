@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 
@@ -38,10 +38,19 @@ from systems.units import format_time_ps
 
 __all__ = ["MDConfig", "checkpoint_path", "simulate"]
 
-# (frames done, frames in all) -> None, called after each block that is on disk.
-ProgressFn = Callable[[int, int], None]
-# Share of the equilibration that is done -> None; 0 while minimising.
-PreparingFn = Callable[[float], None]
+
+class ProgressFn(Protocol):
+    """Called with frames done and frames in all after each block that is on disk; with a `note`, before there are
+    any: then `done` of `total` is the share of the equilibration."""
+
+    def __call__(self, done: int, total: int, note: str | None = None) -> None: ...
+
+
+def tell_preparing(progress: ProgressFn | None, share: float) -> None:
+    """Tell which share of the equilibration is done; 0 while minimising."""
+    if progress is not None:
+        progress(round(1000 * share), 1000, "equilibrating" if share else "minimising")
+
 
 # Python sees Ctrl-C only between calls of OpenMM: about so long may pass until it does.
 _SIGNAL_S = 0.25
@@ -57,11 +66,8 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
-    preparing: PreparingFn | None = None,
     checkpoint_every_s: float = 20.0,
-    max_threads: int = 1,
     choice: PlatformChoice | None = None,
-    patience_s: float = 0.0,
 ) -> Path:
     """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
 
@@ -70,11 +76,10 @@ def simulate(
     loses at most one save interval, half a second of work, or fifty times what it takes to write, whichever is the
     longest; `resume=True` goes on from there with the same random stream, on the same platform, if the frames are still
     those of this run. The equilibration is kept in the same way. Ctrl-C and SIGTERM stop at once with a checkpoint,
-    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile; for one that does,
-    `patience_s` is waited.
+    inside a frame if need be: KeyboardInterrupt. No other process can write `out` meanwhile.
 
-    With `platform='auto'` the platform is measured (`platforms.measured_platform`, at most `max_threads`), unless
-    `choice` says what has been. Raises SimulationError when coordinates stop being finite or the system blows up
+    With `platform='auto'` the platform is measured (`platforms.measured_platform`, one thread), unless `choice` says
+    what has been. Raises SimulationError when coordinates stop being finite or the system blows up
     (`Engine.state`): the frames before stay in the file, which then says `completed: false`.
     """
     out = Path(out)
@@ -82,17 +87,17 @@ def simulate(
     chk = checkpoint_path(out)
     with (
         deferred_interrupt() as asked_to_stop,
-        claimed_outputs([out], may_exist=resume or overwrite, patience_s=patience_s, stopped=asked_to_stop),
+        claimed_outputs([out], may_exist=resume or overwrite),
     ):
         if resume and out.exists() and not chk.exists():
             return _already_complete(out, config)
         kept = last_supported(chk, [out]) if resume and chk.exists() else None
         run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
         run.asked_to_stop = asked_to_stop
-        run.preparing = preparing or run.preparing
-        run.prepare(choice, max_threads)
+        run.progress = progress
+        run.prepare(choice)
         with run.engine_at_start() as engine, run.writer(engine) as writer:
-            run.produce(engine, writer, progress)
+            run.produce(engine, writer)
         chk.unlink(missing_ok=True)
     return out
 
@@ -134,7 +139,7 @@ class _Run:
             check_same_run(self.stand.config, config, out)
         self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
         self.asked_to_stop: Callable[[], bool] = lambda: False
-        self.preparing: PreparingFn = lambda _: None
+        self.progress: ProgressFn | None = None
         self.done = int(self.header["files"][0]["n_frames"])
         self.steps_into_frame = self.stand.steps_into_frame
         self.started = self.saved_at = time.monotonic()
@@ -145,36 +150,16 @@ class _Run:
     def wall_s(self) -> float:
         return self.stand.wall_s + time.monotonic() - self.started
 
-    def prepare(self, choice: PlatformChoice | None, max_threads: int) -> None:
+    def prepare(self, choice: PlatformChoice | None) -> None:
         """Build the forces and settle the platform."""
         self.system = build_system(self.scene, self.config.force)
         if self.resumed:
             choice = PlatformChoice(self.stand.platform, self.stand.threads, "as before it was resumed")
-        self.choice = choice or measured_platform(
-            self.scene,
-            self.config.force,
-            requested=self.config.platform,
-            temperature_k=self.config.temperature_k,
-            friction_per_ps=self.config.friction_per_ps,
-            timestep_ps=self.config.timestep_ps,
-            max_threads=max_threads,
-            system=lambda: self.system,
-        )
+        self.choice = choice or measured_platform(self.scene, self.config, system=lambda: self.system)
 
     def engine(self, ensemble: str) -> Engine:
-        return Engine(
-            self.scene,
-            self.config.force,
-            temperature_k=self.config.temperature_k,
-            friction_per_ps=self.config.friction_per_ps,
-            timestep_ps=self.config.timestep_ps,
-            seed=self.config.seed,
-            platform=self.choice.name,
-            threads=self.choice.threads,
-            ensemble=ensemble,
-            pressure_bar=self.config.pressure_bar,
-            system=self.system,
-        )
+        conditions = replace(self.config, ensemble=ensemble, platform=self.choice.name)
+        return Engine(self.scene, conditions, threads=self.choice.threads, system=self.system)
 
     def engine_at_start(self) -> Engine:
         """Return the engine where the run was left, or at time 0."""
@@ -220,7 +205,7 @@ class _Run:
     def _equilibrate(self, engine: Engine) -> None:
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
         done = self.stand.equilibrated_steps or 0
-        self.preparing(done / max(n_steps, 1))
+        tell_preparing(self.progress, done / max(n_steps, 1))
         if self.blob:
             engine.restore(self.blob)
         else:
@@ -228,7 +213,7 @@ class _Run:
             engine.thermalise()
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
-            self.preparing(done / n_steps)
+            tell_preparing(self.progress, done / n_steps)
             stop = self.asked_to_stop()
             if stop or time.monotonic() - self.saved_at > self.checkpoint_every_s:
                 self.save(engine, equilibrated_steps=done)
@@ -257,7 +242,7 @@ class _Run:
         self.checkpoint.write(self.header, engine.checkpoint())
         self.saved_at = time.monotonic()
 
-    def produce(self, engine: Engine, writer: TrajectoryWriter, progress: ProgressFn | None) -> None:
+    def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:
         """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
         config, n_frames = self.config, self.config.n_frames
         block = 1
@@ -279,8 +264,8 @@ class _Run:
             if self.done < n_frames:
                 self.save(engine, steps_into_frame=self.steps_into_frame)
             flushed_s = time.monotonic() - computed
-            if progress is not None:
-                progress(self.done, n_frames)
+            if self.progress is not None:
+                self.progress(self.done, n_frames)
             if stop:
                 writer.update_record({"cost": self.cost()})
                 raise KeyboardInterrupt

@@ -95,6 +95,7 @@ def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: in
     Raises InputError for weights that carry no velocities.
     """
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     weights = load_weights(path)
@@ -105,7 +106,7 @@ def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: in
     nve = Painet(replace(weights.model.config, friction_per_ps=0.0)).eval()
     nve.load_state_dict(weights.model.state_dict())
     strided = replace(frames, lag_ps=frames.lag_ps * weights.model.config.frame_stride)
-    with Engine(frames.scene, spec, platform="Reference", timestep_ps=0.0005) as engine:
+    with Engine(frames.scene, Conditions(force=spec, platform="Reference", timestep_ps=0.0005)) as engine:
         return judge_integrator(weights.model, strided, engine.energy, nve=nve, starts=starts, chunks=chunks, seed=seed)
 
 

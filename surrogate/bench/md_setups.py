@@ -8,6 +8,7 @@ from typing import Any
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.forces.template_files import PROTEIN_FILES, cutoff_nm, water_file
+from md_reference.run.config import Conditions
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import measured_platform
 from systems.scene import Scene
@@ -74,7 +75,7 @@ def ours(case: Case, scene: Scene, *, cores: int, repartitioned: bool = False) -
     step_ps = LONG_TIMESTEP_PS if repartitioned else TIMESTEP_PS
     system = build_system(scene, spec)
     choice = measured_platform(
-        scene, spec, timestep_ps=step_ps, max_threads=1, side_by_side=cores, system=lambda: system
+        scene, Conditions(force=spec, timestep_ps=step_ps), max_threads=1, side_by_side=cores, system=lambda: system
     )
     properties = platform_properties(choice.name, choice.threads)
     integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE_K, FRICTION_PER_PS, step_ps)

@@ -27,21 +27,8 @@ def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     from md_reference.run.plan import make_plan
 
     molecule = prepare_scene(scene, options, quiet=False)
-    time_ps = 1.0 if options.time_ps is None else options.time_ps
-    molecule, config, protocol = _settle(molecule, options, {"time_ps": time_ps}, quiet=True)
-    found = make_plan(
-        molecule,
-        config.force,
-        temperature_k=config.temperature_k,
-        friction_per_ps=config.friction_per_ps,
-        timestep_ps=config.timestep_ps,
-        platform=options.platform,
-        replicas=options.replicas,
-        time_ps=options.time_ps,
-        equilibrate_ps=config.equilibrate_ps,
-        ensemble=config.ensemble,
-        pressure_bar=config.pressure_bar,
-    ).to_dict()
+    molecule, config, protocol = _settle(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
+    found = make_plan(molecule, config, replicas=options.replicas).to_dict()
     return found | ({"protocol": protocol} if protocol else {})
 
 
@@ -78,11 +65,6 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
         accounted_outputs(outs, resumable="the same command with --resume goes on"),
         progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
-
-        def preparing(share: float) -> None:
-            if progress is not None:
-                progress(round(1000 * share), 1000, "equilibrating" if share else "minimising")
-
         return simulate_replicas(
             molecule,
             config,
@@ -90,7 +72,6 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
             resume=options.resume,
             overwrite=options.overwrite,
             progress=progress,
-            preparing=preparing,
             announce=None if options.quiet else lambda line: tell(molecule.name, line),
         )
 

@@ -169,11 +169,14 @@ def test_backbone_torsions_of_such_a_residue_are_those_of_alanine(aib_chain: Any
 
 
 def test_such_a_chain_stays_whole_at_300_k(aib_chain: Any) -> None:
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     scene, _, _ = aib_chain
     spec = resolve(scene, ForceFieldSpec("auto", "auto"))
-    with Engine(scene, spec, temperature_k=300.0, friction_per_ps=1.0, timestep_ps=0.004, platform="CPU") as engine:
+    with Engine(
+        scene, Conditions(force=spec, temperature_k=300.0, friction_per_ps=1.0, timestep_ps=0.004, platform="CPU")
+    ) as engine:
         engine.minimise()
         engine.thermalise()
         engine.step(1000)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.replicas import simulate_replicas
 from md_reference.run.simulate import MDConfig, simulate
@@ -47,7 +48,8 @@ def run_of(timestep_ps: float, bath_k: float = BATH_K) -> Sampled:
     """
     spec = ForceFieldSpec(hydrogen_mass_da=3.0 if timestep_ps > 0.002 else None)
     with Engine(
-        load("alanine-dipeptide"), spec, temperature_k=bath_k, friction_per_ps=10.0, timestep_ps=timestep_ps, seed=11
+        load("alanine-dipeptide"),
+        Conditions(force=spec, temperature_k=bath_k, friction_per_ps=10.0, timestep_ps=timestep_ps, seed=11),
     ) as engine:
         engine.minimise()
         engine.thermalise()
@@ -99,10 +101,7 @@ def test_temperature_holds_no_velocity_along_the_constraints() -> None:
     excess = []
     with Engine(
         load("alanine-dipeptide"),
-        ForceFieldSpec(hydrogen_mass_da=None),
-        friction_per_ps=91.0,
-        timestep_ps=0.002,
-        seed=2,
+        Conditions(force=ForceFieldSpec(hydrogen_mass_da=None), friction_per_ps=91.0, timestep_ps=0.002, seed=2),
     ) as engine:
         engine.minimise()
         engine.thermalise()
@@ -124,11 +123,7 @@ def test_asking_for_the_state_changes_no_trajectory(friction_per_ps: float, time
     last = []
     for ask, seed in ((False, 4), (True, 4), (False, 5)):
         with Engine(
-            load("alanine-dipeptide"),
-            ForceFieldSpec(),
-            friction_per_ps=friction_per_ps,
-            timestep_ps=timestep_ps,
-            seed=seed,
+            load("alanine-dipeptide"), Conditions(friction_per_ps=friction_per_ps, timestep_ps=timestep_ps, seed=seed)
         ) as engine:
             engine.minimise()
             engine.thermalise()

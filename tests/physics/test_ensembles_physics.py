@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine, State
 from md_reference.run.run_summary import correlation_frames, drift, mean_and_error
 from md_reference.run.simulate import MDConfig, simulate
@@ -25,8 +26,10 @@ N_SAMPLES, SAMPLE_PS = 500, 0.04
 
 @cache
 def warm_state() -> State:
-    with Engine(load("alanine-dipeptide"), FLEXIBLE, timestep_ps=0.0005, friction_per_ps=10.0, platform="Reference",
-                seed=3) as engine:  # fmt: skip
+    with Engine(
+        load("alanine-dipeptide"),
+        Conditions(force=FLEXIBLE, timestep_ps=0.0005, friction_per_ps=10.0, platform="Reference", seed=3),
+    ) as engine:
         engine.minimise()
         engine.thermalise()
         engine.step(4000)
@@ -41,7 +44,7 @@ def energies(timestep_ps: float, *, kick_drift: bool = False, friction_per_ps: f
         settings["ensemble"] = "nve"
     else:
         settings["friction_per_ps"] = friction_per_ps
-    with Engine(load("alanine-dipeptide"), FLEXIBLE, **settings) as engine:
+    with Engine(load("alanine-dipeptide"), Conditions(force=FLEXIBLE, **settings)) as engine:
         if kick_drift:
             engine = _with_kick_drift(engine, timestep_ps)
         engine.take_over(warm_state())

@@ -13,6 +13,7 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.solvation import solvate, solvate_if_asked
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError
 from systems.library.named_scenes import load
@@ -144,7 +145,7 @@ def test_opc_sites_follow_the_atoms_and_the_engine_hides_them() -> None:
     system = build_system(wet, spec)
     assert system.getNumParticles() == wet.n_atoms + n_water
     assert all(system.isVirtualSite(i) == (i >= wet.n_atoms) for i in range(system.getNumParticles()))
-    with Engine(wet, spec, platform="CPU", threads=1) as engine:
+    with Engine(wet, Conditions(force=spec, platform="CPU"), threads=1) as engine:
         before = engine.energy()
         after = engine.minimise(max_iterations=5)
         state = engine.state()

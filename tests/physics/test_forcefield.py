@@ -10,6 +10,7 @@ import pytest
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.errors import PreparationError, UnknownNameError
 from systems.scene import FloatArray, Scene
@@ -37,7 +38,7 @@ def thermal_geometries(name: str, n: int = 4) -> FloatArray:
     """Positions `(n, n_atoms, 3)` nm, 0.4 ps apart, of a hot run: 600 K, so that no term is near its minimum."""
     scene = scene_of(name)
     out = []
-    with Engine(scene, ForceFieldSpec(), temperature_k=600.0, timestep_ps=0.002, seed=5) as engine:
+    with Engine(scene, Conditions(temperature_k=600.0, timestep_ps=0.002, seed=5)) as engine:
         engine.minimise(max_iterations=50)
         engine.thermalise()
         for _ in range(n):
@@ -183,7 +184,7 @@ def test_exactly_the_bonds_to_hydrogen_are_constrained() -> None:
     assert set(constrained) == to_hydrogen
     assert len(constrained) == 12
     assert build_system(scene, ForceFieldSpec(constrain_hydrogens=False)).getNumConstraints() == 0
-    with Engine(scene, ForceFieldSpec(), seed=2) as engine:
+    with Engine(scene, Conditions(seed=2)) as engine:
         engine.minimise()
         engine.thermalise()
         engine.step(100)
@@ -212,7 +213,7 @@ def gradient(engine: Engine, positions_nm: FloatArray, step_nm: float = 1e-5) ->
 def test_forces_are_minus_the_gradient(spec: ForceFieldSpec) -> None:
     name = "alanine-dipeptide"
     here, elsewhere = thermal_geometries(name)[:2]
-    with Engine(scene_of(name), spec) as engine:
+    with Engine(scene_of(name), Conditions(force=spec)) as engine:
         numeric = -gradient(engine, here)
         scale = np.abs(numeric).max()
         np.testing.assert_allclose(engine.forces(here), numeric, atol=1e-5 * scale)

@@ -11,6 +11,7 @@ import pytest
 
 from md_reference.forces.model_forces import build_model_system, build_nve_integrator, generate_n_body
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.library.particles import (
     N_BODY,
@@ -39,11 +40,7 @@ def sampled(scene: Scene, temperature_k: float, *, n_frames: int, every_ps: floa
     timestep_ps = 0.02
     with Engine(
         copies(scene, N_COPIES),
-        MODEL,
-        temperature_k=temperature_k,
-        timestep_ps=timestep_ps,
-        seed=5,
-        platform="Reference",
+        Conditions(force=MODEL, temperature_k=temperature_k, timestep_ps=timestep_ps, seed=5, platform="Reference"),
     ) as engine:
         engine.thermalise()
         engine.step(round(settle_ps / timestep_ps))
@@ -80,7 +77,9 @@ def free_run(scene: Scene, time_ps: float, *, timestep_ps: float = 0.001, n_fram
     """Times `(n,)`, positions and velocities `(n, n_particles, 3)` without a bath, from the scene's own velocities."""
     stride = round(time_ps / timestep_ps / n_frames)
     positions, velocities = np.empty((2, n_frames, scene.n_atoms, 3))
-    with Engine(scene, MODEL, ensemble="nve", timestep_ps=timestep_ps, platform="Reference") as engine:
+    with Engine(
+        scene, Conditions(force=MODEL, ensemble="nve", timestep_ps=timestep_ps, platform="Reference")
+    ) as engine:
         if scene.velocities_nm_ps is not None:
             engine.set_velocities(scene.velocities_nm_ps)
         for k in range(n_frames):
@@ -155,7 +154,7 @@ def plain_energy(scene: Scene, x: FloatArray) -> float:
 def test_energies_and_forces_are_those_of_the_law(name: str) -> None:
     scene = n_body(name, 3)
     x = scene.positions_nm
-    with Engine(scene, MODEL, platform="Reference") as engine:
+    with Engine(scene, Conditions(force=MODEL, platform="Reference")) as engine:
         assert engine.energy() == pytest.approx(plain_energy(scene, x), rel=1e-10)
         forces = engine.forces()
     numeric = np.empty_like(x)
@@ -169,7 +168,7 @@ def test_energies_and_forces_are_those_of_the_law(name: str) -> None:
     scale = np.abs(numeric).max()
     np.testing.assert_allclose(forces, numeric, atol=1e-7 * scale)
     # Negative control: another seed's law or positions give other forces.
-    with Engine(n_body(name, 4), MODEL, platform="Reference") as other:
+    with Engine(n_body(name, 4), Conditions(force=MODEL, platform="Reference")) as other:
         assert np.abs(other.forces() - numeric).max() > 1e-2 * scale
 
 

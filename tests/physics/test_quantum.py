@@ -8,6 +8,7 @@ import pytest
 from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
 from md_reference.forces.spec import ForceFieldSpec, at_level
+from md_reference.run.config import Conditions
 from md_reference.run.defaults import settle
 from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError, UnknownNameError
@@ -27,7 +28,7 @@ def test_energy_is_tblites_own_in_kj_mol_and_its_forces_are_minus_the_gradient()
     own = Calculator("GFN2-xTB", numbers, x / NM_PER_BOHR)
     own.set("verbosity", 0)
     result = own.singlepoint()
-    with Engine(scene, SPEC, platform="Reference", timestep_ps=0.0005) as engine:
+    with Engine(scene, Conditions(force=SPEC, platform="Reference", timestep_ps=0.0005)) as engine:
         energy, forces = engine.energy(x), engine.forces(x)
         assert energy == pytest.approx(float(result.get("energy")) * 2625.4996394799, rel=1e-10)
         # Methanol in GFN2-xTB: -8.22 hartree; a wrong unit is off by orders of magnitude.
@@ -78,7 +79,7 @@ def test_there_are_no_constraints_and_masses_are_natural() -> None:
 
 def test_a_short_run_keeps_its_energy() -> None:
     scene = load("ethanol")
-    with Engine(scene, SPEC, platform="Reference", timestep_ps=0.0005, ensemble="nve") as engine:
+    with Engine(scene, Conditions(force=SPEC, platform="Reference", timestep_ps=0.0005, ensemble="nve")) as engine:
         engine.thermalise()
         totals, potentials = [], []
         for _ in range(5):

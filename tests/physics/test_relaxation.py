@@ -9,6 +9,7 @@ import pytest
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import SimulationError
@@ -19,7 +20,7 @@ SPEC = ForceFieldSpec("ff14SB", "obc2", 3.0)
 
 @pytest.fixture(scope="module")
 def engine(alanine_dipeptide: Scene) -> Iterator[Engine]:
-    with Engine(alanine_dipeptide, SPEC, seed=1) as made:
+    with Engine(alanine_dipeptide, Conditions(force=SPEC, seed=1)) as made:
         made.minimise(max_iterations=50)
         made.thermalise()
         made.step(2000)

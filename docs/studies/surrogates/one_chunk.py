@@ -81,6 +81,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="*", default=[1, 2, 3, 4], help="of leapfrog in a chunk")
     args = parser.parse_args()
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     torch.set_num_threads(1)
@@ -98,7 +99,7 @@ def main() -> None:
 
     spec = ForceFieldSpec(of["force_field"], of["solvent"], None, constrain_hydrogens=False)
     span = model.n_new * model.config.frame_stride
-    with Engine(frames.scene, spec, platform="Reference", timestep_ps=0.0005) as engine:
+    with Engine(frames.scene, Conditions(force=spec, platform="Reference", timestep_ps=0.0005)) as engine:
         for row in chunk_errors(step, frames, span, engine.forces, starts=args.starts, steps=args.steps):
             sys.stdout.write(
                 f"{row.name:24} position {10 * row.position_nm:.4f} Å   velocity {row.velocity_nm_ps:.3f} nm/ps\n"

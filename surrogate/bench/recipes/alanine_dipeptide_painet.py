@@ -146,6 +146,7 @@ def short_runs(path: Path, frames: TrainingFrames, states: Iterable[tuple[FloatA
     """Run OpenMM at constant energy from each state for SHORT_FRAMES frames; kept in a windows file. States that are
     beyond physics are left out."""
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
     from surrogate.data.frames import at_rest, load_frames, quantise
 
@@ -156,7 +157,10 @@ def short_runs(path: Path, frames: TrainingFrames, states: Iterable[tuple[FloatA
     v: list[FloatArray] = []
     # Without a bath the temperature only says what the engine takes for a blow-up.
     with Engine(
-        scene, spec, platform="Reference", timestep_ps=TIMESTEP_PS, ensemble="nve", temperature_k=10 * SHAKEN_K[1]
+        scene,
+        Conditions(
+            force=spec, platform="Reference", timestep_ps=TIMESTEP_PS, ensemble="nve", temperature_k=10 * SHAKEN_K[1]
+        ),
     ) as engine:
         for positions, velocities in states:
             kinetic = 0.5 * float((scene.masses_da[:, None] * np.square(velocities)).sum())

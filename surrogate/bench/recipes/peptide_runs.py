@@ -17,6 +17,7 @@ import sys
 import time
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import MDConfig, settings_of
+from md_reference.run.config import Conditions, MDConfig, settings_of
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import integrator_name
 from md_reference.run.machine import available_cores
@@ -58,7 +59,7 @@ def simulate_peptide(folder: Path, peptide: Peptide, share: float, deadline: flo
         if not missing:
             return True
         scene = build_peptide(peptide.sequence)
-        choice = measured_platform(scene, _SPEC, timestep_ps=0.004, side_by_side=available_cores())
+        choice = measured_platform(scene, Conditions(force=_SPEC, timestep_ps=0.004), side_by_side=available_cores())
         if time.time() > deadline:
             return False
         seeds = _seeds(folder / "seeds.npz", scene, peptide, choice.name)
@@ -88,13 +89,10 @@ def run(scene: Scene, seeds: Seeds, k: int, out: Path, peptide: Peptide, choice:
     """Simulate from the k-th start and write `out` when all frames are there. Raises SimulationError."""
     import openmm
 
-    config = MDConfig(peptide.time_ps, equilibrate_ps=DISCARD_PS, seed=_seed_of(peptide, k), force=_SPEC)
+    config = MDConfig(time_ps=peptide.time_ps, equilibrate_ps=DISCARD_PS, seed=_seed_of(peptide, k), force=_SPEC)
     began = time.monotonic()
     states = []
-    with Engine(
-        scene, _SPEC, temperature_k=config.temperature_k, timestep_ps=config.timestep_ps, seed=config.seed,
-        platform=choice.name, threads=1,
-    ) as engine:  # fmt: skip
+    with Engine(scene, replace(config, platform=choice.name), threads=1) as engine:
         engine.set_positions(seeds.positions_nm[k])
         engine.thermalise()
         engine.step(round(DISCARD_PS / config.timestep_ps))

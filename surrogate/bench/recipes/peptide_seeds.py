@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import platform_properties
 from systems.chemistry.geometry import torsion
@@ -240,7 +241,7 @@ def _turned(scene: Scene, positions_nm: FloatArray, quad: Quad) -> FloatArray:
 
 
 def _relaxed(scene: Scene, positions_nm: FloatArray, which: IntArray, platform: str) -> FloatArray:
-    with Engine(scene, ForceFieldSpec("ff14SB", "obc2"), platform=platform) as engine:
+    with Engine(scene, Conditions(force=ForceFieldSpec("ff14SB", "obc2"), platform=platform)) as engine:
         for k in which:
             engine.set_positions(positions_nm[k])
             engine.minimise()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,12 +51,15 @@ def make_trajectories(
         config = to_config(settings | {"time_ps": time_ps}, seed=seed)
         config = replace(config, force=resolve(scene, config.force), save_velocities=True)
 
-        def advance(done: int, total: int, k: int = k, name: str = name) -> None:
-            if progress is not None:
-                progress(1000 * k + 1000 * done // total, 1000 * len(paths), name)
-
-        simulate(scene, config, path, resume=True, progress=advance)
+        simulate(scene, config, path, resume=True, progress=partial(_advance, progress, name, k, len(paths)))
     return paths
+
+
+def _advance(progress: ProgressFn | None, name: str, k: int, n: int, done: int, total: int,
+             note: str | None = None) -> None:  # fmt: skip
+    """Tell of molecule `k` of `n`; its equilibration counts as nothing."""
+    if progress is not None:
+        progress(1000 * k + (0 if note else 1000 * done // total), 1000 * n, name)
 
 
 def read_windows(path: Path, counts: Mapping[str, int], span: int) -> MoleculeWindows:

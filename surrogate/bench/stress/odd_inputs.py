@@ -157,13 +157,21 @@ def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
     """A frame `(n_atoms, 3)` nm of MD at 50 K more than the training's, None for weights that OpenMM cannot follow."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     conditions, scene = weights.domain.conditions, weights.domain.scene
     try:
         spec = resolve(scene, ForceFieldSpec.of(conditions))
-        with Engine(scene, spec, temperature_k=conditions["temperature_k"] + _HOT_K,
-                    timestep_ps=conditions["timestep_ps"], seed=seed) as engine:  # fmt: skip
+        with Engine(
+            scene,
+            Conditions(
+                force=spec,
+                temperature_k=conditions["temperature_k"] + _HOT_K,
+                timestep_ps=conditions["timestep_ps"],
+                seed=seed,
+            ),
+        ) as engine:
             engine.minimise()
             engine.thermalise()
             engine.step(round(5.0 / conditions["timestep_ps"]))

@@ -142,13 +142,21 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator
     say one of these, and what `Engine` raises."""
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
     conditions = domain.conditions
     spec = resolve(domain.scene, ForceFieldSpec.of(conditions))
-    with Engine(domain.scene, spec, temperature_k=conditions["temperature_k"],
-                friction_per_ps=conditions.get("friction_per_ps") or 1.0, timestep_ps=timestep_ps,
-                seed=seed) as engine:  # fmt: skip
+    with Engine(
+        domain.scene,
+        Conditions(
+            force=spec,
+            temperature_k=conditions["temperature_k"],
+            friction_per_ps=conditions.get("friction_per_ps") or 1.0,
+            timestep_ps=timestep_ps,
+            seed=seed,
+        ),
+    ) as engine:
         engine.minimise()
         engine.thermalise()
         yield engine

@@ -111,16 +111,19 @@ class Coupling:
         return Segment(laid, velocities @ rotation[-1].T)
 
     def _engine(self, *, seed: int) -> Any:
+        from md_reference.run.config import Conditions
         from md_reference.run.engine import Engine
 
         return Engine(
             self._scene,
-            self._spec,
-            temperature_k=self._conditions["temperature_k"],
-            friction_per_ps=self._conditions.get("friction_per_ps") or 1.0,
-            timestep_ps=self._conditions["timestep_ps"],
-            seed=seed,
-            platform=self._platform,
+            Conditions(
+                force=self._spec,
+                temperature_k=self._conditions["temperature_k"],
+                friction_per_ps=self._conditions.get("friction_per_ps") or 1.0,
+                timestep_ps=self._conditions["timestep_ps"],
+                seed=seed,
+                platform=self._platform,
+            ),
             system=self._system,
         )
 

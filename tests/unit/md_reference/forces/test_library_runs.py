@@ -15,6 +15,7 @@ from md_reference.campaign.run_options import to_config
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.defaults import defaults, settle
 from md_reference.run.engine import Engine
 from systems.chemistry.graph import molecule_key
@@ -46,7 +47,7 @@ def no_ambertools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def potential(scene: Scene) -> tuple[float, float]:
     """Energies in kJ/mol of the scene as it is, and minimised."""
-    with Engine(scene, GAFF, platform="Reference") as engine:
+    with Engine(scene, Conditions(force=GAFF, platform="Reference")) as engine:
         before = engine.energy()
         after = engine.minimise()
         relaxed = scene.with_positions(engine.positions())

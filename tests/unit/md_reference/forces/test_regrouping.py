@@ -11,6 +11,7 @@ import pytest
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.regrouping import permuted, regroup
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
@@ -77,8 +78,8 @@ def test_same_system_as_the_library_scene(
         scene = as_one_residue(scene)
     rng = np.random.default_rng(0)
     with (
-        Engine(alanine_dipeptide, spec, native_gb=native_gb) as expected,
-        Engine(scene, spec, native_gb=native_gb) as engine,
+        Engine(alanine_dipeptide, Conditions(force=spec), native_gb=native_gb) as expected,
+        Engine(scene, Conditions(force=spec), native_gb=native_gb) as engine,
     ):
         assert engine.n_constraints == expected.n_constraints
         for _ in range(3):
@@ -113,15 +114,15 @@ def test_residues_follow_the_chain_whatever_the_order_of_atoms() -> None:
             ours = sorted(n for n, r in zip(found.atom_names, found.residue_of_atom, strict=True) if r == residue)
             theirs = sorted(n for n, r in zip(peptide.atom_names, peptide.residue_of_atom, strict=True) if r == residue)
             assert ours == theirs
-    with Engine(peptide, ForceFieldSpec()) as a, Engine(as_one_residue(peptide), ForceFieldSpec()) as b:
+    with Engine(peptide, Conditions()) as a, Engine(as_one_residue(peptide), Conditions()) as b:
         assert b.energy() == pytest.approx(a.energy(), abs=1e-8)
 
 
 def test_a_mirror_image_has_the_energy_of_its_original(alanine_dipeptide: Scene) -> None:
     mirrored = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm * [1.0, 1.0, -1.0])
     with (
-        Engine(alanine_dipeptide, ForceFieldSpec()) as left,
-        Engine(as_one_residue(mirrored), ForceFieldSpec()) as right,
+        Engine(alanine_dipeptide, Conditions()) as left,
+        Engine(as_one_residue(mirrored), Conditions()) as right,
     ):
         assert right.energy() == pytest.approx(left.energy(), abs=1e-8)
 

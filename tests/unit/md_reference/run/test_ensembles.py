@@ -17,6 +17,7 @@ import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import simulate as module
+from md_reference.run.config import Conditions
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, Engine
 from md_reference.run.platforms import PlatformChoice
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
@@ -75,7 +76,7 @@ def test_velocities_and_forces_are_derivatives_of_what_is_stored(alanine_dipepti
     np.testing.assert_allclose(2 * kinetic / (n_dof * GAS_CONSTANT_KJ_MOL_K), scalars["temperature_k"], rtol=1e-4)
     assert np.abs((mass * v).sum(axis=1)).max() < 0.01  # of 19 in a bath; OpenMM's masses have other digits
     # Forces belong to these positions and this field: the energy along a displacement says so.
-    with Engine(alanine_dipeptide, FLEXIBLE, platform="Reference") as engine:
+    with Engine(alanine_dipeptide, Conditions(force=FLEXIBLE, platform="Reference")) as engine:
         push = np.zeros((22, 3))
         push[4] = [1e-4, -2e-4, 1e-4]
         slope = (engine.energy(x[3] + push) - engine.energy(x[3] - push)) / 2
@@ -194,7 +195,9 @@ def test_what_progress_has_reported_survives_a_kill(alanine_dipeptide: Scene, tm
     """A checkpoint stands behind every block, not only every `checkpoint_every_s`."""
     reported: list[int] = []
 
-    def look(done: int, _: int) -> None:
+    def look(done: int, _: int, note: str | None = None) -> None:
+        if note is not None:
+            return
         reported.append(read_checkpoints(checkpoint_path(tmp_path / "a.h5"))[0][0]["files"][0]["n_frames"])
         if done < 10:
             assert reported[-1] == done
@@ -204,8 +207,8 @@ def test_what_progress_has_reported_survives_a_kill(alanine_dipeptide: Scene, tm
 
 
 def stopped(scene: Scene, config: MDConfig, out: Path, **more: Any) -> Path:
-    def stop(done: int, _: int) -> None:
-        if done >= 4:
+    def stop(done: int, _: int, note: str | None = None) -> None:
+        if done >= 4 and note is None:
             os.kill(os.getpid(), signal.SIGTERM)
 
     with pytest.raises(KeyboardInterrupt):

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ def test_names_of_replicas() -> None:
 
 def test_a_failed_replica_is_named_and_the_others_are_kept(alanine_dipeptide: Scene, tmp_path: Path) -> None:
     outs = [tmp_path / "a.h5", tmp_path / "missing" / "b.h5"]
-    told: list[tuple[int, int]] = []
+    told: list[tuple[Any, ...]] = []
     with pytest.raises(SimulationError, match=r"1 of 2 replicas failed; replica 1: .*missing") as caught:
         simulate_replicas(alanine_dipeptide, SHORT, outs, progress=lambda *done: told.append(done))
     assert "\n" not in str(caught.value)

@@ -32,9 +32,9 @@ sys.path.insert(0, {repository!r})
 from md_reference.run.simulate import MDConfig, simulate
 from systems.library.named_scenes import load
 
-def kill_soon(done, total):
+def kill_soon(done, total, note=None):
     global timer
-    if timer is None:
+    if timer is None and note is None:
         timer = threading.Timer({delay_s}, os.kill, (os.getpid(), signal.SIGKILL))
         timer.start()
 
@@ -57,10 +57,15 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_without_equilibration_the_run_begins_at_the_minimum(alanine_dipeptide: Scene, tmp_path: Path) -> None:
-    told: list[float] = []
+    told: list[tuple[int, str]] = []
+
+    def tell(done: int, total: int, note: str | None = None) -> None:
+        if note is not None:
+            told.append((done, note))
+
     config = replace(SHORT, equilibrate_ps=0.0)
-    simulate(alanine_dipeptide, config, tmp_path / "a.h5", preparing=told.append)
-    assert told == [0.0]
+    simulate(alanine_dipeptide, config, tmp_path / "a.h5", progress=tell)
+    assert told == [(0, "minimising")]
     positions, times, record = contents(tmp_path / "a.h5")
     assert len(positions) == config.n_frames and times[0] == pytest.approx(config.save_every_ps)
     assert record["equilibrate_ps"] == 0.0
@@ -151,8 +156,8 @@ def test_resume_after_kill_9_equals_an_uninterrupted_run(
 def interrupted(scene: Scene, out: Path, config: MDConfig = SHORT, *, at_frame: int = 5) -> Path:
     """A run that stopped after some frames, its checkpoint beside it."""
 
-    def stop(done: int, total: int) -> None:
-        if done >= at_frame:
+    def stop(done: int, total: int, note: str | None = None) -> None:
+        if done >= at_frame and note is None:
             raise RuntimeError("stopped")
 
     with pytest.raises(RuntimeError, match="stopped"):

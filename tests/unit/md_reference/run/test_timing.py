@@ -12,6 +12,7 @@ import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import platforms, timing
+from md_reference.run.config import Conditions
 from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
 from md_reference.run.timing import Timing, cache_file, recall, remember, size_class
 from systems.library.named_scenes import load
@@ -72,15 +73,15 @@ def test_without_a_timing_the_size_decides() -> None:
 def test_what_was_timed_is_remembered_for_scenes_like_it(
     alanine_dipeptide: Scene, counted: list[list[tuple[str, int]]]
 ) -> None:
-    first = measured_platform(alanine_dipeptide, VACUUM)
+    first = measured_platform(alanine_dipeptide, Conditions(force=VACUUM))
     assert (first.name, len(counted)) == ("CPU", 1)
-    again = measured_platform(alanine_dipeptide, VACUUM)
+    again = measured_platform(alanine_dipeptide, Conditions(force=VACUUM))
     assert (again.name, len(counted)) == ("CPU", 1)
     assert {t.note for t in again.timings} == {"remembered"}
     assert [t.us_per_step for t in again.timings] == [40.0, 50.0]
-    measured_platform(alanine_dipeptide, ForceFieldSpec())
+    measured_platform(alanine_dipeptide, Conditions())
     assert len(counted) == 2, "another solvent is another timing"
-    measured_platform(load("aspirin"), ForceFieldSpec("gaff2", "vacuum"))
+    measured_platform(load("aspirin"), Conditions(force=ForceFieldSpec("gaff2", "vacuum")))
     assert len(counted) == 3, "another force field is another timing"
 
 
@@ -92,14 +93,14 @@ def test_size_classes_are_a_tenth_wide() -> None:
 def test_threads_are_timed_beside_one_thread_and_only_where_they_may_win(
     alanine_dipeptide: Scene, counted: list[list[tuple[str, int]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measured_platform(alanine_dipeptide, VACUUM, max_threads=2)
+    measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert counted[-1] == [("CPU", 1), ("Reference", 1)]
     monkeypatch.setattr(platforms, "_THREADS_TIMED_ATOMS", 1)
-    choice = measured_platform(alanine_dipeptide, VACUUM, max_threads=2)
+    choice = measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert counted[-1] == [("CPU", 1), ("CPU", 2)]
     assert (choice.name, choice.threads) == ("CPU", 2)
     # Replicas that share the cores know of it and do not take them.
-    assert measured_platform(alanine_dipeptide, VACUUM, max_threads=1).threads == 1
+    assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=1).threads == 1
 
 
 @pytest.mark.parametrize(
@@ -122,7 +123,7 @@ def test_a_damaged_cache_is_ignored_and_replaced(
     cache_file().parent.mkdir(parents=True)
     cache_file().write_bytes(text)
     assert recall(key) == {}
-    assert measured_platform(alanine_dipeptide, VACUUM).name == "CPU"
+    assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM)).name == "CPU"
     assert len(counted) == 1
     assert recall(key) == {"CPU/1": 40.0, "Reference/1": 50.0}
 
@@ -154,16 +155,16 @@ def test_switched_off_the_size_decides_and_nothing_is_touched(
     alanine_dipeptide: Scene, counted: list[list[tuple[str, int]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SURROMD_TIMING", "off")
-    assert measured_platform(alanine_dipeptide, VACUUM).name == "Reference"
+    assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM)).name == "Reference"
     assert not counted and not cache_file().exists()
     monkeypatch.delenv("SURROMD_TIMING")
-    assert measured_platform(alanine_dipeptide, VACUUM, requested="Reference").reason == "asked for"
+    assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM, platform="Reference")).reason == "asked for"
     assert not counted
 
 
 def test_real_steps_of_alanine_dipeptide(alanine_dipeptide: Scene) -> None:
     """Processor time, so this holds on a loaded machine: 9 against 44 µs a step in vacuum."""
-    choice = measured_platform(alanine_dipeptide, VACUUM)
+    choice = measured_platform(alanine_dipeptide, Conditions(force=VACUUM))
     assert choice.name == "Reference"
     by_name = {t.platform: t.us_per_step for t in choice.timings}
     assert by_name["Reference"] is not None and by_name["CPU"] is not None
@@ -180,9 +181,9 @@ def test_on_busy_cores_threads_are_not_timed(alanine_dipeptide: Scene, monkeypat
 
     monkeypatch.setattr(platforms, "_THREADS_TIMED_ATOMS", 1)
     monkeypatch.setattr(timing, "_batch", batch(2.5))
-    busy = measured_platform(alanine_dipeptide, VACUUM, max_threads=2)
+    busy = measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert busy.threads == 1
     assert "CPU/2" not in recall(timing_key(alanine_dipeptide, VACUUM)), "a number about other work was remembered"
     assert any("other work" in t.note for t in busy.timings)
     monkeypatch.setattr(timing, "_batch", batch(1.02))
-    assert measured_platform(alanine_dipeptide, VACUUM, max_threads=2).threads == 2
+    assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2).threads == 2

@@ -106,9 +106,12 @@ def scatter(frames: Tensor, noise: Tensor) -> Tensor:
 def md(alanine_dipeptide: Scene) -> Iterator[np.ndarray]:
     """30 ps of MD, frames 0.1 ps apart, superposed: what the scripted model would have been trained on."""
     from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
 
-    with Engine(alanine_dipeptide, ForceFieldSpec("ff14SB", "obc2", 3.0), timestep_ps=0.002, seed=3) as engine:
+    with Engine(
+        alanine_dipeptide, Conditions(force=ForceFieldSpec("ff14SB", "obc2", 3.0), timestep_ps=0.002, seed=3)
+    ) as engine:
         engine.minimise(max_iterations=100)
         engine.thermalise()
         engine.step(1000)

@@ -10,7 +10,7 @@ import heavy_atoms
 import numpy as np
 import pytest
 
-from surrogate.bench import lags
+from surrogate.bench import lag_errors
 from surrogate.bench.recipes import many_molecules
 from surrogate.bench.recipes.many_molecules import change_per_frame, measure, summary, table
 from surrogate.data.frames import TrainingFrames
@@ -65,11 +65,11 @@ def test_strangers_change_by_more_than_neighbours(frames: np.ndarray) -> None:
 def test_correlation_and_distance_of_known_processes() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=20_000)
-    assert lags._correlation(x, 0.6 * x + 0.8 * rng.normal(size=20_000)) == pytest.approx(0.6, abs=0.02)
-    assert lags._correlation(x, rng.normal(size=20_000)) == pytest.approx(0.0, abs=0.02)
+    assert lag_errors._correlation(x, 0.6 * x + 0.8 * rng.normal(size=20_000)) == pytest.approx(0.6, abs=0.02)
+    assert lag_errors._correlation(x, rng.normal(size=20_000)) == pytest.approx(0.0, abs=0.02)
     angles = rng.uniform(-np.pi, np.pi, (20_000, 2))
-    assert lags.joint_distance(angles, angles) == 0.0
-    assert lags.joint_distance(angles, 0.1 * angles) > 0.7
+    assert lag_errors.joint_distance(angles, angles) == 0.0
+    assert lag_errors.joint_distance(angles, 0.1 * angles) > 0.7
 
 
 def test_rows_of_a_lag_hold_md_and_the_model(
@@ -78,7 +78,7 @@ def test_rows_of_a_lag_hold_md_and_the_model(
     settings = TrainingConfig(stage_one_steps=40, stage_two_steps=2, stage_one_batch=32, stage_two_batch=4, bf16=False,
                               longest_lag_ps=20.0)  # fmt: skip
     weights = load_weights(train_lam_slide(harmonic_frames, tmp_path / "w.safetensors", small_model_config, settings))
-    rows = {r.source: r for r in lags.measure(weights, replace(harmonic_frames), 10.0, 64)}
+    rows = {r.source: r for r in lag_errors.measure(weights, replace(harmonic_frames), 10.0, 64)}
     assert set(rows) == {"MD", "model", "model, told the shortest"}
     # Ten frames on, nothing is left of where correlated (0.8) motion began.
     assert abs(rows["MD"].psi) < 0.5 and rows["MD"].valid == 1.0 and rows["MD"].jsd < 0.6
