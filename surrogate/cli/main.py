@@ -283,7 +283,7 @@ def train(
 @app.command()
 @with_options
 def rollout(
-    scene: SceneArg, *, weights: WeightsOpt, out: OutOpt, options: RolloutOptions, as_json: JsonOpt = False
+    scene: SceneArg, *, weights: WeightsOpt = None, out: OutOpt, options: RolloutOptions, as_json: JsonOpt = False
 ) -> None:
     """Roll SCENE forward with a trained surrogate, in chunks."""
     from surrogate import api

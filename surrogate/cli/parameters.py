@@ -57,8 +57,12 @@ ValidationOpt = Annotated[
 ]
 DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 WeightsOpt = Annotated[
-    str,
-    typer.Option("--weights", help="Name of shipped weights, or a .safetensors file.", autocompletion=_weights),
+    str | None,
+    typer.Option(
+        "--weights",
+        help="Name of shipped weights, or a .safetensors file; else those that cover SCENE.",
+        autocompletion=_weights,
+    ),
 ]
 OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")]
 SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]

@@ -19,10 +19,13 @@ if TYPE_CHECKING:
 
 
 @takes(RolloutOptions)
-def rollout(scene: str | Path | Scene, weights: str | Path, out: str | Path, options: RolloutOptions) -> list[Path]:
+def rollout(
+    scene: str | Path | Scene, weights: str | Path | None, out: str | Path, options: RolloutOptions
+) -> list[Path]:
     """Roll a scene forward with a trained surrogate, in chunks, and return the trajectories written.
 
-    `weights`: the name of shipped weights or a .safetensors file. Atoms are written in the scene's own order, frames at
+    `weights`: the name of shipped weights or a .safetensors file; None takes the shipped ones that cover the scene, and
+    says which and why. Atoms are written in the scene's own order, frames at
     the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Weights
     that were trained for several lags step at `lag_ps`, by default at the longest that `save_every_ps` is a multiple
     of; weights that know atoms by their bonds take molecules that look like those they were trained on. Replicas
@@ -47,7 +50,7 @@ def rollout(scene: str | Path | Scene, weights: str | Path, out: str | Path, opt
 
     outs = replica_paths(Path(out), options.replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
-    file = weights_path(weights)
+    file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
     from surrogate.data.weights import load_weights
@@ -55,7 +58,14 @@ def rollout(scene: str | Path | Scene, weights: str | Path, out: str | Path, opt
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
-    loaded = load_weights(file)
+    if file is None:
+        from surrogate.sampling.choice import choose_weights
+
+        loaded, why = choose_weights(molecule, temperature_k=config.temperature_k)
+        if not options.quiet:
+            tell(molecule.name, why)
+    else:
+        loaded = load_weights(file)
     label = f"surrogate {molecule.name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
     saved_ps = config.save_every_ps
     if saved_ps is None:

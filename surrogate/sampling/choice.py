@@ -1,0 +1,40 @@
+"""Which of the shipped weights roll a scene, where the user names none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from surrogate.data.shipped import shipped_weights
+from surrogate.data.weights import load_weights
+from surrogate.sampling.domain import match_domain
+from systems.errors import OutOfDomainError
+
+if TYPE_CHECKING:
+    from surrogate.data.weights import Weights
+    from systems.scene import Scene
+
+
+def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple[Weights, str]:
+    """Return the shipped weights that cover a scene, and why these.
+
+    Weights that were trained on the molecule come before those that know molecules like it, and those that draw frames
+    from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks.
+    Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
+    """
+    found, refusals = [], []
+    for name, path in shipped_weights().items():
+        weights = load_weights(path)
+        try:
+            match = match_domain(scene, weights, temperature_k=temperature_k)
+        except OutOfDomainError as error:
+            refusals.append((len(error.args[0].split("; ")), name, str(error)))
+            continue
+        found.append((not match.seen, weights.model.carries_velocities, name, weights))
+    if not found:
+        reason = min(refusals)[2] if refusals else "none are shipped."
+        raise OutOfDomainError(f"no shipped weights cover {scene.name}, and none are named. The nearest: {reason}")
+    unseen, _, name, weights = min(found, key=lambda one: one[:3])
+    others = sorted(other for *_, other, _ in found if other != name)
+    why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
+    beside = f"; {', '.join(others)} would do, too" if others else ""
+    return weights, f"weights not named, taken are the shipped {name}: {why}{beside}"

@@ -1,0 +1,33 @@
+"""Weights that the user does not name: those that were trained on the molecule, else those that cover it."""
+
+from __future__ import annotations
+
+import pytest
+
+from surrogate.sampling.choice import choose_weights
+from systems.errors import OutOfDomainError
+from systems.library.named_scenes import load
+from systems.source import prepare
+
+
+def test_a_molecule_that_was_trained_on_gets_its_weights() -> None:
+    weights, why = choose_weights(load("alanine-dipeptide"))
+    assert weights.path.stem == "alanine-dipeptide"
+    assert "trained on this molecule" in why and "alanine-dipeptide-painet would do, too" in why
+
+
+def test_an_unseen_molecule_gets_weights_that_cover_it_and_is_told() -> None:
+    weights, why = choose_weights(prepare("smiles:CCCCCO"))
+    assert weights.path.stem == "alkanes-alcohols-ethers"
+    assert "without having seen it" in why or "trained on this molecule" in why
+
+
+@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "sequence:ACE-GLY-NME"])
+def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> None:
+    with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .* The nearest: .*does not cover"):
+        choose_weights(prepare(scene))
+
+
+def test_another_temperature_is_covered_by_none() -> None:
+    with pytest.raises(OutOfDomainError, match="temperature"):
+        choose_weights(load("alanine-dipeptide"), temperature_k=350.0)
