@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from surrogate.bench.held_out import cut
 from surrogate.data.frames import TrainingFrames, collect_frames
 from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, Surrogate
@@ -160,8 +161,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args()
-    from surrogate.bench.forecasters import cut
-
     torch.set_num_threads(1)
     _, frames = cut(collect_frames([args.reference], canonical=False, velocities=True), args.share)
     report = judge_weights(args.weights, frames, starts=args.starts, chunks=args.chunks, seed=args.seed)

@@ -1,4 +1,4 @@
-"""Commands that the README, the manual, the cards of weights, the notebooks, the changelog and docstrings name exist."""
+"""Commands that the README, manual, cards of weights, notebooks, changelog and docstrings name exist."""
 
 from __future__ import annotations
 
@@ -24,18 +24,22 @@ def documents(root: Path) -> list[Path]:
     """Return what tells people which commands to type."""
     manual = [p for p in (root / "docs").rglob("*.md") if "_build" not in p.parts]
     code = [p for top in ("systems", "md_reference", "surrogate", "docs/studies") for p in (root / top).rglob("*.py")]
-    notebooks = [p for p in (root / "notebooks").glob("*.ipynb")]
-    return sorted([root / "README.md", root / "CHANGELOG.md", root / "CONTRIBUTING.md", *manual, *code, *notebooks,
-                   *(root / "surrogate" / "pretrained").glob("*.md")])  # fmt: skip
+    others = [*(root / "notebooks").glob("*.ipynb"), *(root / "docs" / "results").rglob("*.json"),
+              *(root / "surrogate" / "pretrained").glob("*.md")]  # fmt: skip
+    return sorted([*(root / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING")), *manual, *code, *others])
 
 
 def text_of(path: Path) -> str:
-    """Return a document's text: of the changelog the unreleased part, of a module its docstrings."""
+    """Return a document's text: of the changelog the unreleased part, of a module its docstrings, of results the
+    command that made them."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".ipynb":
         sources = ["".join(cell["source"]) for cell in json.loads(text)["cells"]]
         return "\n\n".join(f"```\n{s}\n```" if cell["cell_type"] == "code" else s
                            for s, cell in zip(sources, json.loads(text)["cells"], strict=True))  # fmt: skip
+    if path.suffix == ".json":
+        found = json.loads(text)
+        return f"`{found['command']}`" if isinstance(found, dict) and "command" in found else ""
     if path.suffix == ".py":
         kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
         return "\n\n".join(ast.get_docstring(n) or "" for n in ast.walk(ast.parse(text)) if isinstance(n, kinds))

@@ -1,17 +1,15 @@
 """Run time against error: a surrogate at many settings beside OpenMM at many lengths, on one core.
 
-`surromd bench cost-error REFERENCE REPLICATE --weights NAME`, or `python -m surrogate.bench.cost_error.sweep` with the
-same arguments. Each setting rolls the same time; its error is that of the φ/ψ map against two held-out runs, its cost
-the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so that the ratio of
-the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out run against the
-whole of the other (`judge.worth`): it is taken to be the same at each time step, by simulated time.
+`surromd bench cost-error REFERENCE REPLICATE --weights NAME`. Each setting rolls the same time; its error is that of
+the φ/ψ map against two held-out runs, its cost the processor time of this process, one thread. Before each of its parts
+OpenMM runs for a moment, so that the ratio of the two does not hang on what else the machine does. MD's own error is
+that of pieces of one held-out run against the whole of the other (`judge.worth`): it is taken to be the same at each
+time step, by simulated time.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from surrogate.bench.cost_error.cost_page import markdown, write_cost_error
+from surrogate.bench.cost_error.cost_page import write_cost_error
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
 from surrogate.bench.cost_error.sweep_settings import USUAL_BATCH, CostErrorConfig, Setting, choose_settings
@@ -33,7 +31,6 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.verbs.options import Trajectories
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError, StorageError, SurromdError
-from systems.units import parse_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -175,37 +172,3 @@ def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
     if found and any(found.get(key) != value for key, value in header.items()):
         raise InputError(f"{path} is of other references, times or rounds; name another folder with --out.")
     return {**header, "rows": [], **found}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("reference", help="a held-out run, or several as one: file, folder or glob")
-    parser.add_argument("replicate", help="another, as long")
-    parser.add_argument("--weights", action="append", required=True, help="name or file; repeatable")
-    parser.add_argument("--out", type=Path, default=Path("runs/cost-error"))
-    parser.add_argument("--time", default="20ns")
-    parser.add_argument("--rounds", type=int, default=CostErrorConfig.rounds)
-    parser.add_argument("--solver", action="append")
-    parser.add_argument("--steps", action="append", type=int)
-    parser.add_argument("--precision", action="append", choices=("auto", "fp32", "bf16"))
-    parser.add_argument("--batch", action="append", type=int)
-    parser.add_argument("--compile", action="store_true")
-    args = parser.parse_args()
-    result = cost_error(
-        args.reference,
-        args.replicate,
-        args.weights,
-        args.out,
-        CostErrorConfig(time_ps=parse_time_ps(args.time, "--time"), rounds=args.rounds),
-        solvers=args.solver,
-        steps=args.steps,
-        precisions=args.precision,
-        batches=args.batch,
-        compiled=args.compile,
-        report=lambda line: print(line, file=sys.stderr),  # noqa: T201
-    )
-    sys.stdout.write(markdown(result) + "\n")
-
-
-if __name__ == "__main__":
-    main()

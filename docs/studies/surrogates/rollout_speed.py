@@ -1,4 +1,4 @@
-"""Rollout against OpenMM's fastest set-up on the same cores, side by side: `python -m surrogate.bench.speed`.
+"""Rollout against OpenMM's fastest set-up on the same cores: `python docs/studies/surrogates/rollout_speed.py`.
 
 Each round times, one after the other: OpenMM with one replica per core (Reference platform, native OBC2, 4 fs), the
 surrogate with one replica, and the surrogate with a batch. Ratios are taken within a round; the median and the extremes
@@ -24,14 +24,9 @@ SCENE = "alanine-dipeptide"
 
 def microseconds_per_day(simulated_ps: float, run: Callable[[], object]) -> float:
     """Return simulated µs per day of wall time of `run`, start-up and writing included."""
-    return simulated_ps * 1e-6 / seconds_of(run)[1] * 86400.0
-
-
-def seconds_of(run: Callable[[], object]) -> tuple[float, float]:
-    """Return processor seconds (of this process, all threads) and wall seconds of `run`, at least a nanosecond."""
-    wall, cpu = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
     run()
-    return max(time.process_time() - cpu, 1e-9), max(time.perf_counter() - wall, 1e-9)
+    return simulated_ps * 1e-6 / (time.perf_counter() - began) * 86400.0
 
 
 def one_round(

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import forecasters
 import numpy as np
 import pytest
 import torch
-
-from surrogate.bench import forecasters
-from surrogate.bench.forecasters import (
+from forecasters import (
     Cost,
     _working_parameters,
     compare_errors,
@@ -20,6 +19,7 @@ from surrogate.bench.forecasters import (
     measure_cost,
     window_errors,
 )
+
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import EgnnForecaster, Painet

@@ -1,4 +1,6 @@
-"""PAINET's cost against atoms, and its error against EGNN's: `python -m surrogate.bench.forecasters cost|error`.
+"""PAINET's cost against atoms, and its error against EGNN's.
+
+`python docs/studies/surrogates/forecasters.py cost` or `... error TRAJECTORY...`.
 
 `cost` times one chunk of branched chains of 10 to 10,000 atoms, factored and dense attention side by side, in
 processor time of one thread, and prints the exponent of a power law fitted to all sizes and to the last decade.
@@ -29,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from surrogate.bench.held_out import cut
 from surrogate.bench.reproduce.forecast_errors import Estimate, block_means, ratio
 from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames, collect_frames
@@ -151,17 +154,6 @@ def compare_errors(
         egnn_s=spent["egnn"],
         painet_s=spent["painet"],
     )
-
-
-def cut(frames: TrainingFrames, share: float) -> tuple[TrainingFrames, TrainingFrames]:
-    """Split frames of one trajectory by time: all but the last `share`, and that."""
-    at = round(frames.n_frames * (1.0 - share))
-    assert frames.velocities is not None
-    parts = []
-    for part in (slice(0, at), slice(at, frames.n_frames)):
-        x, v = frames.coordinates[part], frames.velocities[part]
-        parts.append(replace(frames, coordinates=x, velocities=v, starts=np.array([0, len(x)])))
-    return parts[0], parts[1]
 
 
 def thinned(starts: npt.NDArray[np.int64], at_most: int) -> npt.NDArray[np.int64]:
