@@ -36,6 +36,8 @@ from systems.trajectory.codec import open_trajectory
 MD = MDConfig(time_ps=3.0, save_every_ps=0.2, timestep_ps=0.02, equilibrate_ps=0.2, seed=3, platform="Reference",
               force=ForceFieldSpec("auto", "auto"))  # fmt: skip
 Run = Callable[..., Any]
+# What is long is done in so many tests: none may take ten minutes.
+PARTS = 4
 
 
 @dataclass
@@ -142,10 +144,11 @@ def recorded(kind: Kind, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
     return disk
 
 
-def crashes(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int) -> tuple[int, dict[Any, str]]:
+def crashes(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int,
+            first: int = 0) -> tuple[int, dict[Any, str]]:  # fmt: skip
     disk = recorded(kind, tmp_path / "run", monkeypatch)
     found = {}
-    for n in range(0, len(disk.operations) + 1, every):
+    for n in range(first, len(disk.operations) + 1, every):
         disk.put(tmp_path / f"{n}", disk.after(n))
         found[n, disk.operations[n - 1][:2] if n else ""] = outcome(kind, tmp_path / f"{n}")
     return len(disk.operations), found
@@ -155,10 +158,11 @@ def name_of(kind: Kind) -> str:
     return "rollout" if len(kind.names) > 1 else f"reference {Path(kind.names[0]).suffix}"
 
 
-def power_failures(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int) -> dict[Any, str]:
+def power_failures(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int,
+                   first: int = 0) -> dict[Any, str]:  # fmt: skip
     disk = recorded(kind, tmp_path / "run", monkeypatch)
     found = {}
-    for n in range(0, len(disk.operations) + 1, every):
+    for n in range(first, len(disk.operations) + 1, every):
         for how, (data, names) in LOSSES.items():
             folder = tmp_path / f"{n} {how}"
             disk.put(folder, disk.after(n, data, names, seed=n))
@@ -166,14 +170,15 @@ def power_failures(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     return found
 
 
-def faults(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, every: int) -> dict[Any, str]:
+def faults(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, every: int,
+           first: int = 0) -> dict[Any, str]:  # fmt: skip
     """Have each operation fail in turn, once, or from then on all that need space; then go on with the disk mended."""
     found: dict[Any, str] = {}
     (tmp_path / "count").mkdir()
     calls: list[str] = []
     with watched(tmp_path / "count", monkeypatch, lambda number, what: calls.append(what) or 0):
         kind.run(tmp_path / "count")
-    for n in range(1, len(calls) + 1, every):
+    for n in range(1 + first, len(calls) + 1, every):
         folder = tmp_path / f"{code} {n}"
         folder.mkdir()
         seen: list[str] = []
@@ -214,21 +219,24 @@ def test_some_operations_that_fail(kind: Kind, code: int, tmp_path: Path, monkey
 
 
 @pytest.mark.slow
-def test_killed_at_every_operation(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, found = crashes(kind, tmp_path, monkeypatch, every=1)
+@pytest.mark.parametrize("part", range(PARTS))
+def test_killed_at_every_operation(kind: Kind, part: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, found = crashes(kind, tmp_path, monkeypatch, PARTS, part)
     count(f"{name_of(kind)}: killed at an operation", found)
 
 
 @pytest.mark.slow
-def test_power_lost_at_each_operation(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    every = 1 if len(kind.names) == 1 else 4  # no test may take ten minutes
-    count(f"{name_of(kind)}: power lost at an operation", power_failures(kind, tmp_path, monkeypatch, every))
+@pytest.mark.parametrize("part", range(PARTS))
+def test_power_lost_at_each_operation(kind: Kind, part: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count(f"{name_of(kind)}: power lost at an operation", power_failures(kind, tmp_path, monkeypatch, PARTS, part))
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC])
-def test_every_operation_that_fails(kind: Kind, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    count(f"{name_of(kind)}: {errno.errorcode[code]}", faults(kind, tmp_path, monkeypatch, code, every=1))
+def test_every_operation_that_fails(kind: Kind, code: int, part: int, tmp_path: Path,
+                                    monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    count(f"{name_of(kind)}: {errno.errorcode[code]}", faults(kind, tmp_path, monkeypatch, code, PARTS, part))
 
 
 @pytest.mark.slow

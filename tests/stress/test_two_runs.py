@@ -14,7 +14,7 @@ from systems.scene import Scene
 from systems.trajectory.claim import Claim
 from systems.trajectory.codec import open_trajectory, open_writer
 
-COMMAND = [sys.executable, "-c", "from surrogate.cli import main; main()", "reference", "double-well", "--time", "4ps",
+COMMAND = [sys.executable, "-c", "from surrogate.cli.main import main; main()", "reference", "double-well", "--time", "4ps",
            "--save-every", "200fs", "--timestep", "20fs", "--equilibrate", "1ps", "--platform", "Reference",
            "--quiet"]  # fmt: skip
 
