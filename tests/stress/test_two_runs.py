@@ -14,9 +14,8 @@ from systems.scene import Scene
 from systems.trajectory.claim import Claim
 from systems.trajectory.codec import open_trajectory, open_writer
 
-COMMAND = [sys.executable, "-c", "from surrogate.cli.main import main; main()", "reference", "double-well", "--time", "4ps",
-           "--save-every", "200fs", "--timestep", "20fs", "--equilibrate", "1ps", "--platform", "Reference",
-           "--quiet"]  # fmt: skip
+COMMAND = [sys.executable, "-m", "surrogate.cli.main", "reference", "double-well", "--time", "4ps", "--save-every",
+           "200fs", "--timestep", "20fs", "--equilibrate", "1ps", "--platform", "Reference", "--quiet"]  # fmt: skip
 
 
 def both(out: Path, repository: Path, *more: str) -> list[tuple[int, int, str]]:

@@ -39,7 +39,7 @@ import atexit, cProfile, sys, time
 profile = cProfile.Profile(time.process_time)
 atexit.register(profile.dump_stats, sys.argv.pop(1))
 profile.enable()
-from surrogate.cli import main
+from surrogate.cli.main import main
 main()
 """
 _BLOCK_FRAMES = 20_000
