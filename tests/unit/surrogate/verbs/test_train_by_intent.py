@@ -1,0 +1,209 @@
+"""What `train` chooses for its references, how it says so, and that the file of --explain gives the same training."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import surrogate as sm
+from command_line import SMALL_LAM_SLIDE, run
+from surrogate.data.references import References
+from surrogate.data.weights import load_weights
+from surrogate.models.lam_slide import choices
+from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
+from surrogate.models.peptides.model import PeptideConfig
+from surrogate.models.peptides.trainer import PeptideTraining
+from surrogate.models.settings import toml_text
+from surrogate.training.trainer import TrainingRequest
+from systems.errors import InputError
+from systems.prepare.peptide import build_peptide
+from systems.scene import Scene
+from systems.source import prepare
+from systems.trajectory.codec import open_writer
+
+MD = {"kind": "reference", "temperature_k": 300.0, "force_field": "ff14SB", "solvent": "obc2"}
+
+
+def write(folder: Path, scene: Scene, n_frames: int = 64, record: dict[str, object] = MD, lag_ps: float = 1.0) -> Path:
+    """Write frames in which every atom shakes by itself."""
+    path, rng = folder / f"{scene.name}.h5", np.random.default_rng(n_frames)
+    with open_writer(path, scene, record) as writer:
+        frames = scene.positions_nm + 0.003 * rng.normal(size=(n_frames, scene.n_atoms, 3))
+        writer.append(frames, lag_ps * np.arange(1.0, n_frames + 1))
+    return path
+
+
+def explained(references: Sequence[Path], **given: object) -> tuple[dict[str, object], list[str]]:
+    """Return the record of the explained configuration and the lines at its head."""
+    text = sm.explain_training(list(references), **given)
+    return tomllib.loads(text), [line.removeprefix("# ") for line in text.splitlines() if line.startswith("# ")]
+
+
+def chosen(lines: list[str]) -> dict[str, str]:
+    return dict(line.split(": ")[0].split(" = ") for line in lines)
+
+
+@pytest.fixture(scope="module")
+def alanine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("one"), build_peptide("ACE-ALA-NME"), 660)
+
+
+@pytest.fixture(scope="module")
+def peptides(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("peptides")
+    return [write(folder, build_peptide(s), 200, lag_ps=2.0) for s in ("ACE-ALA-NME", "ACE-SER-NME")]
+
+
+@pytest.fixture(scope="module")
+def molecules(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("molecules")
+    return [write(folder, prepare(f"smiles:{smiles}")) for smiles in ("CCO", "CCC")]
+
+
+def test_one_molecule_keeps_every_default(alanine: Path) -> None:
+    record, lines = explained([alanine])
+    assert lines == ["arch = lam-slide: one molecule"]
+    assert LamSlideConfig.from_dict(record["model"]) == LamSlideConfig()
+    assert TrainingConfig(**record["training"]) == TrainingConfig()
+    assert not {"budget_s", "seed", "device", "stage_one_steps"} & record["training"].keys()
+
+
+def test_one_molecule_is_trained_as_by_the_defaults_bit_for_bit(alanine: Path, tmp_path: Path) -> None:
+    settings = TrainingConfig(stage_one_steps=1, stage_two_steps=2, seed=5)
+    frames = References((alanine,)).frames(canonical=True)
+    plain = train_lam_slide(frames, tmp_path / "plain.safetensors", LamSlideConfig(), settings)
+    by_intent = tmp_path / "intent.safetensors"
+    done = run("train", str(alanine), "--steps", "3", "--seed", "5", "--device", "cpu", "-q", "-o", str(by_intent))
+    assert done.exit_code == 0, done.stderr
+    one, other = load_file(plain), load_file(by_intent)
+    assert one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+
+
+@pytest.mark.parametrize("record", [MD, {}])
+def test_many_molecules_are_known_by_their_bonds(tmp_path: Path, record: dict[str, object]) -> None:
+    references = [write(tmp_path, prepare(f"smiles:{smiles}"), record=record) for smiles in ("CCO", "CCC")]
+    found, lines = explained(references)
+    said = chosen(lines)
+    assert (said["arch"], said["model.graph"], said["training.stage_two_batch"]) == ("lam-slide", "true", "32")
+    # What nobody says is MD at constant temperature is not taken for it.
+    assert ("training.time_reversal" in said) == found["training"]["time_reversal"] == bool(record)
+    assert LamSlideConfig.from_dict(found["model"]) == LamSlideConfig.of_many({})
+    one, _ = explained(references[:1], validation=references[1:])
+    assert one["model"]["graph"], "a molecule held out whole is another molecule too"
+
+
+def test_several_peptides_are_known_by_their_residues(peptides: list[Path], tmp_path: Path) -> None:
+    record, lines = explained(peptides)
+    assert lines[0].startswith("arch = lam-slide-peptides: 2 peptides")
+    assert chosen(lines) == {"arch": "lam-slide-peptides", "model.shortest_ps": "2.0", "model.longest_ps": "360.0",
+                             "training.time_reversal": "true"}  # fmt: skip
+    assert PeptideConfig.from_dict(record["model"]) == PeptideConfig(shortest_ps=2.0, longest_ps=360.0)
+    assert PeptideTraining(**record["training"]) == PeptideTraining(time_reversal=True)
+    mixed, _ = explained([*peptides, write(tmp_path, prepare("smiles:CCO"), lag_ps=2.0)])
+    assert mixed["arch"] == "lam-slide", "one that is no peptide"
+    alone, _ = explained(peptides[:1])
+    assert alone["arch"] == "lam-slide"
+
+
+def test_peptides_are_trained_and_rolled_by_the_verb(peptides: list[Path], tmp_path: Path) -> None:
+    config, out = tmp_path / "small.toml", tmp_path / "w.safetensors"
+    config.write_text("[model]\nwidth = 16\nn_layers = 1\nn_heads = 2\nchunk_frames = 4\n")
+    done = run("train", *map(str, peptides), "--config", str(config), "--steps", "4", "--longest-lag", "40ps", "-o",
+               str(out))  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    assert "model.longest_ps = 40.0: --longest-lag" in done.stderr and "frames pass the guards" in done.stderr
+    weights = load_weights(out)
+    assert weights.model.arch == "lam-slide-peptides" and weights.domain.lag_ps == pytest.approx(2.0)
+    assert len(weights.domain.members) == 2 and weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
+
+
+def test_several_lags_are_learned_where_they_are_asked_for(alanine: Path) -> None:
+    record, lines = explained([alanine], longest_lag_ps="10ps")
+    assert chosen(lines) == {"arch": "lam-slide", "training.time_reversal": "true"}
+    assert record["training"]["longest_lag_ps"] == 10.0
+    assert LamSlideConfig.from_dict(record["model"]) == LamSlideConfig()
+
+
+def test_more_atoms_than_identifiers_are_coded_as_residues_or_without_hydrogens(tmp_path: Path) -> None:
+    large = write(tmp_path, build_peptide("ACE-ALA-ALA-NME"))
+    assert chosen(explained([large])[1])["model.entities"] == "residue"
+    chain = write(tmp_path, prepare("smiles:CCCCCCCCCCC"))
+    record, lines = explained([chain])
+    assert chosen(lines)["model.hydrogens"] == record["model"]["hydrogens"] == "placed"
+    assert "35 atoms, more than 32 identifiers; 11 heavy ones" in lines[1]
+    # Hydrogens are placed at one lag alone.
+    assert chosen(explained([chain], longest_lag_ps=5)[1])["model.autoencoder.identifier_pool"] == "35"
+
+
+def test_what_the_user_sets_stays(molecules: list[Path], tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text('[model.atoms]\nlatents = "set"\n[training]\nstage_two_batch = 7\ntime_reversal = false\n')
+    record, lines = explained(molecules, config=config)
+    assert set(chosen(lines)) == {"arch", "model.graph"}
+    assert record["training"]["stage_two_batch"] == 7 and record["training"]["time_reversal"] is False
+    assert record["model"]["atoms"]["latents"] == "set"
+
+
+def test_the_explained_file_gives_the_same_training(molecules: list[Path], tmp_path: Path) -> None:
+    small, filled = tmp_path / "small.toml", tmp_path / "filled.toml"
+    small.write_text(SMALL_LAM_SLIDE + "[model.atoms]\nwidth = 24\nn_rounds = 1\n")
+    names = [str(path) for path in molecules]
+    shown = run("train", *names, "--config", str(small), "--longest-lag", "4ps", "--explain")
+    assert shown.exit_code == 0, shown.stderr
+    filled.write_text(shown.stdout)
+    written = {}
+    for name, options in (("direct", [str(small), "--longest-lag", "4ps"]), ("filled", [str(filled)])):
+        out = tmp_path / f"{name}.safetensors"
+        done = run("train", *names, "--steps", "3", "-o", str(out), "--device", "cpu", "-q", "--config", *options)
+        assert done.exit_code == 0, done.stderr
+        written[name] = load_file(out)
+    assert all(np.array_equal(written["direct"][k], written["filled"][k]) for k in written["direct"])
+
+
+def test_rare_states_are_weighted_in_a_further_training_that_shows_them(
+    tmp_path: Path, small_weights_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = load_weights(small_weights_file)
+    scene = trained.domain.scene
+    few = write(tmp_path, scene)
+    request = TrainingRequest("lam-slide", tmp_path / "w.safetensors", steps=4, start_from=small_weights_file)
+    trainer, references = choices.LamSlideTrainer(), References((few,))
+    assert trainer.choose(references, request) == (), "64 frames tell nothing of what is rare"
+    monkeypatch.setattr(choices, "_FRAMES_FOR_RARE", 10)
+    monkeypatch.setattr(choices, "rare_kinds", lambda frames, length: ("kind",))
+    found = {choice.key: choice.value for choice in trainer.choose(references, request)}
+    assert found == {"training.rare_kinds": True, "training.rare_draws": 0.3}
+
+
+def test_files_that_cannot_be_meant_are_refused_in_one_line(alanine: Path, tmp_path: Path) -> None:
+    config = tmp_path / "bad.toml"
+    for text, said in (
+        ("chunk_frames = 4\n", "unknown key chunk_frames.*model.chunk_frames"),
+        ("model = 3\n", r"model is a table, \[model\], not 3"),
+        ('arch = "painte"\n', "Did you mean 'painet'"),
+        ("[training]\nstage_two_bacth = 3\n", "training.stage_two_bacth.*stage_two_batch"),
+    ):
+        config.write_text(text)
+        with pytest.raises(InputError, match=said):
+            explained([alanine], config=config)
+    config.write_text('arch = "painet"\n')
+    with pytest.raises(InputError, match="is for painet, the command asks for lam-slide"):
+        explained([alanine], config=config, arch="lam-slide")
+    refused = run("train", str(alanine), "--steps", "4")
+    assert refused.exit_code == 2 and "-o w.safetensors" in refused.stderr
+
+
+def test_a_record_comes_back_from_its_toml() -> None:
+    record = {"arch": "a", "model": {"n": 3, "x": 1e-3, "on": True, "none": None, "text": 'q"\\', "list": [1.5, "b"],
+                                     "deep": {"kinds": [{"quad": [1, 2], "visited": None}], "empty": []}},
+              "training": {}}  # fmt: skip
+    found = tomllib.loads(toml_text(record))
+    expected = {"arch": "a", "model": {"n": 3, "x": 1e-3, "on": True, "text": 'q"\\', "list": [1.5, "b"],
+                                       "deep": {"kinds": [{"quad": [1, 2]}], "empty": []}}, "training": {}}  # fmt: skip
+    assert found == expected
