@@ -14,18 +14,10 @@ from typer.core import TyperGroup
 from surrogate import __version__
 from surrogate.cli.bench_verbs import bench, stress
 from surrogate.cli.parameters import (
-    ArchOpt,
-    DeviceOpt,
     JsonOpt,
     OutOpt,
-    OverwriteOpt,
-    QuietOpt,
-    ResumeOpt,
     SceneArg,
-    SeedOpt,
-    ValidationOpt,
     WeightsOpt,
-    literal,
     with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
@@ -38,13 +30,13 @@ from surrogate.verbs.options import (
     Quiet,
     ReferenceOptions,
     RolloutOptions,
+    TrainOptions,
     WindowsOptions,
 )
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
 from systems.options import option
-from systems.units import parse_time_ps, parse_wall_s
 
 
 class _Group(TyperGroup):
@@ -219,65 +211,32 @@ def windows(
 
 
 @app.command()
+@with_options
 def train(
     references: Annotated[
         list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
     ],
+    *,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Weights to write, .safetensors.")] = None,
-    arch: ArchOpt = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help=literal("TOML with tables [model] and [training]; see --explain."))
-    ] = None,
-    budget: Annotated[str | None, typer.Option("--budget", help="Wall time to spend, such as 30min.")] = None,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps instead of a budget.")] = None,
-    start_from: Annotated[
-        str | None, typer.Option("--from", help="Weights whose second stage is trained further: a name or a file.")
-    ] = None,
-    validation: ValidationOpt = None,
-    longest_lag: Annotated[
-        str | None, typer.Option("--longest-lag", help="Learn every frame spacing up to this one, such as 1ns.")
-    ] = None,
-    device: DeviceOpt = "auto",
-    seed: SeedOpt = 0,
+    options: TrainOptions,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print the configuration filled in for these references; train nothing.")
+        bool, typer.Option("--explain", help="Print the --config filled in for these references; train nothing.")
     ] = False,
-    resume: ResumeOpt = False,
-    overwrite: OverwriteOpt = False,
-    quiet: QuietOpt = False,
     as_json: JsonOpt = False,
 ) -> None:
-    """Train a surrogate on reference trajectories."""
+    """Train a surrogate that suits the reference trajectories."""
     from surrogate import api
 
-    longest_lag_ps = None if longest_lag is None else parse_time_ps(longest_lag, "--longest-lag")
     if explain:
-        typer.echo(
-            api.explain_training(references, arch=arch, config=config, start_from=start_from, validation=validation,
-                                 longest_lag_ps=longest_lag_ps), nl=False)  # fmt: skip
+        typer.echo(api.explain_training(references, options=options), nl=False)
         return
     if out is None:
         raise typer.BadParameter("name the weights to write: -o w.safetensors", param_hint="--out")
-    written = api.train(
-        references,
-        out,
-        arch=arch,
-        config=config,
-        budget_s=None if budget is None else parse_wall_s(budget, "--budget"),
-        steps=steps,
-        start_from=start_from,
-        validation=validation,
-        longest_lag_ps=longest_lag_ps,
-        seed=seed,
-        device=device,
-        resume=resume,
-        overwrite=overwrite,
-        quiet=quiet,
-    )
+    written = api.train(references, out, options=options)
     from surrogate.training.devices import is_first_process
 
     if is_first_process():
-        print_written([written], as_json, quiet)
+        print_written([written], as_json, options.quiet)
 
 
 @app.command()

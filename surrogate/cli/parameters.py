@@ -47,15 +47,6 @@ SceneArg = Annotated[
         metavar="SCENE", help="Library name, path, smiles:CCO or sequence:ACE-ALA-NME.", autocompletion=_scenes
     ),
 ]
-ArchOpt = Annotated[
-    str | None,
-    typer.Option("--arch", help="lam-slide, painet, egnn, a baseline, ... Default: what suits the references."),
-]
-ValidationOpt = Annotated[
-    list[str] | None,
-    typer.Option("--validation", help="Trajectory held out whole; repeatable. Default: the last 5 % of each."),
-]
-DeviceOpt = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 WeightsOpt = Annotated[
     str | None,
     typer.Option(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from surrogate.sampling.config import RolloutConfig
 from systems.options import OptionRow, option, option_rows
@@ -61,6 +62,15 @@ class Resuming:
     """Of verbs that can go on where they were stopped."""
 
     resume: bool = option("Go on where an earlier run of the same settings stopped.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validated:
+    """Of verbs that hold frames out of a training."""
+
+    validation: Trajectories | None = option(
+        "Trajectory held out whole; repeatable.", None, unset="the last 5 % of each"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,12 +147,9 @@ class CampaignOptions(Quiet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowsOptions(Quiet, Overwriting):
+class WindowsOptions(Quiet, Overwriting, Validated):
     """What `windows` can be told."""
 
-    validation: Trajectories | None = option(
-        "Trajectory held out whole; repeatable.", None, unset="the last 5 % of each"
-    )
     velocities: bool = option("Keep velocities, which painet learns from.", False)
     canonical: bool = option("Superpose frames on one pose, unless velocities are kept.", True, words=None)
 
@@ -174,6 +181,24 @@ class DemoOptions(Quiet, Seeded):
     rollout_replicas: int = option("Rollouts side by side.", 8, within=(1, None), words=None)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(Quiet, Overwriting, Resuming, Seeded, Validated):
+    """What `train` can be told. What is left open is chosen to suit the references, and said with its reason."""
+
+    arch: str | None = option(
+        "lam-slide, painet, egnn, a baseline, or another that is installed.", None, unset="what suits the references"
+    )
+    budget_s: float | None = option("Wall time to spend, such as 30min.", None)
+    steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
+    start_from: str | Path | None = option(
+        "Weights whose second stage is trained further: a name or a file.", None, words=("from",)
+    )
+    longest_lag_ps: float | None = option("Learn every frame spacing up to this one, such as 1ns.", None)
+    device: str = option("Where it runs.", "auto", choices=("auto", "cpu", "cuda"))
+    model: dict[str, Any] | None = option("Settings of the network, as explained.", None, words=None)
+    training: dict[str, Any] | None = option("Settings of its training, as explained.", None, words=None)
+
+
 # By the verb's name in Python.
 VERB_OPTIONS: dict[str, type] = {
     "demo": DemoOptions,
@@ -183,6 +208,7 @@ VERB_OPTIONS: dict[str, type] = {
     "windows": WindowsOptions,
     "rollout": RolloutOptions,
     "compare": CompareOptions,
+    "train": TrainOptions,
 }
 
 

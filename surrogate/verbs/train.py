@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import weights_path
 from surrogate.models.registry import architecture, names
 from surrogate.progress import progress_bar
-from surrogate.verbs.options import PathLike, Trajectories
+from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from surrogate.verbs.scene_listing import tell
+from surrogate.verbs.takes import takes
 from systems.errors import InputError
 from systems.trajectory.claim import Claim
-from systems.units import Quantity, quantity
 
 if TYPE_CHECKING:
     from surrogate.data.references import References
@@ -37,23 +37,8 @@ class _Plan:
         return [f"arch = {self.request.arch}: {self.why}", *(choice.line() for choice in self.choices)]
 
 
-def train(
-    references: Trajectories,
-    out: PathLike,
-    *,
-    arch: str | None = None,
-    config: PathLike | None = None,
-    budget_s: Quantity | None = None,
-    steps: int | None = None,
-    start_from: PathLike | None = None,
-    validation: Trajectories | None = None,
-    longest_lag_ps: Quantity | None = None,
-    seed: int = 0,
-    device: str = "auto",
-    resume: bool = False,
-    overwrite: bool = False,
-    quiet: bool = False,
-) -> Path:
+@takes(TrainOptions)
+def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Path:
     """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
@@ -63,12 +48,11 @@ def train(
     decoder alone, egnn, which learn from velocities (a reference made with --save-velocities and natural hydrogen
     masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
     others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
-    `config`: a TOML file with tables [model] and [training]. `start_from`: weights (name or file) whose second stage is
-    trained further, with their configuration. `validation`: trajectories that the curves are measured on; without any
-    it is the last twentieth of each; molecules that are in `validation` alone are held out whole. A stretch of motion
-    that would be both trained on and validated on is refused. `longest_lag_ps`: every spacing of frames from that of
-    the references to this one is learned. `device`: 'auto', 'cpu' or 'cuda'; several devices by torchrun
-    (surrogate.training.devices).
+    `start_from`: weights (name or file) whose second stage is trained further, with their configuration. `validation`:
+    trajectories that the curves are measured on; without any it is the last twentieth of each; molecules that are in
+    `validation` alone are held out whole. A stretch of motion that would be both trained on and validated on is
+    refused. `longest_lag_ps`: every spacing of frames from that of the references to this one is learned. `device`:
+    'auto', 'cpu' or 'cuda'; several devices by torchrun (surrogate.training.devices).
 
     Beside `out`, a CSV holds the training curves and, until done, files the state that `resume` goes on from; at the
     end the curves are drawn (.svg), and a short rollout that is checked frame by frame says whether the weights are
@@ -76,20 +60,19 @@ def train(
     Raises InputError, TrajectoryError, SimulationError (training diverged), StorageError.
     """
     out = Path(out)
-    asked = _asked(arch, out, config, budget_s, steps, start_from, longest_lag_ps)
-    asked = replace(asked, seed=seed, resume=resume)
+    asked = _asked(options, out)
     if asked.arch:
         _trainer(asked.arch).check(asked)
-    check_outputs([out], [".safetensors"], resume=resume, overwrite=overwrite)
+    check_outputs([out], [".safetensors"], resume=options.resume, overwrite=options.overwrite)
     states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-    if states and not (resume or overwrite):
+    if states and not (options.resume or options.overwrite):
         raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
-    if resume and out.exists() and not states:
+    if options.resume and out.exists() and not states:
         return out
-    plan = _plan(references, validation, replace(asked, device=_device(device)))
+    plan = _plan(references, options.validation, replace(asked, device=_device(options.device)))
     from surrogate.training.devices import is_first_process
 
-    first = is_first_process()
+    first, quiet = is_first_process(), options.quiet
     prepared = plan.trainer.prepare(plan.references, plan.request)
     if first and not quiet:
         for line in plan.lines():
@@ -107,77 +90,47 @@ def train(
     return written
 
 
-def explain_training(
-    references: Trajectories,
-    *,
-    arch: str | None = None,
-    config: PathLike | None = None,
-    start_from: PathLike | None = None,
-    validation: Trajectories | None = None,
-    longest_lag_ps: Quantity | None = None,
-) -> str:
+@takes(TrainOptions)
+def explain_training(references: Trajectories, options: TrainOptions) -> str:
     """Return the configuration file, filled in, that a training on these references would use; nothing is trained.
 
     Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
+    Budget, seed and device belong to the command and are left out. Raises InputError, TrajectoryError.
     """
-    asked = _asked(arch, Path("explained.safetensors"), config, None, None, start_from, longest_lag_ps)
-    # Whatever the budget is: it belongs to the command.
-    plan = _plan(references, validation, asked, explained=True)
     from surrogate.models.settings import toml_text
 
+    plan = _plan(references, options.validation, _asked(options, Path("explained.safetensors")), explained=True)
     head = "".join(f"# {line}\n" for line in plan.lines())
     tables = plan.trainer.settings(plan.request).tables()
-    if start_from is not None:
+    if plan.request.start_from is not None:
         tables.pop("model", None)
     return head + toml_text({"arch": plan.request.arch, **tables})
 
 
-def _asked(
-    arch: str | None, out: Path, config: PathLike | None, budget_s: Quantity | None, steps: int | None,
-    start_from: PathLike | None, longest_lag_ps: Quantity | None,
-) -> TrainingRequest:  # fmt: skip
-    """Return the request with the tables of the configuration file; `arch` is empty where nothing names one."""
+def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
+    """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
     from surrogate.training.trainer import TrainingRequest
 
-    record = _read_config(config)
-    named = record.get("arch", arch)
-    if arch is not None and named != arch:
-        raise InputError(f"{config} is for {named}, the command asks for {arch}; leave one of the two out.")
-    start = None if start_from is None else weights_path(start_from)
-    if named is None and start is not None:
+    start, arch = options.start_from, options.arch
+    file = None if start is None else weights_path(start)
+    if arch is None and file is not None:
         from surrogate.data.weights import read_header
 
-        named = read_header(start).arch
-    if named is not None:
-        architecture(named)
+        arch = read_header(file).arch
+    if arch is not None:
+        architecture(arch)
     return TrainingRequest(
-        arch=named or "",
+        arch=arch or "",
         out=out,
-        budget_s=quantity("budget_s", budget_s),
-        steps=steps,
-        start_from=start,
-        longest_lag_ps=quantity("longest_lag_ps", longest_lag_ps),
-        model=record["model"],
-        training=record["training"],
+        budget_s=options.budget_s,
+        steps=options.steps,
+        start_from=file,
+        longest_lag_ps=options.longest_lag_ps,
+        seed=options.seed,
+        resume=options.resume,
+        model=options.model or {},
+        training=options.training or {},
     )
-
-
-def _read_config(config: PathLike | None) -> dict[str, Any]:
-    """Return `arch`, where it is named, and the tables `model` and `training` of a configuration file."""
-    from systems.files.toml_file import read_toml
-
-    record = {} if config is None else read_toml(config)
-    for table in ("model", "training"):
-        if not isinstance(record.setdefault(table, {}), dict):
-            raise InputError(f"{config}: {table} is a table, [{table}], not {record[table]!r}.")
-    if not isinstance(record.get("arch", ""), str):
-        raise InputError(f"{config}: arch is the name of an architecture, not {record['arch']!r}.")
-    if unknown := sorted(record.keys() - {"arch", "model", "training"}):
-        raise InputError(
-            f"{config}: unknown key {unknown[0]}; a configuration holds arch and the tables [model] and [training] "
-            f"(such as model.{unknown[0]})."
-        )
-    return record
 
 
 def _trainer(name: str) -> Trainer:
