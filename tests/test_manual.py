@@ -46,6 +46,26 @@ def test_commands_have_their_options() -> None:
     assert "\\[required\\]" in text
 
 
+def test_settings_without_a_flag_are_listed_as_such() -> None:
+    text = command_markdown(["rollout"])
+    assert "| `[sampling] solver` |" in text
+    assert "In `--config` files" not in command_markdown(["systems"])
+
+
+def flags_in(text: str) -> set[str]:
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", text))
+
+
+def test_the_manual_names_no_flag_that_is_gone(repository: Path) -> None:
+    known = set().union(*(flags_in(command_markdown(words)) for words in all_commands()))
+    # of the program as a whole, and of the shell's own commands
+    known |= {"--help", "--version", "--install-completion", "--exclude"}
+    pages = [repository / "README.md", *(repository / "docs").glob("*.md"), *(repository / "notebooks").glob("*.ipynb")]
+    named = {page.name: flags_in(page.read_text(encoding="utf-8")) - known for page in pages}
+    assert {name: flags for name, flags in named.items() if flags} == {}
+    assert flags_in("`--not-there` and a--b") == {"--not-there"}
+
+
 def test_tutorials_are_in_the_manual_and_stripped(repository: Path) -> None:
     index = (repository / "docs" / "index.md").read_text(encoding="utf-8")
     notebooks = sorted((repository / "notebooks").glob("*.ipynb"))

@@ -11,6 +11,7 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+_HEAD = ("| | |", "|---|---|")
 # Verbs that measure the others come last.
 _MEASURING = ("bench", "stress", "reproduce")
 
@@ -52,6 +53,19 @@ def _plain(text: str) -> str:
     return " ".join(text.replace("\\[", "[").split())
 
 
+def file_rows(words: list[str]) -> list[tuple[str, str]]:
+    """Return (table and key, what it says) of each option of a verb that the command line has no flag for."""
+    from surrogate.verbs.options import VERB_OPTIONS, verb_option_rows
+
+    rows = verb_option_rows(words[0]) if words[0] in VERB_OPTIONS else []
+    found = []
+    for row in (row for row in rows if not row.flag):
+        choices = f" One of {', '.join(row.choices)}." if row.choices else ""
+        default = f" [default: {row.default}]" if row.default else ""
+        found.append((f"[{row.section}] {row.key}" if row.section else row.key, f"{row.help}{choices}{default}"))
+    return found
+
+
 def command_markdown(words: list[str]) -> str:
     """Return a verb's section in MyST: what it does, how it is called, and its table."""
     command = find_command(words)
@@ -60,7 +74,10 @@ def command_markdown(words: list[str]) -> str:
     usage = usage.replace("{", "").replace("}", "")
     said = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
     table = [f"| `{_cell(written)}` | {_text(text)} |" for written, text in command_rows(command)]
-    return "\n".join([said, "", "```text", usage, "```", "", "| | |", "|---|---|", *table])
+    further = [f"| `{_cell(written)}` | {_text(text)} |" for written, text in file_rows(words)]
+    if further:
+        further = ["", "In `--config` files, and as keywords in Python:", "", *_HEAD, *further]
+    return "\n".join([said, "", "```text", usage, "```", "", *_HEAD, *table, *further])
 
 
 def _cell(text: str) -> str:
