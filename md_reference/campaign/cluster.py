@@ -29,6 +29,8 @@ _CLASSES = {
     "local": "LocalCluster",
 }
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
+# Dask listens for browsers in any case: where nobody does, and at no port that another asks for.
+_NO_PAGE = "127.0.0.1:0"
 _NO_PAGES = {"DASK_DISTRIBUTED__WORKER__HTTP__ROUTES": "[]"}
 # So long a scheduler may take to answer.
 _ANSWER_S = 20.0
@@ -106,6 +108,7 @@ def _local(workers: int) -> Any:
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": _NO_PAGE},
         memory_limit=0,
         silence_logs=logging.CRITICAL,
         env=_ONE_THREAD,
@@ -149,7 +152,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
         python, prologue = " ".join(["env", *one_thread, spec.python or sys.executable]), []
     logs = (folder / JOB_LOGS).resolve()
     logs.mkdir(parents=True, exist_ok=True)
-    scheduler: dict[str, Any] = {"dashboard": bool(spec.dashboard), "dashboard_address": spec.dashboard or None}
+    scheduler: dict[str, Any] = {"dashboard": bool(spec.dashboard), "dashboard_address": spec.dashboard or _NO_PAGE}
     if not spec.interface:
         scheduler["host"] = "127.0.0.1" if spec.kind == "local" else get_ip()
     arguments: dict[str, Any] = {

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import ssl
 import sys
 import urllib.error
 import urllib.request
+import warnings
 from pathlib import Path
 
 import pytest
@@ -118,6 +120,18 @@ def test_a_scheduler_lets_nobody_in_who_has_not_its_certificate() -> None:
         for page in ("status", "info/main/workers.html", "json/counts.json"):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=30)
+
+
+def test_a_busy_port_of_dask_s_pages_is_no_matter(tmp_path: Path) -> None:
+    with socket.socket() as busy, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with contextlib.suppress(OSError):  # another's, just as well
+            busy.bind(("127.0.0.1", 8787))
+            busy.listen()
+        with open_client(workers=1) as client:
+            assert client.submit(lambda: 6 * 7).result(timeout=60) == 42
+        with job_cluster(ClusterSpec(kind="local"), tmp_path) as cluster:
+            assert cluster.scheduler_address.startswith("tls://127.0.0.1:")
 
 
 def test_jobs_talk_by_tls_and_show_nothing(tmp_path: Path) -> None:
