@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 _TEXT_BYTES = 512_000_000
 # HDF5's columns that are read whole: more than this, and more than so many times the file, is not believed.
 _COLUMN_BYTES, _PACKED = 64_000_000, 100
-# What zipfile and NumPy raise on files that are damaged, or made to harm.
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-              OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
+# What zipfile, NumPy and h5py raise on files that are damaged, or made to harm.
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, SystemError,
+              MemoryError, OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 # Atoms have some dozen neighbours; this many times as many stand in each other.
 _PAIRS_PER_ATOM = 500
 

@@ -18,7 +18,7 @@ from surrogate.sampling.rollout_account import Tally
 from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
 from systems.errors import SurromdError
 from systems.scene import Scene
-from systems.trajectory.checkpoint import CheckpointFile, read_checkpoints
+from systems.trajectory.checkpoint import CheckpointFile, new_header, read_checkpoints
 from systems.trajectory.codec import open_trajectory, open_writer
 from time_limits import time_limit
 
@@ -125,7 +125,7 @@ def make_checkpoint(path: Path) -> None:
     progress = Progress(last, velocities,
                         chunks=9, steps=63, wall_s=1.5, seconds={"draw": 1.0}, tallies=[tally, Tally()])  # fmt: skip
     plain, arrays = packed_progress(progress)
-    CheckpointFile(path, None).write({"settings": SETTINGS, "files": [], "progress": plain}, arrays)
+    CheckpointFile(path, None).write(new_header(0, overwrite=False) | {"settings": SETTINGS, "progress": plain}, arrays)
 
 
 def read_progress(path: Path) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
         make_checkpoint(folder / "a.h5.checkpoint")
         return folder / "a.h5.checkpoint", read_progress
     if kind == "reference checkpoint":
-        CheckpointFile(folder / "b.h5.checkpoint", None).write({"config": {"seed": 1}, "files": []}, b"state" * 300)
+        CheckpointFile(folder / "b.h5.checkpoint", None).write(new_header(0, overwrite=False), b"state" * 300)
         return folder / "b.h5.checkpoint", read_checkpoints
     if kind == "simulation checkpoint":
         simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
