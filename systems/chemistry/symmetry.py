@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from systems.chemistry.geometry import signed_volumes, torsion
 from systems.elements import ATOMIC_NUMBERS
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
 
 _LARGEST_RING = 12
 _CC_DOUBLE_NM = 0.141
@@ -64,26 +64,27 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
         return AtomClasses(tuple(colours), (), ())
     flip = -1 if mirrored else 1
     cycles = _lone_cycles(rings)
-    double = _double_bonds(scene, neighbours, rings)
+    double = {pair for pair in _double_bonds(scene) if pair not in rings}
+    x = scene.positions_nm
     centres: dict[int, tuple[int, int, int, int]] = {}
     signs: dict[int, int] = {}
     done: set[tuple[int, int]] = set()
     while True:
         marks: dict[int, list[object]] = {}
-        fresh = _fresh_centres(scene, neighbours, colours, set(centres))
+        fresh = _fresh_centres(scene.elements, neighbours, colours, set(centres))
         for row in fresh:
             centres[row[0]] = row
-            signs[row[0]] = flip * _sign(scene, row)
+            signs[row[0]] = flip * _sign(x, row)
             marks[row[0]] = [signs[row[0]]]
         settled = len(done)
         for i, j in double - done:
-            mark = _cis_trans(scene, neighbours, colours, i, j)
+            mark = _cis_trans(x, neighbours, colours, i, j)
             if mark:
                 done.add((i, j))
                 marks.setdefault(i, []).append(mark)
                 marks.setdefault(j, []).append(mark)
         for cycle in cycles:
-            for atom, relation in _ring_relations(scene, neighbours, colours, cycle, set(centres)).items():
+            for atom, relation in _ring_relations(x, neighbours, colours, cycle, set(centres)).items():
                 marks.setdefault(atom, []).append(relation)
         if not marks:
             break
@@ -132,54 +133,49 @@ def local_handedness(scene: Scene) -> dict[int, int]:
         ranked = sorted(((rank(j, centre), j) for j in graph[centre]), reverse=True)
         alike = any(a == b for (a, _), (b, _) in pairwise(ranked))
         top = [j for _, j in ranked[:3]]
-        found[centre] = 0 if alike else _sign(scene, (centre, top[0], top[1], top[2]))
+        found[centre] = 0 if alike else _sign(scene.positions_nm, (centre, top[0], top[1], top[2]))
     return found
 
 
-def _sign(scene: Scene, row: tuple[int, int, int, int]) -> int:
-    return 1 if float(signed_volumes(scene.positions_nm, [row])[0]) > 0 else -1
+def _sign(positions_nm: FloatArray, row: tuple[int, int, int, int]) -> int:
+    return 1 if float(signed_volumes(positions_nm, [row])[0]) > 0 else -1
 
 
 def _fresh_centres(
-    scene: Scene, neighbours: list[list[int]], colours: list[int], known: set[int]
+    elements: Sequence[str], neighbours: list[list[int]], colours: list[int], known: set[int]
 ) -> list[tuple[int, int, int, int]]:
     rows = []
-    for i, symbol in enumerate(scene.elements):
+    for i, symbol in enumerate(elements):
         near = neighbours[i]
         tetrahedral = len(near) == 4 and symbol != "H"
         pyramidal = len(near) == 3 and symbol in ("S", "P", "Se", "As")
         if i in known or not (tetrahedral or pyramidal):
             continue
-        if symbol == "N" and any(scene.elements[j] == "H" for j in near):
+        if symbol == "N" and any(elements[j] == "H" for j in near):
             continue  # inverts by losing and taking up its proton
         if len({colours[j] for j in near}) == len(near):
-            a, b, c = sorted(near, key=lambda j: (scene.elements[j] == "H", -colours[j]))[:3]
+            a, b, c = sorted(near, key=lambda j: (elements[j] == "H", -colours[j]))[:3]
             rows.append((i, a, b, c))
     return rows
 
 
-def _double_bonds(scene: Scene, neighbours: list[list[int]], rings: dict[tuple[int, int], int]) -> set[tuple[int, int]]:
-    """C=C bonds outside small rings, by their order or, where this is unknown, by their length."""
-    found = set()
-    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
-        if scene.elements[i] != "C" or scene.elements[j] != "C" or (min(i, j), max(i, j)) in rings:
-            continue
-        if len(neighbours[i]) != 3 or len(neighbours[j]) != 3:
-            continue
-        length = float(np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j]))
-        if order == 2 or (order == 0 and length < _CC_DOUBLE_NM):
-            found.add((i, j))
-    return found
+def _double_bonds(scene: Scene) -> set[tuple[int, int]]:
+    """C=C bonds between atoms of three bonds, by their order or, where this is unknown, by their length."""
+    length = np.linalg.norm(np.diff(scene.positions_nm[scene.bonds], axis=1)[:, 0], axis=1)
+    degree = np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)
+    carbon = np.array([e == "C" for e in scene.elements]) & (degree == 3)
+    double = (scene.bond_orders == 2) | ((scene.bond_orders == 0) & (length < _CC_DOUBLE_NM))
+    return {(min(i, j), max(i, j)) for i, j in scene.bonds[double & carbon[scene.bonds].all(axis=1)].tolist()}
 
 
-def _cis_trans(scene: Scene, neighbours: list[list[int]], colours: list[int], i: int, j: int) -> str:
+def _cis_trans(positions_nm: FloatArray, neighbours: list[list[int]], colours: list[int], i: int, j: int) -> str:
     ends = []
     for atom, other in ((i, j), (j, i)):
         a, b = (k for k in neighbours[atom] if k != other)
         if colours[a] == colours[b]:
             return ""
         ends.append(a if colours[a] > colours[b] else b)
-    angle = float(torsion(scene.positions_nm, [[ends[0], i, j, ends[1]]])[0])
+    angle = float(torsion(positions_nm, [[ends[0], i, j, ends[1]]])[0])
     return "cis" if abs(angle) < np.pi / 2 else "trans"
 
 
@@ -211,7 +207,7 @@ def _lone_cycles(rings: dict[tuple[int, int], int]) -> list[list[int]]:
 
 
 def _ring_relations(
-    scene: Scene, neighbours: list[list[int]], colours: list[int], cycle: list[int], known: set[int]
+    positions_nm: FloatArray, neighbours: list[list[int]], colours: list[int], cycle: list[int], known: set[int]
 ) -> dict[int, list[tuple[int, int, int]]]:
     """Cis and trans on rings whose two directions are alike (1,4-dimethylcyclohexane), which hold no stereocentre.
 
@@ -225,7 +221,7 @@ def _ring_relations(
         if atom in known or len(others) != 2 or colours[before] != colours[after]:
             continue
         if colours[others[0]] != colours[others[1]]:
-            signs[k] = _sign(scene, (atom, before, after, max(others, key=lambda j: colours[j])))
+            signs[k] = _sign(positions_nm, (atom, before, after, max(others, key=lambda j: colours[j])))
     relations: dict[int, list[tuple[int, int, int]]] = {}
     for k, sign in signs.items():
         pairs = [

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from systems.chemistry.cell_shape import lengths_and_angles
 from systems.chemistry.cell_shape import read_cells as cells_of
 from systems.errors import InputError
-from systems.scene import Scene
 from systems.trajectory.frame_block import FrameBlock
 from systems.trajectory.frame_store import EDGES, add_column
 
@@ -37,18 +36,18 @@ def check_wanted(wanted: Sequence[str], path: Path) -> None:
             raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
 
 
-def lay_out_extras(file: h5py.File, scene: Scene, wanted: Sequence[str], chunk: int) -> None:
-    """Add empty columns for what is `wanted`, and for the cell of a periodic scene; positions must be there already."""
-    particles, position = file["particles/trajectory"], file[_POSITION]
+def lay_out_extras(file: h5py.File, wanted: Sequence[str], *, periodic: bool) -> None:
+    """Add empty columns for what is `wanted`, and for the cell; positions must be there already."""
+    particles, position, coordinates = file["particles/trajectory"], file[_POSITION], file["coordinates"]
     for name in (n for n in PER_ATOM if n in wanted):
         h5md_name, units, unit = _LAYOUT[name]
-        column = add_column(file, name, 0, "<f4", tail=(scene.n_atoms, 3), chunk=chunk)
+        column = add_column(file, name, 0, "<f4", tail=coordinates.shape[1:], chunk=coordinates.chunks[0])
         column.attrs["units"], column.attrs["unit"] = np.bytes_(units), unit
         group = particles.create_group(h5md_name)
         group["value"], group["time"], group["step"] = column, position["time"], position["step"]
     box = particles["box"]
-    box.attrs["boundary"] = np.array([b"none" if scene.cell_nm is None else b"periodic"] * 3, dtype="S8")
-    if scene.cell_nm is None:
+    box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
+    if not periodic:
         return
     for name, units, unit in (("cell_lengths", b"nanometers", "nm"), ("cell_angles", b"degrees", "deg")):
         column = add_column(file, name, 0, "<f4", tail=(3,))
@@ -58,10 +57,12 @@ def lay_out_extras(file: h5py.File, scene: Scene, wanted: Sequence[str], chunk: 
     box["edges/time"], box["edges/step"] = position["time"], position["step"]
 
 
-def extra_values(file: h5py.File, scene: Scene, block: FrameBlock, where: str) -> dict[str, npt.NDArray[Any]]:
+def extra_values(
+    file: h5py.File, block: FrameBlock, cell_nm: npt.ArrayLike | None, where: str
+) -> dict[str, npt.NDArray[Any]]:
     """Return the values of a block by dataset name.
 
-    A periodic scene whose frames come without a cell keeps its own. Raises InputError when velocities or forces are
+    `cell_nm` (3, 3): the cell of frames that come without one. Raises InputError when velocities or forces are
     given for some frames of a file and not for others.
     """
     values: dict[str, npt.NDArray[Any]] = {}
@@ -74,11 +75,11 @@ def extra_values(file: h5py.File, scene: Scene, block: FrameBlock, where: str) -
     if EDGES in file:
         cell = block.cell_nm
         if cell is None:
-            cell = np.broadcast_to(np.asarray(scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
+            cell = np.broadcast_to(np.asarray(cell_nm, dtype=np.float64), (len(block), 3, 3))
         values["cell_lengths"], values["cell_angles"] = lengths_and_angles(cell)
         values[EDGES] = np.asarray(cell)
     elif block.cell_nm is not None:
-        raise InputError(f"{where}: {scene.name!r} has no periodic cell, but frames came with one.")
+        raise InputError(f"{where}: this file has no periodic cell, but frames came with one.")
     return values
 
 

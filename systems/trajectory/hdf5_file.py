@@ -101,7 +101,7 @@ class Hdf5Writer(TrajectoryWriter):
             step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
         else:
             step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
-        extra = extra_values(self._store.file, self.scene, block, f"{self.path}, after frame {self.n_frames}")
+        extra = extra_values(self._store.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
         stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
         if EDGES in extra:
             stored[CELLS] = extra[EDGES]
@@ -275,7 +275,7 @@ def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:
     position = particles.create_group("position")
     position["value"], position["time"] = coordinates, time
     add_column(file, f"{_POSITION}/step", 0, "<i8")
-    lay_out_extras(file, scene, columns, chunk)
+    lay_out_extras(file, columns, periodic=scene.cell_nm is not None)
     particles["species"] = np.array([ATOMIC_NUMBERS.get(e, 0) for e in scene.elements], dtype=np.int32)
     particles["mass"] = scene.masses_da
     particles["mass"].attrs["unit"] = "u"

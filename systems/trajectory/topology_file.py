@@ -2,7 +2,7 @@
 
 A trajectory is not read by it, so it may be missing (files of earlier versions, copies); a file of another program is
 never replaced. The text is written here: every bond and the scene's own atom order must stand in it, while OpenMM's
-PDBFile writes no CONECT records inside standard residues and renumbers chains, and MDTraj's writer cuts names.
+PDBFile writes CONECT records of non-standard residues alone (12 of alanine dipeptide's 21 bonds).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TRAJECTORIES = (".h5", ".hdf5", ".dcd")
 
 
 def pdb_text(scene: Scene) -> str:
-    """Return PDB text in the scene's atom order, with CONECT records for all bonds.
+    """Return PDB text (ASCII) in the scene's atom order, with CONECT records for all bonds.
 
     A scene too far from the origin for the columns is centred. Raises InputError above 99,999 atoms (the format's
     limit).
@@ -56,7 +56,7 @@ def pdb_text(scene: Scene) -> str:
             row = "".join(f"{j + 1:5d}" for j in sorted(neighbours[i])[start : start + 4])
             lines.append(f"CONECT{i + 1:5d}{row}")
     lines.append("END")
-    return "\n".join(lines) + "\n"
+    return ("\n".join(lines) + "\n").encode("ascii", "replace").decode()
 
 
 def topology_path(trajectory: Path) -> Path:
@@ -87,7 +87,7 @@ def refuse_other_topology(trajectory: Path, scene: Scene, *, overwrite: bool) ->
     another trajectory of that name, or without `overwrite`."""
     refuse_foreign_topology(trajectory)
     pdb = topology_path(trajectory)
-    if not pdb.exists() or scene.n_atoms > MOST_ATOMS or _atoms(pdb.read_bytes()) == _atoms(_bytes(scene)):
+    if not pdb.exists() or scene.n_atoms > MOST_ATOMS or _atoms(pdb.read_bytes()) == _atoms(pdb_text(scene).encode()):
         return
     others = [trajectory.with_suffix(s) for s in _TRAJECTORIES if s != trajectory.suffix.lower()]
     beside = next((other for other in others if other.exists()), None)
@@ -102,12 +102,8 @@ def write_topology(trajectory: Path, scene: Scene) -> Path:
     StorageError."""
     pdb = topology_path(trajectory)
     if scene.n_atoms <= MOST_ATOMS:
-        create_whole(pdb, _bytes(scene))
+        create_whole(pdb, pdb_text(scene).encode())
     return pdb
-
-
-def _bytes(scene: Scene) -> bytes:
-    return pdb_text(scene).encode("ascii", "replace")
 
 
 def _atoms(pdb: bytes) -> list[bytes]:

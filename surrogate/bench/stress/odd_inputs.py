@@ -91,7 +91,7 @@ def _through_pdb(scene: Scene) -> Scene:
     """Return what our own PDB file of a scene is read as."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.pdb"
-        path.write_text(pdb_text(scene), encoding="ascii", errors="replace")
+        path.write_text(pdb_text(scene))
         return prepare(str(path))
 
 
