@@ -51,7 +51,7 @@ def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Compari
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise InputError(f"{folder} is a file; name a folder with --out.") from None
+        raise InputError(f"{folder} is a file; name a folder with `out`.") from None
     name = "alanine-dipeptide"
     weights_path(name)  # missing weights are noticed before anything is simulated
     try:

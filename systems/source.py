@@ -39,9 +39,9 @@ def prepare(
     if not 0.0 <= ph <= 14.0:
         raise InputError(f"pH {ph:g} lies outside 0 to 14.")
     if keep_ligand and drop_ligand:
-        raise InputError("--keep-ligand and --drop-ligand exclude each other; choose one.")
+        raise InputError("`keep_ligand` and `drop_ligand` exclude each other; choose one.")
     if keep_water and drop_water:
-        raise InputError("--keep-water and --drop-water exclude each other; choose one.")
+        raise InputError("`keep_water` and `drop_water` exclude each other; choose one.")
     text = str(spec).strip()
     kind, _, rest = text.partition(":")
     if kind.lower() == "sequence":

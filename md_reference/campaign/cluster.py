@@ -80,7 +80,7 @@ def open_client(
 
 def _refuse_both(workers: int | None, scheduler: str | None) -> None:
     if workers is not None and scheduler is not None:
-        raise InputError("--workers starts workers here, --scheduler uses those that are there; give one of them.")
+        raise InputError("`workers` starts workers here, `scheduler` uses those that are there; give one of them.")
 
 
 @contextmanager

@@ -58,7 +58,7 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
     def refuse(key: str, was: Any, now: Any) -> InputError:
         return InputError(
             f"{folder} belongs to another campaign: there {key} is {was!r}, in this file {now!r}; restore it, or "
-            "name another folder (out = ..., or --out)."
+            "name another folder (out = ..., or `out`)."
         )
 
     if old.seed != new.seed:

@@ -77,9 +77,9 @@ def open_campaign(campaign: Campaign) -> Manifest:
     if (folder / MANIFEST_NAME).is_file():
         manifest = check_same_campaign(read_manifest(folder), manifest, folder)
     elif folder.is_file():
-        raise InputError(f"{folder} is a file; name another folder (out = ..., or --out).")
+        raise InputError(f"{folder} is a file; name another folder (out = ..., or `out`).")
     elif folder.is_dir() and any(not path.name.startswith(".") and path.name != JOB_LOGS for path in folder.iterdir()):
-        raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or --out).")
+        raise InputError(f"{folder} is not empty and no campaign's folder; name another (out = ..., or `out`).")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "campaign.toml").write_text(campaign.text, encoding="utf-8")

@@ -35,7 +35,7 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
             raise PreparationError(
                 f"scene {scene.name!r} has no law of its own; give a force field instead of 'model'."
             )
-        raise PreparationError(f"scene {scene.name!r} brings its own law; leave --force-field out.")
+        raise PreparationError(f"scene {scene.name!r} brings its own law; leave `force_field` out.")
     if name == "auto":
         name = MODEL if scene.interactions is not None else _choose(scene)
     solvent = spec.solvent
@@ -94,7 +94,7 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
         )
     if not spec.is_explicit and scene.cell_nm is not None:
         raise PreparationError(
-            f"scene {scene.name!r} has a periodic cell, which {spec.solvent} does not; give --solvent tip3p or opc."
+            f"scene {scene.name!r} has a periodic cell, which {spec.solvent} does not; give `solvent='tip3p'` or opc."
         )
     if scene.cell_nm is not None:
         far_nm, _ = cutoff_nm(spec.protein)
@@ -103,7 +103,7 @@ def _check_cell(scene: Scene, spec: ForceFieldSpec) -> None:
         if smallest < 2 * far_nm:
             raise PreparationError(
                 f"the cell of scene {scene.name!r} is {smallest:.2f} nm wide, less than twice the cut-off of "
-                f"{far_nm:g} nm; use a larger --padding."
+                f"{far_nm:g} nm; use a larger `padding_nm`."
             )
 
 
@@ -132,7 +132,7 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         elif spec.protein != "ff14SB":
             raise PreparationError(
                 f"{spec.protein} has no parameters for {', '.join(chain.lacking[:4])} of scene {scene.name!r}; such "
-                "residues are joined to ff14SB alone: use --force-field ff14SB+gaff2."
+                "residues are joined to ff14SB alone: use `force_field='ff14SB+gaff2'`."
             )
         build = _build_molecule if chain is None else build_chain
         parts.append((atoms, build(part, spec)))

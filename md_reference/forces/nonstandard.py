@@ -143,5 +143,5 @@ def _refuse_loose_atoms(scene: Scene, system: Any) -> None:
         ]
         raise PreparationError(
             f"scene {scene.name!r}: no parameters for {len(loose)} bonds or angles ({'; '.join(names)}); "
-            "use --level gfn2-xtb, or a structure without that residue."
+            "use `level='gfn2-xtb'`, or a structure without that residue."
         )

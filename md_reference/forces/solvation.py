@@ -46,9 +46,9 @@ def solvate(
     Raises PreparationError for a scene that has a cell, another solvent, or values that make no cell.
     """
     if not spec.is_explicit:
-        raise PreparationError(f"solvent {spec.solvent!r} has no molecules to add; give --solvent tip3p or opc.")
+        raise PreparationError(f"solvent {spec.solvent!r} has no molecules to add; give `solvent='tip3p'` or opc.")
     if scene.cell_nm is not None:
-        raise PreparationError(f"scene {scene.name!r} has a periodic cell already; leave --padding out.")
+        raise PreparationError(f"scene {scene.name!r} has a periodic cell already; leave `padding_nm` out.")
     if not 0.3 <= padding_nm <= 10.0:
         raise PreparationError(f"padding of {padding_nm:g} nm: give between 0.3 and 10 nm.")
     if not 0.0 <= ionic_strength_molar <= 5.0:
@@ -82,7 +82,7 @@ def solvate(
 def require_molecules(spec: ForceFieldSpec) -> None:
     """Raise InputError where waters of a file are to be kept in a solvent that is none of molecules."""
     if not spec.is_explicit:
-        raise InputError("--keep-water needs a solvent of molecules; give --solvent tip3p or opc, or leave it out.")
+        raise InputError("`keep_water` needs a solvent of molecules; give `solvent='tip3p'` or opc, or leave it out.")
 
 
 def solvate_if_asked(
@@ -99,14 +99,14 @@ def solvate_if_asked(
     """
     given = [
         option
-        for option, value in (("--padding", padding_nm), ("--ionic-strength", ionic_strength_molar))
+        for option, value in (("`padding_nm`", padding_nm), ("`ionic_strength_molar`", ionic_strength_molar))
         if value is not None
     ]
     if spec.is_explicit and scene.cell_nm is None:
         return solvate(scene, spec, 1.0 if padding_nm is None else padding_nm, ionic_strength_molar or 0.0, seed=seed)
     if given and not spec.is_explicit:
         raise InputError(
-            f"nothing would use {' and '.join(given)} without water around the scene; give --solvent tip3p or opc."
+            f"nothing would use {' and '.join(given)} without water around the scene; give `solvent='tip3p'` or opc."
         )
     if given:
         raise InputError(f"scene {scene.name!r} has a periodic cell already; leave {' and '.join(given)} out.")
@@ -186,7 +186,9 @@ def _ion_sites(
 ) -> npt.NDArray[np.int64]:
     """Return which waters become ions, `(n,)`: apart from the solute and from each other while there is room."""
     if n > len(oxygens) // 4:
-        raise PreparationError(f"{n} ions in {len(oxygens)} waters; use more padding or a lower --ionic-strength.")
+        raise PreparationError(
+            f"{n} ions in {len(oxygens)} waters; use more padding or a lower `ionic_strength_molar`."
+        )
     order = rng.permutation(len(oxygens))
     gap = np.array([np.linalg.norm(_nearest(solute - x, cell), axis=1).min() for x in oxygens])
     chosen: list[int] = []

@@ -49,11 +49,11 @@ class ForceFieldSpec:
                 + nearest(self.solvent, list(SOLVENTS))
             )
         if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
-            raise PreparationError("solvent 'amber99-obc' goes with --force-field ff99SB-ILDN; use obc2 otherwise.")
+            raise PreparationError("solvent 'amber99-obc' goes with `force_field='ff99SB-ILDN'`; use obc2 otherwise.")
         if self.force_field in (QUANTUM, MODEL) and self.solvent not in ("vacuum", "auto"):
-            raise PreparationError(f"{self.force_field} has no solvent; leave --solvent out or give vacuum.")
+            raise PreparationError(f"{self.force_field} has no solvent; leave `solvent` out or give vacuum.")
         if self.force_field == "charmm36" and self.solvent == "opc":
-            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use --solvent tip3p.")
+            raise PreparationError("charmm36 has no parameters for OPC water and its ions; use `solvent='tip3p'`.")
 
     @staticmethod
     def of(record: Mapping[str, Any]) -> ForceFieldSpec:
@@ -92,7 +92,7 @@ class ForceFieldSpec:
         if self.is_born and name == "charmm36":
             found.append(f"charmm36 was not made for {self.solvent}, whose radii are Amber's. Use ff14SB, or tip3p.")
         if self.solvent == "tip3p" and name == "ff19SB":
-            found.append("ff19SB is tuned for OPC water; use --solvent opc.")
+            found.append("ff19SB is tuned for OPC water; use `solvent='opc'`.")
         return tuple(found)
 
 
@@ -106,5 +106,5 @@ def at_level(level: str | None, force_field: str | None) -> str | None:
     if level not in ("mm", QUANTUM):
         raise UnknownNameError(f"unknown level {level!r}; known: mm, {QUANTUM}." + nearest(level, ["mm", QUANTUM]))
     if (level == QUANTUM) != (force_field == QUANTUM) and force_field not in (None, "auto"):
-        raise InputError(f"--level {level} contradicts --force-field {force_field}; give one of them.")
+        raise InputError(f"`level='{level}'` contradicts `force_field='{force_field}'`; give one of them.")
     return QUANTUM if level == QUANTUM else force_field

@@ -45,7 +45,7 @@ def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = Tru
     except Unmatched as error:
         raise PreparationError(
             f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, hydrogens as they are; "
-            "leave --force-field out, or give --force-field ff14SB+gaff2, for residues that it lacks."
+            "leave `force_field` out, or give `force_field='ff14SB+gaff2'`, for residues that it lacks."
         ) from error
 
 

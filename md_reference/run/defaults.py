@@ -61,7 +61,7 @@ def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = N
         if given.get("timestep_ps", 0.0) > LONGEST_FLEXIBLE_STEP_PS:
             raise InputError(
                 f"{QUANTUM} leaves bonds to hydrogen free, for which {format_time_ps(given['timestep_ps'])} is too "
-                "long; use --timestep 1fs or less."
+                "long; use `timestep_ps='1fs'` or less."
             )
         own |= QUANTUM_DEFAULTS
         decisive.pop("equilibrate_ps", None)
@@ -81,7 +81,7 @@ def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[st
     if protocol is None:
         return own, ("by the system's own settings", named_scenes.source_of_settings(name) if own else "")
     if own:
-        raise InputError(f"{name} brings its own law and its own settings; leave --protocol out.")
+        raise InputError(f"{name} brings its own law and its own settings; leave `protocol` out.")
     found = find_protocol(protocol)
     return dict(found.settings), (f"by protocol {found.name}", found.source)
 

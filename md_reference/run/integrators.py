@@ -24,7 +24,7 @@ def check_ensemble(name: str, scene: Scene) -> str:
     if ensemble == "npt" and scene.cell_nm is None:
         raise InputError(
             f"ensemble npt needs a volume, and scene {scene.name!r} has no periodic cell; use nvt, or give an explicit "
-            "--solvent."
+            "`solvent`."
         )
     return ensemble
 

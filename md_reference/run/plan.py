@@ -265,7 +265,7 @@ def _skips(
     else:
         skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
     if not config.save_velocities:
-        skips.append(Skip("velocities on disk", "nobody asked for them (--save-velocities)", "half of the file"))
+        skips.append(Skip("velocities on disk", "nobody asked for them (`save_velocities=True`)", "half of the file"))
     skips.append(Skip("energies and copies between saved frames", "nobody keeps them"))
     if spec.solvent == "vacuum":
         skips.append(Skip("generalised Born term", "the solvent is vacuum"))
@@ -299,7 +299,7 @@ def _warnings(scene: Scene, spec: ForceFieldSpec, timestep_ps: float) -> tuple[s
     natural = spec.hydrogen_mass_da is None or spec.hydrogen_mass_da < 1.5
     if timestep_ps > _LONGEST_NATURAL_STEP_PS and natural and "H" in scene.elements:
         found.append(
-            f"{timestep_ps * 1000:g} fs is long for hydrogens of natural mass; use --hydrogen-mass 3Da or 2fs."
+            f"{timestep_ps * 1000:g} fs is long for hydrogens of natural mass; use `hydrogen_mass_da='3Da'` or 2fs."
         )
     if timestep_ps > 0.001 and not spec.constrain_hydrogens and "H" in scene.elements:
         found.append(f"{timestep_ps * 1000:g} fs is long for unconstrained bonds to hydrogen; use at most 1fs.")

@@ -115,7 +115,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     lines = [", ".join(parts)]
     off = _off_target(temperature)
     if off:
-        lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter --timestep.")
+        lines.append(f"warning: the mean temperature is {off:+.1f} K off the bath's; try a shorter `timestep_ps`.")
     return lines
 
 

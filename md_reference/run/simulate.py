@@ -347,7 +347,7 @@ class _Run:
 
 
 def _advice(config: MDConfig) -> str:
-    return f"Try a shorter --timestep (now {config.timestep_ps * 1000:g} fs)."
+    return f"Try a shorter `timestep_ps` (now {config.timestep_ps * 1000:g} fs)."
 
 
 def _already_complete(out: Path, config: MDConfig) -> Path:
@@ -359,5 +359,5 @@ def _already_complete(out: Path, config: MDConfig) -> Path:
         return out
     raise InputError(
         f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
-        "--overwrite, or keep it under another name."
+        "`overwrite`, or keep it under another name."
     )

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from surrogate import __version__
 from surrogate.cli.bench_verbs import bench, stress
+from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import (
     JsonOpt,
     OutOpt,
@@ -33,6 +34,7 @@ from surrogate.verbs.options import (
     TrainOptions,
     WindowsOptions,
 )
+from surrogate.verbs.telling import said
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
@@ -43,6 +45,7 @@ class _Group(TyperGroup):
     """Turns whatever a verb raises into one line on stderr and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
+        said.set(as_flags)
         if os.environ.get("SURROMD_DEBUG") == "1":
             return super().invoke(ctx)
         try:
@@ -72,7 +75,7 @@ def _usage_errors() -> tuple[type[BaseException], ...]:
 
 
 def _fail(message: str, code: int) -> None:
-    typer.echo(printable(" ".join(message.split())), err=True)
+    typer.echo(printable(as_flags(" ".join(message.split()))), err=True)
     raise typer.Exit(code) from None
 
 
@@ -189,7 +192,7 @@ def campaign(
         typer.echo(f"{result['file']}: {result['summary']}")
     if result.get("failed"):
         for name, reason in result["failed"].items():
-            typer.echo(f"failed: {name}: {reason}", err=True)
+            typer.echo(as_flags(f"failed: {name}: {reason}"), err=True)
         raise typer.Exit(1)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from surrogate.cli.flags import as_flags
 from systems.files.outside import printable
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 def _say(text: str) -> None:
     """Print text of files, in which nothing steers the terminal."""
-    typer.echo(printable(text))
+    typer.echo(printable(as_flags(text)))
 
 
 def print_json(value: Any) -> None:

@@ -306,12 +306,12 @@ def _velocities(reader: TrajectoryReader, start: int, n_frames: int) -> npt.NDAr
     found = reader.read_velocities(start, start + n_frames)
     if found is None:
         raise InputError(
-            f"{reader.path} carries no velocities; make the reference with --save-velocities, or train lam-slide."
+            f"{reader.path} carries no velocities; make the reference with `save_velocities=True`, or train lam-slide."
         )
     if reader.record.get("hydrogen_mass_da") is not None:
         raise InputError(
             f"{reader.path} was made with hydrogens of {reader.record['hydrogen_mass_da']:g} Da, so its velocities are "
-            "not the molecule's; make the reference with --hydrogen-mass natural."
+            "not the molecule's; make the reference with `hydrogen_mass_da='natural'`."
         )
     if not np.isfinite(found).all():
         raise InputError(f"{reader.path} holds velocities that are not finite; it cannot be trained on.")

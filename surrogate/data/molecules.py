@@ -83,7 +83,7 @@ def _read(paths: list[Path], held: list[Path], spool: Path | None) -> TrainingFr
     if is_windows(paths[0]):
         frames = load_frames(paths[0])
         if not frames.canonical:
-            raise InputError(f"{paths[0]} holds frames in their own pose; make it without --velocities.")
+            raise InputError(f"{paths[0]} holds frames in their own pose; make it without `velocities=True`.")
         return frames
     return collect_frames(paths, held=held, spool=spool)
 

@@ -66,14 +66,14 @@ class References:
             frames.refuse_leaks()
             return frames
         if self.held:
-            raise InputError("--validation needs trajectories to train on; a windows file keeps its own split.")
+            raise InputError("`validation` needs trajectories to train on; a windows file keeps its own split.")
         if len(self.paths) > 1:
             raise InputError("give either trajectories or one windows file to train on.")
         frames = load_frames(self.paths[0])
         if velocities and frames.velocities is None:
             raise InputError(
                 f"{self.paths[0]} holds no velocities, which this architecture learns from; make it with "
-                "`surromd windows --velocities`."
+                "`velocities=True` of `windows`."
             )
         frames.refuse_leaks()
         return frames

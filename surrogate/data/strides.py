@@ -43,7 +43,7 @@ class StrideSampler:
                     break
                 raise InputError(
                     f"{frames.scene.name}: no window of {length} frames {stride * frames.lag_ps:g} ps apart fits; give "
-                    "longer trajectories, a shorter --longest-lag or shorter chunks."
+                    "longer trajectories, a shorter `longest_lag_ps` or shorter chunks."
                 ) from error
         return StrideSampler(tuple(s for s, _ in found), tuple(starts for _, starts in found))
 

@@ -55,7 +55,7 @@ def never(survey: Survey) -> None:
 
 @dataclass(frozen=True)
 class Architecture:
-    """One kind of surrogate, under the name that weights files and `--arch` have for it.
+    """One kind of surrogate, under the name that weights files and `arch` have for it.
 
     `config` builds a configuration from a record (InputError for unknown keys), `model` the network from that.
     `trainer` imports the training code and returns its `surrogate.training.trainer.Trainer`: rollouts do not call it.

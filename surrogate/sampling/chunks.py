@@ -55,11 +55,11 @@ class ChunkSampler:
         if solver is not None and solver not in known:
             raise InputError(
                 f"the solver {solver!r} does not suit {weights.path.name}; "
-                + (f"choose {' or '.join(known)}." if known else "its model has no solver; leave --solver out.")
+                + (f"choose {' or '.join(known)}." if known else "its model has no solver; leave `solver` out.")
             )
         if stiff == "imposed" and weights.stiff is None:
             raise InputError(
-                f"{weights.path.name} holds no stiff terms of its reference to impose; leave --stiff out, or train "
+                f"{weights.path.name} holds no stiff terms of its reference to impose; leave `stiff` out, or train "
                 "with training.stiff = 'drawn'."
             )
         self._stiff = None if stiff == "modelled" else weights.stiff

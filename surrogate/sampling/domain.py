@@ -84,7 +84,7 @@ def match_domain(
     advice = (
         "Run `surromd reference` for this molecule, then `surromd train` on it."
         if barred
-        else "Run `surromd reference` for it instead, or roll with --force: the trajectory is then marked."
+        else "Run `surromd reference` for it instead, or roll with `force=True`: the trajectory is then marked."
     )
     raise OutOfDomainError(
         f"{weights.path.name} does not cover {scene.name}: {reasons}. These weights cover "

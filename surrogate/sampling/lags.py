@@ -27,7 +27,7 @@ def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | No
     low, high = domain.lag_ps, domain.longest_lag_ps
     if not domain.jumps:
         if lag_ps is not None and not math.isclose(lag_ps, low, rel_tol=_ROUNDING):
-            raise InputError(f"{name} steps {format_time_ps(low)} and takes no other lag; leave --lag out.")
+            raise InputError(f"{name} steps {format_time_ps(low)} and takes no other lag; leave `lag_ps` out.")
         return low
     if lag_ps is None:
         if save_every_ps is None:
@@ -36,7 +36,7 @@ def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | No
     if not low * (1 - _ROUNDING) <= lag_ps <= high * (1 + _ROUNDING):
         raise InputError(
             f"{name} was trained for lags of {format_time_ps(low)} to {format_time_ps(high)}, not for "
-            f"{format_time_ps(lag_ps)}; choose --lag, or --save-every, inside that range."
+            f"{format_time_ps(lag_ps)}; choose `lag_ps`, or `save_every_ps`, inside that range."
         )
     return lag_ps
 

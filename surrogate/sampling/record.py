@@ -117,9 +117,9 @@ def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path])
     row, reason = chunk.failure
     at = f"after {format_time_ps(state.steps * plan.weights.domain.lag_ps)}" if state.steps else "in its first chunk"
     if plan.config.guard in ("off", "flag"):
-        advice = f"the frames are marked in {outs[row]}. Try --precision fp32, --guard repair or other weights."
+        advice = f"the frames are marked in {outs[row]}. Try `precision='fp32'`, `guard='repair'` or other weights."
         if plan.config.guard == "flag":
-            advice += " With --guard off nothing stops it."
+            advice += " With `guard='off'` nothing stops it."
     else:
         advice = f"the frames before are in {outs[row]}. Use other weights, or `surromd reference` for this molecule."
     return f"replica {row}, {at}: {reason}; {advice}"

@@ -1,4 +1,4 @@
-"""Where a rollout stands: written beside its first file after each flush, read by `--resume`."""
+"""Where a rollout stands: written beside its first file after each flush, read by `resume`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) 
         known, progress = dict(header["settings"]), built(Progress, {**header["progress"], **arrays}, "progress.")
     except UNREADABLE as error:
         raise InputError(
-            f"checkpoint {path} cannot be read ({first_line(error)}); start again with --overwrite."
+            f"checkpoint {path} cannot be read ({first_line(error)}); start again with `overwrite=True`."
         ) from error
     wanted = known if settings is None else settings
     for key in {**known, **wanted}:

@@ -265,12 +265,12 @@ def _already_complete(outs: Sequence[Path], plan: Plan) -> list[Path]:
             if not reader.record.get("completed") or reader.n_frames != plan.n_frames:
                 raise InputError(
                     f"{path} holds {reader.n_frames} of {plan.n_frames} frames but its checkpoint is gone; start again "
-                    "with --overwrite, or keep it under another name."
+                    "with `overwrite=True`, or keep it under another name."
                 )
             for key, value in wanted.items():
                 if reader.record.get(key) != value:
                     raise InputError(
                         f"{path} is complete, but of {key} = {reader.record.get(key)!r}, not {value!r}; take another "
-                        "name, or --overwrite."
+                        "name, or `overwrite=True`."
                     )
     return list(outs)

@@ -1,6 +1,6 @@
 """Where a training runs: one CPU or GPU, or several started by torchrun, by Lightning Fabric.
 
-    torchrun --nproc-per-node 4 -m surrogate.cli.main train REF... -o model.safetensors --budget 30min
+    torchrun [...] -m surrogate.cli.main train REF... -o model.safetensors [...]
 
 Every process draws its own batch; gradients are averaged, so that the whole batch is the setting's times their number.
 The first process alone validates and writes.
@@ -30,7 +30,7 @@ def choose_device(name: str) -> str:
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"the device {name!r} is unknown; choose auto, cpu or cuda.")
     if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("there is no CUDA device here; leave --device out.")
+        raise InputError("there is no CUDA device here; leave `device` out.")
     if name == "cpu" or not torch.cuda.is_available():
         return "cpu"
     local = os.environ.get("LOCAL_RANK")

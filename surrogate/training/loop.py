@@ -54,7 +54,7 @@ class StageConfig:
 
     def __post_init__(self) -> None:
         if self.budget_s is None and self.steps is None:
-            raise InputError(f"training stage {self.name!r} needs a --budget or a number of steps.")
+            raise InputError(f"training stage {self.name!r} needs a `budget_s` or a number of steps.")
 
     def share_done(self, step: int, spent_s: float) -> float:
         shares = [0.0]
@@ -279,14 +279,14 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
             header = built(StateHeader, parsed(metadata["surromd_training"]))
             tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"training state {path} cannot be read ({error}); train again without --resume.") from error
+        raise InputError(f"training state {path} cannot be read ({error}); train again without `resume`.") from error
     # States of earlier versions carry no checksum; a name that is neither is one that was altered.
     if set(metadata) - {"surromd_training", "sha256"} or (
         "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd_training"], tensors)
     ):
         raise InputError(
             f"training state {path} is damaged: it is not what was written (checksum); restore it from a whole copy, "
-            "or train again without --resume."
+            "or train again without `resume`."
         )
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch)):
         if getattr(header, key) != expected:

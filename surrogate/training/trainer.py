@@ -106,23 +106,23 @@ class Trainer(ABC):
 
     # Fitted in one go: takes neither a budget nor settings.
     fitted: ClassVar[bool] = False
-    # Knows how to go on from weights (--from), and how to learn several spacings of frames (--longest-lag).
+    # Knows how to go on from weights (`start_from`), and how to learn several spacings of frames (`longest_lag_ps`).
     goes_on: ClassVar[bool] = False
     learns_lags: ClassVar[bool] = False
 
     def check(self, request: TrainingRequest) -> None:
         """Raise InputError for what was asked for and means nothing here; no reference has been read yet."""
         if self.fitted:
-            given = {"--budget": request.budget_s, "--steps": request.steps,
-                     "--config": request.model or request.training or None}  # fmt: skip
+            given = {"`budget_s`": request.budget_s, "`steps`": request.steps,
+                     "`config`": request.model or request.training or None}  # fmt: skip
             _refuse(request.arch, [k for k, v in given.items() if v is not None], "is fitted in one go")
         elif request.budget_s is None and request.steps is None:
-            raise InputError("say how long to train: --budget 30min or --steps 10000.")
+            raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
         unknown = []
         if request.start_from is not None and not self.goes_on:
-            unknown.append("--from")
+            unknown.append("`start_from`")
         if request.longest_lag_ps is not None and not self.learns_lags:
-            unknown.append("--longest-lag")
+            unknown.append("`longest_lag_ps`")
         _refuse(request.arch, unknown, "does not know it")
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:

@@ -102,7 +102,7 @@ def _relaxed_energy(scene: Scene, record: dict[str, Any]) -> Callable[[npt.NDArr
     from systems.errors import SimulationError
 
     if record.get("force_field") is None or record.get("solvent") is None:
-        raise InputError("--energies: the reference's file does not say with which force field it was made.")
+        raise InputError("`energies`: the reference's file does not say with which force field it was made.")
     spec = resolve(scene, ForceFieldSpec.of(record))
     relaxer = Relaxer(scene, build_system(scene, spec), born=spec.is_born)
 

@@ -77,7 +77,7 @@ def training_lines(record: dict[str, Any]) -> list[str]:
     """Return how the molecule of a rollout stands to what its weights were trained on, where it is not of it."""
     lines = [UNSEEN] if record.get("unseen_molecule") else []
     beyond = record.get("out_of_domain") or []
-    return [*lines, *(f"outside the training domain (--force): {d['what']}: {d['reason']}" for d in beyond)]
+    return [*lines, *(f"outside the training domain (`force=True`): {d['what']}: {d['reason']}" for d in beyond)]
 
 
 def _percent(share: float) -> str:

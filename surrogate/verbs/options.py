@@ -206,9 +206,9 @@ VERB_OPTIONS: dict[str, type] = {
     "reference": ReferenceOptions,
     "campaign": CampaignOptions,
     "windows": WindowsOptions,
+    "train": TrainOptions,
     "rollout": RolloutOptions,
     "compare": CompareOptions,
-    "train": TrainOptions,
 }
 
 

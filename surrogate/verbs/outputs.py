@@ -25,7 +25,7 @@ def check_outputs(
     `overwrite`), or both switches at once; TrajectoryError where a trajectory's NAME.pdb is another program's.
     """
     if resume and overwrite:
-        raise InputError("--resume and --overwrite exclude each other.")
+        raise InputError("`resume` and `overwrite` exclude each other.")
     for path in paths:
         if "\0" in str(path):
             raise InputError(f"{str(path)!r} is no name for a file: it holds a NUL.")
@@ -36,7 +36,7 @@ def check_outputs(
         if path.is_dir():
             raise InputError(f"{path} is a folder; name a file.")
         if path.exists() and not (resume or overwrite):
-            raise InputError(f"{path} exists; add --overwrite to replace it, or choose another name.")
+            raise InputError(f"{path} exists; add `overwrite=True` to replace it, or choose another name.")
         if path.suffix.lower() in TRAJECTORY_SUFFIXES and suffixes == TRAJECTORY_SUFFIXES and not resume:
             refuse_foreign_topology(path)
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import PlanOptions, ReferenceOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
-from surrogate.verbs.scene_listing import prepare_scene, tell
+from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.takes import takes
+from surrogate.verbs.telling import tell
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig
@@ -62,7 +63,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
         tell(molecule.name, protocol)
     label = f"OpenMM {molecule.name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
     with (
-        accounted_outputs(outs, resumable="the same command with --resume goes on"),
+        accounted_outputs(outs, resumable="the same again with `resume=True` goes on"),
         progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
         return simulate_replicas(

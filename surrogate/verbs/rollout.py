@@ -10,8 +10,9 @@ from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.options import RolloutOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
-from surrogate.verbs.scene_listing import prepare_scene, tell
+from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.takes import takes
+from surrogate.verbs.telling import tell
 from systems.options import part_of
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def rollout(
     if saved_ps is None:
         saved_ps = choose_lag(loaded, config.lag_ps, None)
     with (
-        accounted_outputs(outs, resumable="the same command with --resume goes on"),
+        accounted_outputs(outs, resumable="the same again with `resume=True` goes on"),
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=options.quiet, ps_per_frame=saved_ps * len(outs)) as progress,
     ):

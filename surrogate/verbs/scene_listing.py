@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.verbs.options import Preparation
+from surrogate.verbs.telling import tell
 from systems.chemistry.graph import molecule_key
 
 if TYPE_CHECKING:
@@ -82,8 +82,3 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
         for line in prepared.provenance.get("repairs", []):
             tell(scene, line)
     return prepared
-
-
-def tell(name: str, line: str) -> None:
-    """Say a line about a scene on stderr."""
-    sys.stderr.write(f"{name}: {line}\n")

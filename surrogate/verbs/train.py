@@ -13,8 +13,8 @@ from surrogate.models.registry import architecture, names
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.scene_listing import tell
 from surrogate.verbs.takes import takes
+from surrogate.verbs.telling import tell
 from systems.errors import InputError
 from systems.trajectory.claim import Claim
 
@@ -45,7 +45,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
     `arch`: an installed architecture (`surrogate.models.registry.names`): lam-slide; lam-slide-peptides; painet or its
-    decoder alone, egnn, which learn from velocities (a reference made with --save-velocities and natural hydrogen
+    decoder alone, egnn, which learn from velocities (a reference made with `save_velocities=True` and natural hydrogen
     masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
     others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
     `start_from`: weights (name or file) whose second stage is trained further, with their configuration. `validation`:
@@ -66,7 +66,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     check_outputs([out], [".safetensors"], resume=options.resume, overwrite=options.overwrite)
     states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
     if states and not (options.resume or options.overwrite):
-        raise InputError(f"{states[0]} is the state of an interrupted training; add --resume or --overwrite.")
+        raise InputError(f"{states[0]} is the state of an interrupted training; add `resume=True` or `overwrite=True`.")
     if options.resume and out.exists() and not states:
         return out
     plan = _plan(references, options.validation, replace(asked, device=_device(options.device)))
@@ -168,7 +168,7 @@ def _suited(references: References) -> tuple[str, str]:
     survey = references.survey()
     fits = [(fit, name) for name in names() if (fit := architecture(name).suits(survey)) is not None]
     if not fits:
-        raise InputError("no installed architecture suits these references by itself; name one with --arch.")
+        raise InputError("no installed architecture suits these references by itself; name one with `arch`.")
     best, name = max(fits, key=lambda found: found[0].rank)
     return name, best.reason
 
@@ -182,7 +182,7 @@ def _said_when_stopped(out: Path) -> Iterator[None]:
         kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
         if not kept:
             raise KeyboardInterrupt("no training state had been saved yet") from None
-        raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same command with --resume goes on") from None
+        raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same again with `resume=True` goes on") from None
 
 
 def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:

@@ -31,7 +31,7 @@ class TrainingVerdict:
     """How a training went. `steps` and `validation` (named as in the curves) by stage; of the rollout the frames, how
     many in per cent pass the guards, and what is wrong with the others, in frames; `stopped`: why it could not go on.
 
-    `word`: 'usable', 'usable with help' (--guard repair or resample) or 'not usable'; `advice`: what would help.
+    `word`: 'usable', 'usable with help' (`guard='repair'` or resample) or 'not usable'; `advice`: what would help.
     """
 
     steps: dict[str, int]
@@ -63,7 +63,7 @@ class TrainingVerdict:
         if self.word == "usable":
             lines.append("usable; whether populations and time scales are right, `surromd compare` with MD tells")
             return lines
-        help_ = "usable with --guard repair or resample alone" if self.word != "not usable" else "not usable as it is"
+        help_ = "usable with `guard='repair'` or resample alone" if self.word != "not usable" else "not usable as it is"
         return [*lines, f"{help_}; what would help: {'; '.join(self.advice)}"]
 
 
@@ -193,7 +193,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
     values = series(rows, column)[1] if column else []
     if len(values) < 4 or values[-1] < (1.0 - _STILL_FALLS) * values[len(values) // 2]:
-        found.append("more minutes (--budget): the validation error had not settled")
+        found.append("more minutes (`budget_s`): the validation error had not settled")
     trained = series(rows, column.replace("validation_", "train_"))[1] if column else []
     by_heart = bool(values and trained and values[-1] > _BY_HEART * trained[-1])
     if by_heart or 0 < n_frames < _FEW_FRAMES:
@@ -201,7 +201,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
         if by_heart:
             why = f"the validation error is {values[-1] / trained[-1]:.2g} times that in training"
         found.append(f"more reference MD: {why}")
-    return found or ["more minutes (--budget) and more reference MD"]
+    return found or ["more minutes (`budget_s`) and more reference MD"]
 
 
 def _nearer_weights(weights: Weights) -> list[str]:
@@ -220,7 +220,7 @@ def _nearer_weights(weights: Weights) -> list[str]:
         if header.arch != weights.model.arch or not same or domain.lag_ps != own.lag_ps:
             continue
         if not any(find_deviations(member.scene, domain) for member in own.members):
-            return [f"to go on from weights that know such molecules (--from {name}), or to roll those"]
+            return [f"to go on from weights that know such molecules (`start_from='{name}'`), or to roll those"]
     return []
 
 

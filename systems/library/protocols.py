@@ -1,4 +1,4 @@
-"""Protocols of papers by name: the settings that made their data, for `--protocol NAME` and `protocol = "NAME"`.
+"""Protocols of papers by name: the settings that made their data, for `protocol` and `protocol = "NAME"`.
 
 A protocol goes with no molecule: it is asked for, and what is said beside it outweighs it. What it leaves out stays at
 the program's defaults.

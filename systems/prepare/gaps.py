@@ -41,7 +41,7 @@ def refuse_gaps(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRec
         more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
         raise PreparationError(
             f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart){more}; fill "
-            "the gap, add --cap-breaks to close both ends with caps, or end the chain there with a TER record."
+            "the gap, add `cap_breaks=True` to close both ends with caps, or end the chain there with a TER record."
         )
 
 

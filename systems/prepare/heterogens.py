@@ -109,10 +109,10 @@ def settle_ligands(
         return True
     if not drop:
         raise PreparationError(
-            f"beside the peptide it holds {names}; add --keep-ligand to simulate them, too, or --drop-ligand to leave "
-            "them out."
+            f"beside the peptide it holds {names}; add `keep_ligand=True` to simulate them, too, or `drop_ligand=True` "
+            "to leave them out."
         )
-    notes.append(f"left out, as asked (--drop-ligand): {names}")
+    notes.append(f"left out, as asked (`drop_ligand=True`): {names}")
     return False
 
 
@@ -125,5 +125,5 @@ def refuse_bare_ligands(atoms: Sequence[AtomRecord], ligands: Sequence[int]) -> 
         if ("C" in elements and "H" not in elements) or (elements == {"O"} and template_for(name) is None):
             raise PreparationError(
                 f"{name} {chain}{number} has no hydrogens, which a ligand must bring; add them (its SDF from the "
-                "Protein Data Bank has them), or leave it out with --drop-ligand."
+                "Protein Data Bank has them), or leave it out with `drop_ligand=True`."
             )

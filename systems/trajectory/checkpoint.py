@@ -98,7 +98,7 @@ def read_checkpoints(path: Path) -> list[Checkpoint]:
             built(_Common, {f.name: header[f.name] for f in fields(_Common) if f.name in header})
             found.append((header, blob))
     except (OSError, ValueError) as error:
-        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with --overwrite.") from error
+        raise InputError(f"checkpoint {path} cannot be read ({error}); start again with `overwrite=True`.") from error
     return found
 
 
@@ -117,7 +117,7 @@ def last_supported(path: Path, outs: Sequence[Path]) -> Checkpoint:
         if not any(found):
             return header, blob
         reasons += [reason for reason in found if reason]
-    raise InputError(f"{reasons[0]}; restore it, or start again with --overwrite.")
+    raise InputError(f"{reasons[0]}; restore it, or start again with `overwrite=True`.")
 
 
 def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str, Any], k: int = 0, *, resumed: bool,

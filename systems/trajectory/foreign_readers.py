@@ -78,7 +78,7 @@ class MdtrajReader(TrajectoryReader):
             frames = mdtraj.load(str(path), **({} if topology is None else {"top": topology}))
         except Exception as error:
             needs = topology is None and path.suffix.lower() not in _WITH_TOPOLOGY
-            hint = " (a format without topology: give one with --top)" if needs else ""
+            hint = " (a format without topology: give one with `top`)" if needs else ""
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}{hint}.") from error
         self.n_frames, self.n_atoms = frames.n_frames, frames.n_atoms
         self.time_ps, self.times_known = np.asarray(frames.time, dtype=np.float64), path.suffix.lower() in _WITH_TIMES

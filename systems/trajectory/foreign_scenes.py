@@ -158,7 +158,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
         guessed = "xyz" in top.suffix.lower() and len(element) == 2 and atom.isupper() and atom not in ("CL", "BR")
         symbol = element_symbol(atom, residues[of_atom[i]], "" if guessed else element)
         if symbol is None:
-            raise InputError(f"{top}: the element of atom {i} ({atom}) is not known; give a PDB file with --top.")
+            raise InputError(f"{top}: the element of atom {i} ({atom}) is not known; give a PDB file with `top`.")
         elements.append(symbol)
     bonds = np.empty((0, 2), dtype=np.int64)
     if hasattr(atoms, "bonds"):

@@ -204,9 +204,9 @@ def test_a_missing_term_is_refused(aib_chain: Any, monkeypatch: pytest.MonkeyPat
 
 def test_other_protein_force_fields_send_such_chains_to_ff14sb() -> None:
     scene = scene_from_smiles("CC(=O)N[C@@H](C)C(=O)NC(C)(C)C(=O)N[C@@H](C)C(=O)NC")
-    with pytest.raises(PreparationError, match=r"use --force-field ff14SB\+gaff2"):
+    with pytest.raises(PreparationError, match=r"use `force_field='ff14SB\+gaff2"):
         build_system(scene, ForceFieldSpec("ff19SB+gaff2", "vacuum"))
-    with pytest.raises(PreparationError, match=r"--force-field ff14SB\+gaff2"):
+    with pytest.raises(PreparationError, match=r"`force_field='ff14SB\+gaff2"):
         build_system(scene, ForceFieldSpec("ff14SB", "vacuum"))
 
 

@@ -236,7 +236,7 @@ def test_contradictions_are_refused() -> None:
         build_system(peptide_box(), ForceFieldSpec())
     with pytest.raises(PreparationError, match="twice the cut-off"):
         build_system(replace(peptide_box(), cell_nm=np.eye(3) * 1.7), TIP3P)
-    with pytest.raises(InputError, match="--padding"):
+    with pytest.raises(InputError, match="`padding_nm"):
         solvate_if_asked(scene, ForceFieldSpec(), 1.0)
     with pytest.raises(InputError, match="cell already"):
         solvate_if_asked(peptide_box(), TIP3P, 1.0)

@@ -212,7 +212,7 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_changed(
     before = [path.read_bytes() for path in half_done]
     for bad in (b"", good[:-40], good[:300] + bytes([good[300] ^ 4]) + good[301:], b"PK\x03\x04 nothing of ours"):
         state.write_bytes(bad)
-        with pytest.raises(InputError, match=r"checkpoint .* cannot be read .*--overwrite|is none of this version's"):
+        with pytest.raises(InputError, match=r"checkpoint .* cannot be read .*`overwrite|is none of this version's"):
             rollout(alanine_dipeptide, small_weights, half_done, config, resume=True)
     assert [path.read_bytes() for path in half_done] == before
     state.unlink()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import with_options
 from surrogate.verbs.takes import takes
 from systems.errors import InputError, UnitError, UnknownNameError
@@ -162,3 +164,35 @@ def test_a_dataclass_made_by_hand_can_be_checked() -> None:
         check_options(Settings(time_ps=1.0, guard="repare"))
     with pytest.raises(MissingOptionError):
         gather(Settings, {})
+
+
+def test_messages_name_options_in_the_words_of_who_asks() -> None:
+    told = "add `overwrite=True`, use `timestep_ps='1fs'`, leave `start_from` out, try `precision='fp32'`; see `x info`"
+    assert as_flags(told) == (
+        'add --overwrite, use --timestep 1fs, leave --from out, try precision = "fp32" in [sampling] of --config; '
+        "see `x info`"
+    )
+
+
+# CSS variables, switches of other programs, and modules that are commands of their own.
+_NO_FLAGS_OF_OURS = re.compile(r"var\(--|--preload|--no-dashboard")
+
+
+def flags_outside(repository: Path) -> list[str]:
+    """Return the lines outside the command line that name a flag."""
+    found = []
+    for package in ("systems", "md_reference", "surrogate"):
+        for path in sorted((repository / package).rglob("*.py")):
+            text = path.read_text()
+            if "surrogate/cli/" in path.as_posix() or "import argparse" in text:
+                continue
+            found += [f"{path.relative_to(repository)}: {line.strip()}" for line in text.splitlines()
+                      if re.search(r"(?<![\w-])--[a-z]", line) and not _NO_FLAGS_OF_OURS.search(line)]  # fmt: skip
+    return found
+
+
+def test_no_flag_stands_outside_the_command_line(repository: Path, tmp_path: Path) -> None:
+    assert not flags_outside(repository)
+    (tmp_path / "systems").mkdir()
+    (tmp_path / "systems" / "wrong.py").write_text('raise InputError("exists; add --overwrite.")\n')
+    assert len(flags_outside(tmp_path)) == 1

@@ -88,7 +88,7 @@ def refuse(scene: Scene) -> None:
     if foreign:
         raise PreparationError(
             f"GAFF2 has no parameters for {', '.join(foreign)} in scene {scene.name!r} (it covers "
-            f"{', '.join(ELEMENTS)}); use --level gfn2-xtb."
+            f"{', '.join(ELEMENTS)}); use `level='gfn2-xtb'`."
         )
     graph: nx.Graph = nx.Graph()
     graph.add_nodes_from(range(scene.n_atoms))
@@ -102,7 +102,7 @@ def refuse(scene: Scene) -> None:
     if crowded:
         raise PreparationError(
             f"{scene.atom_names[crowded[0]]} in scene {scene.name!r} has {graph.degree(crowded[0])} neighbours; GAFF2 "
-            "has no angle terms for more than four. Use --level gfn2-xtb."
+            "has no angle terms for more than four. Use `level='gfn2-xtb'`."
         )
     charge = int(scene.formal_charges.sum())
     electrons = sum(_ATOMIC_NUMBERS[e] for e in scene.elements) - charge
@@ -111,7 +111,7 @@ def refuse(scene: Scene) -> None:
         n = unpaired or 1
         raise PreparationError(
             f"scene {scene.name!r} (charge {charge:+d}) has {n} unpaired electron{'s' if n > 1 else ''}; GAFF2 and "
-            "AM1-BCC are made for closed shells. Check hydrogens and charges, or use --level gfn2-xtb."
+            "AM1-BCC are made for closed shells. Check hydrogens and charges, or use `level='gfn2-xtb'`."
         )
     if scene.n_atoms > LARGEST:
         lacking = _without_template(scene)
@@ -184,7 +184,7 @@ def _missing_terms(scene: Scene, folder: Path) -> None:
     if unknown:
         terms = "; ".join(" ".join(term.split()) for term in unknown[:3])
         raise PreparationError(
-            f"GAFF2 has no parameters for {len(unknown)} of its terms ({terms}); use --level gfn2-xtb"
+            f"GAFF2 has no parameters for {len(unknown)} of its terms ({terms}); use `level='gfn2-xtb'`"
         )
 
 

@@ -69,7 +69,7 @@ def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[s
     found = joint_measure(truth.reference, features, truth.replicate, truth.torsions)
     worth = None if found is None else worth_by(*found, seed)
     if found is None or worth is None:
-        raise InputError("too few frames to tell an error; give longer references, or a longer --time.")
+        raise InputError("too few frames to tell an error; give longer references, or a longer `time_ps`.")
     sample = _sample(features, truth, seed)
     correlation, relaxation = relaxation_of(sample)
     out: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """Run time against error: a surrogate at many settings beside OpenMM at many lengths, on one core.
 
-`surromd bench cost-error REFERENCE REPLICATE --weights NAME`. Each setting rolls the same time; its error is that of
+`surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of
 the φ/ψ map against two held-out runs, its cost the processor time of this process, one thread. Before each of its parts
 OpenMM runs for a moment, so that the ratio of the two does not hang on what else the machine does. MD's own error is
 that of pieces of one held-out run against the whole of the other (`judge.worth`): it is taken to be the same at each
@@ -168,7 +168,7 @@ def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     except (OSError, ValueError) as error:
-        raise StorageError(f"{path} cannot be used ({error}); name another folder with --out.") from error
+        raise StorageError(f"{path} cannot be used ({error}); name another folder with `out`.") from error
     if found and any(found.get(key) != value for key, value in header.items()):
-        raise InputError(f"{path} is of other references, times or rounds; name another folder with --out.")
+        raise InputError(f"{path} is of other references, times or rounds; name another folder with `out`.")
     return {**header, "rows": [], **found}

@@ -100,7 +100,7 @@ def stress_weights(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with --out.") from error
+        raise StorageError(f"cannot make the folder {folder} ({error.strerror}); name another with `out`.") from error
     try:
         return run_stress(loaded, folder, config, report=report)
     except KeyboardInterrupt:

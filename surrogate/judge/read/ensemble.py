@@ -55,7 +55,9 @@ class Ensemble:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
-            raise InputError(f"{self.label}: the time between frames is {self.lag_ps} ps; state it with --lag 1ps.")
+            raise InputError(
+                f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `lag_ps='1ps'`."
+            )
         for i, segment in enumerate(self.segments):
             if segment.ndim != 3 or segment.shape[1:] != (self.scene.n_atoms, 3):
                 raise InputError(
@@ -221,7 +223,7 @@ def equal_lags(ensembles: Sequence[Ensemble]) -> list[Ensemble]:
             intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in ensembles)
             raise InputError(
                 f"Save intervals have no common multiple short enough to compare at ({intervals}); "
-                "save again at a multiple of one another, or state the interval with --lag."
+                "save again at a multiple of one another, or state the interval with `lag_ps`."
             )
         out.append(ensemble.strided(stride))
     return out

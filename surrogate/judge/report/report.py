@@ -29,6 +29,7 @@ from surrogate.judge.report.wording import (
 from surrogate.judge.rows.account import Account
 from surrogate.judge.rows.rows import GROUPS
 from systems.errors import InputError, StorageError
+from systems.options import flag_of
 from systems.units import format_time_ps
 
 _STYLES = ("report.css", "viewer.css")
@@ -135,11 +136,11 @@ def _command(comparison: Comparison, target: Path) -> str:
     accounts = [comparison.reference, *(j.account for j in comparison.judgements)]
     words = ["surromd", "compare", *(",".join(a.sources) or a.label for a in accounts)]
     if comparison.replicate is not None:
-        words += ["--replicate", ",".join(comparison.replicate.sources) or comparison.replicate.label]
+        words += [flag_of("replicate"), ",".join(comparison.replicate.sources) or comparison.replicate.label]
     if comparison.reference.top is not None:
-        words += ["--top", comparison.reference.top]
+        words += [flag_of("top"), comparison.reference.top]
     if comparison.reference.stated_lag_ps is not None:
-        words += ["--lag", format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+        words += [flag_of("lag_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
     return shlex.join([*words, "-o", target.name])
 
 

@@ -38,7 +38,7 @@ def refuse_wrong_topology(ensemble: Ensemble) -> None:
     if long >= _REFUSED[0] and long >= _REFUSED[1] * len(ensemble.scene.bonds):
         raise InputError(
             f"{ensemble.label}: {words}. The topology does not fit the coordinates, whose atoms are in another order; "
-            "name the one that belongs to them with --top."
+            "name the one that belongs to them with `top`."
         )
 
 

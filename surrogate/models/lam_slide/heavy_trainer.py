@@ -54,7 +54,7 @@ def on_heavy_atoms(
             )
         frames = frames.trained[0]
     if several_lags or config.approximator.lag_range_ps is not None:
-        raise InputError('hydrogens are placed at one lag; leave --longest-lag out, or set hydrogens = "modelled".')
+        raise InputError('hydrogens are placed at one lag; leave `longest_lag_ps` out, or set hydrogens = "modelled".')
     domain = training_domain(frames)
     if start is not None:
         assert isinstance(start.model, HeavyLamSlide)

@@ -27,7 +27,7 @@ class PeptideTrainer(Trainer):
         if "longest_ps" not in request.model:
             reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
             if request.longest_lag_ps is not None:
-                found.append(Choice("model.longest_ps", request.longest_lag_ps, "--longest-lag"))
+                found.append(Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
             elif reach < known.longest_ps:
                 found.append(Choice("model.longest_ps", reach, "as far as every reference reaches"))
         if "time_reversal" not in request.training and survey.equilibrium:

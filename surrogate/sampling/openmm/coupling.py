@@ -133,4 +133,4 @@ class Coupling:
 
 
 def _cannot(weights: Weights) -> str:
-    return f"{weights.path.name} cannot be coupled to OpenMM (--guard flag and resample need no coupling)"
+    return f"{weights.path.name} cannot be coupled to OpenMM (`guard='flag'` and resample need no coupling)"

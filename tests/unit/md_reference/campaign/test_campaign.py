@@ -181,7 +181,7 @@ def test_what_fails_is_reported_and_the_rest_goes_on(client: Any, tmp_path: Path
     assert states["alanine-dipeptide"].status == COMPLETE
     assert states["too-fast"].status == FAILED
     assert states["too-fast"].attempts == 2  # tried again, as it might have been the machine
-    assert "Try a shorter --timestep" in states["too-fast"].reason
+    assert "Try a shorter `timestep_ps`" in states["too-fast"].reason
     assert states["ACE-XYZ-NME"].status == FAILED
     assert "XYZ" in states["ACE-XYZ-NME"].reason
     assert set(reasons) == {"too-fast_300K_r0", "ACE-XYZ-NME"}

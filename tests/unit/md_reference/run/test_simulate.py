@@ -215,7 +215,7 @@ def test_a_damaged_checkpoint_is_one_clear_line(alanine_dipeptide: Scene, tmp_pa
     whole = checkpoint_path(out).read_bytes()
     for damaged in (b"", b"\x00\x01", b"[1]\n" + whole, whole[:60], whole[: len(whole) // 2], flipped(whole, 700)):
         checkpoint_path(out).write_bytes(damaged)
-        with pytest.raises(InputError, match=r"cannot be read .*--overwrite|is none of this version's") as caught:
+        with pytest.raises(InputError, match=r"cannot be read .*`overwrite|is none of this version's") as caught:
             simulate(alanine_dipeptide, SHORT, out, resume=True)
         assert "\n" not in str(caught.value)
     checkpoint_path(out).write_bytes(whole)
@@ -328,7 +328,7 @@ def test_a_blow_up_stops_with_the_good_frames_kept(alanine_dipeptide: Scene, tmp
 
 def test_a_blow_up_before_the_first_frame_leaves_nothing(alanine_dipeptide: Scene, tmp_path: Path) -> None:
     config = replace(SHORT, timestep_ps=0.02, save_every_ps=0.2)
-    with pytest.raises(SimulationError, match="shorter --timestep"):
+    with pytest.raises(SimulationError, match="shorter `timestep_ps"):
         simulate(alanine_dipeptide, config, tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
 

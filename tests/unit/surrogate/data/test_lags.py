@@ -93,7 +93,7 @@ def test_lags_outside_the_trained_range_are_refused_in_one_line(
     weights: Weights, alanine_dipeptide: Scene, tmp_path: Path, lag_ps: float | None, save_every_ps: float | None
 ) -> None:
     config = RolloutConfig(time_ps=42.0, lag_ps=lag_ps, save_every_ps=save_every_ps)
-    with pytest.raises(InputError, match=r"lags of 1 ps to 20 ps, not for .*--lag") as refused:
+    with pytest.raises(InputError, match=r"lags of 1 ps to 20 ps, not for .*`lag_ps") as refused:
         rollout(alanine_dipeptide, weights, [tmp_path / "x.h5"], config)
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "x.h5").exists()

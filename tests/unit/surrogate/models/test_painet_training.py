@@ -209,9 +209,9 @@ def test_frames_without_velocities_or_with_heavy_hydrogens_are_refused(tmp_path:
             writer.append(positions + shift, np.arange(40) * LAG_PS, **extra)
         return tmp_path / name
 
-    with pytest.raises(InputError, match="--save-velocities"):
+    with pytest.raises(InputError, match="`save_velocities"):
         collect_frames([write("a.h5", moving=False)], canonical=False, velocities=True)
-    with pytest.raises(InputError, match="--hydrogen-mass natural"):
+    with pytest.raises(InputError, match="`hydrogen_mass_da='natural"):
         collect_frames([write("b.h5", moving=True, hydrogen_mass_da=3.0)], canonical=False, velocities=True)
     with pytest.raises(InputError, match="carry none"):
         train_painet(replace(frames_of(diatomic), velocities=None), tmp_path / "m.safetensors", SMALL, QUICK)

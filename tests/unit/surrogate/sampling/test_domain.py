@@ -65,7 +65,7 @@ def test_an_isomer_with_the_same_formula_has_other_bonds(small_weights: Weights)
 def test_the_mirror_image_can_be_forced_and_is_named(small_weights: Weights, alanine_dipeptide: Scene) -> None:
     mirrored = alanine_dipeptide.with_positions(alanine_dipeptide.positions_nm * [1.0, -1.0, 1.0])
     assert kinds(mirrored, small_weights) == {"stereo": True, "start": True}
-    with pytest.raises(OutOfDomainError, match=r"mirror image.*--force"):
+    with pytest.raises(OutOfDomainError, match=r"mirror image.*`force"):
         match_domain(mirrored, small_weights)
     forced = match_domain(mirrored, small_weights, force=True)
     assert [d.what for d in forced.deviations] == ["stereo", "start"]

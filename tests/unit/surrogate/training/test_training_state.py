@@ -72,7 +72,7 @@ def test_a_flipped_bit_is_refused_and_without_the_checksum_would_not_be(
     start = 8 + int.from_bytes(data[:8], "little")
     data[start if where == "first tensor" else -1] ^= 1
     stopped.write_bytes(data)
-    with pytest.raises(InputError, match=r"s\.train\.safetensors is damaged.*checksum.*without --resume"):
+    with pytest.raises(InputError, match=r"s\.train\.safetensors is damaged.*checksum.*without `resume"):
         train(tmp_path, resume=True)
     rewrite(stopped, {"sha256": None})
     train(tmp_path, resume=True)
@@ -97,4 +97,4 @@ def test_wherever_a_byte_is_altered_the_state_is_refused_in_one_line(tmp_path: P
         with pytest.raises(InputError) as refused:
             train(tmp_path, resume=True)
         assert "\n" not in str(refused.value), place
-        assert "--resume" in str(refused.value), place
+        assert "`resume" in str(refused.value), place

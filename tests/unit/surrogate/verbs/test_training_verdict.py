@@ -58,7 +58,7 @@ def test_too_short_a_training_is_called_unusable_and_told_what_would_help(
     assert verdict["steps"] == {"autoencoder": 2, "flow": 8} and verdict["validation"]["flow"]["validation_flow"] > 0
     assert "autoencoder 2 steps, flow 8 steps; validation error" in said and "not usable as it is" in said
     advice = " ".join(verdict["advice"])
-    assert "--from alanine-dipeptide" in advice, "shipped weights know this molecule under these conditions"
+    assert "start_from='alanine-dipeptide'" in advice, "shipped weights know this molecule under these conditions"
     assert 'hydrogens = "placed"' in advice and "more minutes" in advice and "800 frames are few" in advice
     assert out.exists() and not list(tmp_path.glob("*.h5"))
 
@@ -84,7 +84,7 @@ def test_weights_that_stand_still_are_not(tmp_path: Path, small_weights: Weights
 
 
 @pytest.mark.parametrize(("percent", "stopped", "said"), [
-    (99.5, "", "usable; whether"), (95.0, "", "usable with --guard"), (69.0, "", "not usable"),
+    (99.5, "", "usable; whether"), (95.0, "", "usable with `guard"), (69.0, "", "not usable"),
     (99.5, "replica 0, in its first chunk", "not usable"),
 ])  # fmt: skip
 def test_the_words(percent: float, stopped: str, said: str) -> None:

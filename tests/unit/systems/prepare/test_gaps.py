@@ -34,7 +34,7 @@ def test_a_break_is_closed_with_caps(tmp_path: Path, sequence: str, hydrogens: b
     whole = prepare(f"sequence:{sequence}")
     gone = ("4", "5") if sequence.startswith("ACE") else ("3", "4")
     path = _without(whole, gone, tmp_path, hydrogens=hydrogens)
-    with pytest.raises(PreparationError, match=r"the chain breaks between .* \(C and N are .* Å apart\).*--cap-breaks"):
+    with pytest.raises(PreparationError, match=r"the chain breaks between .* \(C and N are .* Å apart\).*`cap_breaks"):
         prepare(path)
     scene = prepare(path, cap_breaks=True)
     before, after = int(gone[0]) - 1, int(gone[-1]) + 1

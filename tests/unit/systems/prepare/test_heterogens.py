@@ -118,7 +118,7 @@ def test_free_ions_go_with_the_water_and_bound_ones_ask(tmp_path: Path) -> None:
         x, y, z = oxygen + (0.0, 0.0, gap)
         path = _write(tmp_path / "y.pdb", PEPTIDE, _line(910, "SOD", "SOD", 10, (x, y, z)))
         if asks:
-            with pytest.raises(InputError, match="SOD W10; add --keep-ligand"):
+            with pytest.raises(InputError, match="SOD W10; add `keep_ligand"):
                 prepare(path)
             kept = prepare(path, keep_ligand=True)
             assert (kept.elements[-1], len(kept.bonds)) == ("Na", len(ALA2.bonds))
@@ -138,7 +138,7 @@ def test_an_ion_is_bonded_to_nothing_by_distance_or_conect() -> None:
 def test_ions_under_one_number_are_ions_each(tmp_path: Path) -> None:
     x, y, z = 10 * ALA2.positions_nm[5] + (0.0, 0.0, 2.5)
     near, far = _line(910, "SOD", "SOD", 10, (x, y, z)), _line(911, "SOD", "SOD", 10, (x, y, z + 30.0))
-    with pytest.raises(InputError, match="SOD W10; add --keep-ligand"):
+    with pytest.raises(InputError, match="SOD W10; add `keep_ligand"):
         prepare(_write(tmp_path / "x.pdb", PEPTIDE, near, far))
     scene = prepare(_write(tmp_path / "y.pdb", PEPTIDE, far, far.replace("911", "912").replace(" 10 ", " 10 ")))
     assert scene.n_atoms == 22

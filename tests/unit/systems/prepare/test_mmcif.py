@@ -82,7 +82,7 @@ def test_waters_ligands_and_alternates_as_in_pdb_files(tmp_path: Path) -> None:
     x, y, z = ALA2.positions_nm[5] * 10 + (0.0, 0.0, 2.9)
     rows[-1] = _row(32, "ZN", "ZN", "302", (x, y, z), "ZN", group="HETATM")
     bound = _write(tmp_path / "bound.cif", rows)
-    with pytest.raises(PreparationError, match=r"ZN X302; add --keep-ligand"):
+    with pytest.raises(PreparationError, match=r"ZN X302; add `keep_ligand"):
         prepare(bound)
     scene = prepare(path, keep_ligand=True)
     assert scene.provenance["repairs"][:1] == [

@@ -52,7 +52,7 @@ def _record(name: str, residue: str, number: str, x: float, y: float, z: float, 
 
 def test_what_stands_beside_the_peptide_is_refused_kept_or_dropped_as_told(tmp_path: Path) -> None:
     path = _write(tmp_path / "x.pdb", _peptide(), METHANE, CHLORIDE, WATER)
-    with pytest.raises(PreparationError, match=r"LIG A201; add --keep-ligand .* or --drop-ligand") as caught:
+    with pytest.raises(PreparationError, match=r"LIG A201; add `keep_ligand.* or `drop_ligand") as caught:
         prepare(path)
     assert "\n" not in str(caught.value) and "x.pdb" in str(caught.value)
     with pytest.raises(InputError, match="exclude each other"):
@@ -60,7 +60,7 @@ def test_what_stands_beside_the_peptide_is_refused_kept_or_dropped_as_told(tmp_p
     bare = prepare(path, drop_ligand=True)
     assert bare.provenance["repairs"] == [
         "1 water molecule and free ion CL left out",
-        "left out, as asked (--drop-ligand): LIG A201",
+        "left out, as asked (`drop_ligand=True`): LIG A201",
     ]
     assert molecule_key(bare) == molecule_key(ALA2)
     kept = prepare(path, keep_ligand=True)
@@ -79,7 +79,7 @@ def test_a_kept_ligand_stays_while_the_peptide_is_completed(tmp_path: Path) -> N
     assert scene.positions_nm[ligand[0]] == pytest.approx([3.0, 2.0, 2.0])
     assert scene.bonds[np.isin(scene.bonds, ligand).any(axis=1)].tolist() == [[22, k] for k in (23, 24, 25, 26)]
     bare = METHANE.splitlines(keepends=True)[0]
-    with pytest.raises(PreparationError, match=r"LIG A201 has no hydrogens.*--drop-ligand"):
+    with pytest.raises(PreparationError, match=r"LIG A201 has no hydrogens.*`drop_ligand"):
         prepare(_write(tmp_path / "y.pdb", _peptide(), bare), keep_ligand=True)
 
 

@@ -82,7 +82,7 @@ def test_an_xyz_file_is_its_own_topology(folder: Path, alanine_dipeptide: Scene)
 def test_formats_without_topology_say_so(folder: Path, tmp_path: Path) -> None:
     with open_trajectory(folder / "a.nc") as reader:
         assert reader.scene is None and reader.n_frames == N
-    with pytest.raises(TrajectoryError, match=r"a\.mdcrd cannot be read: .*--top"):
+    with pytest.raises(TrajectoryError, match=r"a\.mdcrd cannot be read: .*`top"):
         open_trajectory(folder / "a.mdcrd")
     (tmp_path / "x.traj").write_bytes(b"- of Ulm")
     with pytest.raises(TrajectoryError, match="ase convert"):
