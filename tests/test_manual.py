@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("sphinx", reason="the manual's libraries are not installed: pip install '.[docs]'")
 
+import from_bench
 from command_reference import all_commands, command_markdown
 from result_tables import TABLES, read_table, table_markdown
 
@@ -35,6 +36,33 @@ def test_a_table_that_says_too_little_is_refused(tmp_path: Path, wrong: dict, me
     path.write_text(json.dumps(record | wrong))
     with pytest.raises(ValueError, match=re.escape(message)):
         read_table(path)
+
+
+def test_what_a_benchmark_wrote_becomes_a_table(tmp_path: Path) -> None:
+    speeds = {"case": "ethanol", "n_atoms": 9, "ns_per_day": {"ours": 122_100.0}, "ratio": [14.5, 13.0, 15.0]}
+    measured = {"machine": {"name": "mine", "cores_used": 2}, "rounds": 3, "rows": [speeds | {"solvent": "vacuum"}]}
+    record = from_bench.reference_speed(measured)
+    path = tmp_path / "table.json"
+    path.write_text(from_bench.table_text(record), encoding="utf-8")
+    assert read_table(path) == record
+    assert "| 9 (ethanol) | 122,100 | 14.5 [13.0, 15.0] |" in table_markdown(record)
+    assert "mine, 2 cores used" in table_markdown(record)
+
+
+def test_the_figure_reads_a_table_of_the_sweep(repository: Path) -> None:
+    setting = {
+        "label": "fitted 3", "weights": "w", "cpu_s_per_ns": {"mean": 0.591},
+        "jsd": {"value": 0.1671, "low": 0.153, "high": None}, "md_of_same_seconds": 0.262, "worth": {"words": "8.1 ns"},
+        "times_faster": 5.01, "valid_half_angstrom_%": {"value": 99.64}, "bonds_20_percent_%": {"value": 94.63},
+    }  # fmt: skip
+    measured = {
+        "config": {"time_ps": 20_000.0, "threads": 1}, "machine": {"name": "mine"},
+        "md": {"length_ps": 1e5, "floor": 0.058, "errors": [0.6]},
+        "rows": [setting, {"label": "timed", "weights": "w"}],
+    }  # fmt: skip
+    record = from_bench.cost_error(measured)
+    assert record["rows"] == [["`fitted`, 3", "0.59", "0.167", "0.26", "8.1 ns", "5.0", "99.64 / 94.63"]]
+    assert record["columns"] == read_table(TABLES / "cost_error.json")["columns"]
 
 
 def test_commands_have_their_options() -> None:

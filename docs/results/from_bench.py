@@ -1,0 +1,108 @@
+"""Make a table of the manual of what a benchmark wrote: `python docs/results/from_bench.py NAME FILE.json`.
+
+NAME is `reference_speed` (FILE of `surromd bench reference -o FILE`) or `cost_error` (FILE of `surromd bench
+cost-error`). The table goes to docs/results/tables/NAME.json with the machine that the benchmark names, and replaces
+the one there.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+TABLES = Path(__file__).resolve().parent / "tables"
+
+
+def reference_speed(measured: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of our OpenMM set-up against the plain one: speeds of all cores together and their ratio."""
+    by_case: dict[tuple[int, str], dict[str, Any]] = {}
+    for row in measured["rows"]:
+        by_case.setdefault((row["n_atoms"], row["case"]), {})[row["solvent"]] = row
+    solvents = list(dict.fromkeys(row["solvent"] for row in measured["rows"]))
+    rows = []
+    for (n_atoms, case), found in sorted(by_case.items()):
+        cells = [f"{n_atoms:,} ({case})"]
+        for solvent in solvents:
+            row = found.get(solvent)
+            cells += ["", ""] if row is None else [f"{significant(row['ns_per_day']['ours'])}", spread(row["ratio"])]
+        rows.append(cells)
+    heads = [head for solvent in solvents for head in (f"{solvent}: ours, ns/day", "ratio")]
+    return {
+        "command": "surromd bench reference",
+        "machine": f"{measured['machine']['name']}, {measured['machine']['cores_used']} cores used",
+        "note": f"Medians of {measured['rounds']} rounds, least and greatest in brackets; time step 2 fs.",
+        "columns": ["atoms", *heads],
+        "rows": rows,
+    }
+
+
+def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of run time against error: the settings that were judged."""
+    config, md = measured["config"], measured["md"]
+    rows = []
+    for row in (row for row in measured["rows"] if "jsd" in row):
+        solver, _, rest = row["label"].partition(" ")
+        same = row["md_of_same_seconds"]
+        valid = [row[key]["value"] for key in ("valid_half_angstrom_%", "bonds_20_percent_%")]
+        rows.append(
+            [
+                f"`{solver}`, {rest}",
+                f"{row['cpu_s_per_ns']['mean']:.2f}",
+                interval(row["jsd"]),
+                f"> {md['errors'][0]:.2f}" if same is None else f"{same:.2f}",
+                row["worth"]["words"],
+                f"{row['times_faster']:.1f}",
+                " / ".join(f"{value:.2f}" for value in valid),
+            ]
+        )
+    asked = " ".join(dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"]))
+    heads = ["solver, steps", "s/ns", "distance", "MD, same seconds", "worth of MD", "times faster", "0.5 Å / 20 %"]
+    return {
+        "command": f"surromd bench cost-error HELD1 HELD2 {asked}",
+        "machine": measured["machine"]["name"],
+        "note": f"{1e-3 * config['time_ps']:g} ns at each setting, against two held-out runs of "
+        f"{1e-3 * md['length_ps']:g} ns, which are {md['floor']:.3f} apart; {config['threads']} thread(s).",
+        "columns": heads,
+        "rows": rows,
+    }
+
+
+def significant(speed: float) -> str:
+    """Return a speed with four digits at most: 122,100, 59.7."""
+    return f"{float(f'{speed:.4g}'):,.0f}" if speed >= 1000 else f"{speed:.3g}"
+
+
+def spread(ratio: list[float]) -> str:
+    """Return a median with the least and the greatest."""
+    return f"{ratio[0]:.1f} [{ratio[1]:.1f}, {ratio[2]:.1f}]"
+
+
+def interval(found: dict[str, Any]) -> str:
+    """Return a value with its 95 % interval, where it has one."""
+    if found["low"] is None or found["high"] is None:
+        return f"{found['value']:.3f}"
+    return f"{found['value']:.3f} [{found['low']:.3f}, {found['high']:.3f}]"
+
+
+KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "reference_speed": reference_speed,
+    "cost_error": cost_error,
+}
+
+
+def table_text(record: dict[str, Any]) -> str:
+    """Return a table's JSON, a row a line."""
+    others = [(key, value) for key, value in record.items() if key != "rows"]
+    head = [f' "{key}": {json.dumps(value, ensure_ascii=False)}' for key, value in others]
+    rows = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in record["rows"])
+    return "{\n" + ",\n".join(head) + f',\n "rows": [\n{rows}\n ]\n}}\n'
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3 or sys.argv[1] not in KINDS:
+        sys.exit(f"usage: python docs/results/from_bench.py {{{','.join(KINDS)}}} FILE.json")
+    made = KINDS[sys.argv[1]](json.loads(Path(sys.argv[2]).read_text(encoding="utf-8")))
+    (TABLES / f"{sys.argv[1]}.json").write_text(table_text(made), encoding="utf-8")
