@@ -69,9 +69,10 @@ def reproduce(
     """Repeat a published forecasting task: make its data, train, and put our errors under the published ones."""
     from surrogate.bench.reproduce import md17 as molecules
     from surrogate.bench.reproduce import n_body as bodies
-    from surrogate.bench.reproduce.forecast_methods import METHODS, SWITCHES, Settings, without_switches
+    from surrogate.bench.reproduce.forecast_methods import SWITCHES, Settings, without_switches
     from surrogate.bench.reproduce.md17_data import MD17_MOLECULES
     from surrogate.bench.reproduce.md17_methods import METHODS as MOLECULE_METHODS
+    from surrogate.bench.reproduce.n_body_methods import METHODS
     from surrogate.progress import progress_bar
     from surrogate.training.devices import choose_device
 
@@ -106,8 +107,7 @@ def reproduce(
         if of_molecules:
             asked = {"train": train, "validation": validation or test, "test": test}
             found = molecules.reproduce_molecules(
-                folder,
-                settings=settings,
+                settings,
                 molecules=chosen_molecules,
                 methods=chosen,
                 time_ps=parse_time_ps(simulated, "--time"),
@@ -120,12 +120,13 @@ def reproduce(
         else:
             result = bodies.reproduce(
                 name,
-                folder,
+                settings,
                 methods=chosen,
-                settings=settings,
-                n_train=train or bodies.N_TRAIN,
-                n_validation=validation,
-                n_test=test or bodies.N_TEST,
+                sizes={
+                    "train": train or bodies.SIZES["train"],
+                    "validation": validation or max(2, (test or bodies.SIZES["test"]) // 10),
+                    "test": test or bodies.SIZES["test"],
+                },
                 workers=workers,
                 progress=advance,
                 report=lambda row: say(bodies.row_line(row)),

@@ -45,8 +45,6 @@ MANY_PARAMETERS = {
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
     "surrogate/training/loop.py:run_stage": "callbacks beside the settings",
     "surrogate/bench/cost_error/sweep.py:cost_error": "settings of the sweep, one by one",
-    "surrogate/bench/reproduce/md17.py:reproduce_molecules": "settings of the task, one by one",
-    "surrogate/bench/reproduce/n_body.py:reproduce": "settings of the task, one by one",
 }
 
 

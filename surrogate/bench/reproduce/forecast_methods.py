@@ -1,12 +1,13 @@
-"""The methods of `surromd reproduce`: each is trained on a set and forecasts another. What goes beyond the published
-protocol is a field of `Settings` and said in a method's note."""
+"""What the methods of all forecasting tasks have in common: settings, extrapolation, the latent model, and the account
+of what each one costs. What goes beyond the published protocol is a field of `Settings` and said in a method's note."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,17 +18,16 @@ from systems.errors import UnknownNameError, nearest
 if TYPE_CHECKING:
     import torch
 
-    from surrogate.data.particle_sets import ParticleSet
+    from surrogate.models.lam_slide.config import AutoencoderConfig
     from surrogate.models.lam_slide.model import LamSlide
     from surrogate.models.particles.trainer import Training
     from surrogate.training.loop import ProgressFn
 
 Array = npt.NDArray[np.float64]
-# Test set, number of samples -> positions (K, n, n_new, n_particles, 3) nm; K is 1 of what is deterministic.
-Forecast = Callable[["ParticleSet", int], Array]
+# What is forecast: a set of particle systems, or one molecule.
+Subject = TypeVar("Subject")
 
 N_GIVEN, N_NEW, N_SAMPLES = 10, 20, 5
-_BLOCK = 100
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,7 @@ SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical", "predicted
 
 def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
     """Return the settings with these switches off. Raises UnknownNameError."""
-    for one in without:
-        if one not in SWITCHES:
-            known = ", ".join(SWITCHES)
-            raise UnknownNameError(f"unknown switch {one!r}; known: {known}.{nearest(one, list(SWITCHES))}")
+    check_known(switch=(without, SWITCHES))
     return replace(
         settings,
         extrapolate=settings.extrapolate and "extrapolate" not in without,
@@ -96,13 +93,72 @@ def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """A method ready to forecast; `seconds` of training, `note` what it is told and what goes beyond the papers."""
+class Fitted(Generic[Subject]):
+    """A method ready to forecast; `seconds` of training, `note` what it is told and what goes beyond the papers.
 
-    forecast: Forecast
+    `forecast`: the subject, its given frames `(n, n_given, n_atoms, 3)` nm and a number of samples K -> positions
+    `(K, n, n_new, n_atoms, 3)` nm; K is 1 of what is deterministic.
+    """
+
+    forecast: Callable[[Subject, Array, int], Array]
     note: str
     seconds: float = 0.0
     n_parameters: int = 0
+
+
+@dataclass(frozen=True)
+class MethodAccount:
+    """What a method cost, and what is to be said of it."""
+
+    method: str
+    note: str
+    n_parameters: int
+    training_s: float
+    cpu_s: float
+    forecast_s: float
+
+
+def measured(
+    method: str, fit: Callable[[], Fitted[Subject]], tests: Sequence[tuple[Subject, Array]]
+) -> tuple[MethodAccount, list[tuple[Array, Array]]]:
+    """Fit a method; return what it cost, and ADE and FDE (n,) of each of `tests`: a subject and its windows
+    `(n, n_given + n_new, n_atoms, 3)` nm."""
+    cpu = time.process_time()
+    fitted = fit()
+    cpu, began = time.process_time() - cpu, time.perf_counter()
+    errors = [
+        forecast_errors(fitted.forecast(subject, windows[:, :N_GIVEN], N_SAMPLES), windows[:, N_GIVEN:])
+        for subject, windows in tests
+    ]
+    took = time.perf_counter() - began
+    account = MethodAccount(method, fitted.note, fitted.n_parameters, round(fitted.seconds, 1), round(cpu, 1),
+                            round(took, 2))  # fmt: skip
+    return account, errors
+
+
+def check_known(**asked: tuple[Sequence[str], Mapping[str, object] | Sequence[str]]) -> None:
+    """Raise UnknownNameError for a name that is not among the known ones, naming the nearest; `kind=(asked, known)`."""
+    for kind, (names, known) in asked.items():
+        for name in names:
+            if name not in known:
+                raise UnknownNameError(
+                    f"unknown {kind} {name!r}; known: {', '.join(known)}.{nearest(name, list(known))}"
+                )
+
+
+def frozen() -> Fitted[Subject]:
+    """Return the forecast of those who stay: the last given frame."""
+    return extrapolated(polynomial_weights(0, 1))
+
+
+def constant_velocity() -> Fitted[Subject]:
+    """Return the step between the last two given frames, again and again."""
+    return extrapolated(polynomial_weights(1, 2))
+
+
+def extrapolated(weights: Array, note: str = "positions") -> Fitted[Subject]:
+    """Return the forecast of a polynomial, by its weights."""
+    return Fitted(lambda subject, given, n_samples: extrapolate(given, weights)[None], note)
 
 
 def polynomial_weights(degree: int, n_points: int, n_given: int = N_GIVEN, n_new: int = N_NEW) -> Array:
@@ -125,134 +181,30 @@ def extrapolate(given: Array, weights: Array) -> Array:
     return last + np.einsum("ts,nsad->ntad", weights, given - last)
 
 
-def best_polynomial(data: ParticleSet) -> tuple[int, int, Array]:
-    """Return the degree, the points and the weights with the least ADE on a set."""
-    given, truth = data.positions_nm[:, :N_GIVEN], data.positions_nm[:, N_GIVEN:]
-    tried = []
-    for n_points in range(1, N_GIVEN + 1):
-        for degree in range(n_points):
-            weights = polynomial_weights(degree, n_points)
-            ade = forecast_errors(extrapolate(given, weights)[None], truth)[0].mean()
-            tried.append((float(ade), degree, n_points, weights))
-    _, degree, n_points, weights = min(tried, key=lambda entry: entry[0])
-    return degree, n_points, weights
-
-
-def frozen(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """The last given frame."""
-    return _polynomial(polynomial_weights(0, 1), "positions")
-
-
-def constant_velocity(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """The step between the last two given frames, again and again."""
-    return _polynomial(polynomial_weights(1, 2), "positions")
-
-
-def polynomial(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """The polynomial through the last given frames whose degree and number of frames suit the validation set best."""
-    degree, n_points, weights = best_polynomial(validation)
-    return _polynomial(weights, f"positions; degree {degree} through the last {n_points} frames")
-
-
-def _polynomial(weights: Array, note: str) -> Fitted:
-    return Fitted(lambda data, n_samples: extrapolate(data.positions_nm[:, :N_GIVEN], weights)[None], note)
-
-
-def egnn(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """EGNN from the last given frame and its velocity, as in the published row (told of charges and springs)."""
-    import torch
-
-    from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig
-    from surrogate.models.particles.trainer import Tensors, held_jumps, jumps_of, train_egnn
-
-    training = settings.training("egnn")
-    config = EgnnJumpConfig(n_new=N_NEW, lag_ps=train.lag_ps, from_velocity=settings.from_velocity)
-    model = EgnnJump(config)
-    draw = jumps_of(train, N_GIVEN, any_start=settings.any_start)
-    seconds = train_egnn(model, draw, [held_jumps(validation, N_GIVEN)], training)
-    model.cpu()
-    last = N_GIVEN - 1
-
-    @torch.no_grad()
-    def forecast(data: ParticleSet, n_samples: int) -> Array:
-        t = Tensors.of(data)
-        return model.all_frames(t.x[:, last], t.v[:, last], t.types, t.pairs).double().numpy()[None]
-
-    more = beyond({"any start": settings.any_start, "moved on at its velocity": settings.from_velocity})
-    return Fitted(forecast, f"last frame and velocity, pair kinds{more}", seconds, n_parameters(model))
-
-
-def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """A learned force between each pair, integrated; from given positions alone, told of charges and springs."""
-    import torch
-
-    from surrogate.models.particles.model import PairForces, PairForcesConfig
-    from surrogate.models.particles.trainer import train_pair_forces
-
-    training = settings.training("pair-forces")
-    model = PairForces(PairForcesConfig(lag_ps=train.lag_ps))
-    seconds = train_pair_forces(model, train, validation, training)
-    model.double()
-
-    @torch.no_grad()
-    def forecast(data: ParticleSet, n_samples: int) -> Array:
-        given, pairs = torch.from_numpy(data.positions_nm[:, :N_GIVEN]), torch.from_numpy(data.pairs)
-        return model.forecast(given, pairs, N_NEW).numpy()[None]
-
-    note = (
-        f"last {model.config.velocity_frames} positions, pair kinds; beyond the papers: integrates learned pair forces"
-    )
-    return Fitted(forecast, note, seconds, n_parameters(model))
-
-
-def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted:
-    """LaM-SLidE: ten given frames, random identifiers and rotations, loss on predicted frames; told of charges."""
-    import torch
-
-    from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+def latent_forecaster(
+    settings: Settings, autoencoder: AutoencoderConfig, *, latents_per_token: int, width: int, n_layers: int
+) -> LamSlide:
+    """Return LaM-SLidE for windows of this protocol: positions as the task's view makes them, no auxiliary losses."""
+    from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
     from surrogate.models.lam_slide.model import LamSlide
-    from surrogate.models.particles.trainer import encode_windows, train_lam_slide_on_windows, turned_windows
 
-    training = settings.training("lam-slide")
-    degree, _, weights = best_polynomial(validation) if settings.extrapolate else (0, 0, None)
-    view = WindowView.of(train, weights)
-    model = LamSlide(
+    return LamSlide(
         LamSlideConfig(
             canonical=False,
             position_scale_nm=1.0,
-            autoencoder=AutoencoderConfig(
-                n_latents=2, latent_dim=32, width=64, identifier_pool=train.n_particles, n_octaves=3, type_weight=0.0
-            ),
+            autoencoder=autoencoder,
             approximator=ApproximatorConfig(
                 chunk_frames=N_GIVEN + N_NEW,
                 loss_on_given=not settings.predicted_only,
+                clean_conditioning=settings.clean_conditioning,
                 n_conditioning=N_GIVEN,
-                latents_per_token=2,
-                width=128,
-                n_layers=4,
+                latents_per_token=latents_per_token,
+                width=width,
+                n_layers=n_layers,
                 position_weight=0.0,
                 distance_weight=0.0,
             ),
         )
-    )
-    held = validation.first(min(100, len(validation)))
-    seen = [(torch.from_numpy(view.to_model(s.positions_nm)).float(), torch.from_numpy(s.types)) for s in (train, held)]
-    seconds = train_lam_slide_on_windows(model, turned_windows(*seen[0]), [seen[1]], training)
-    model.cpu().eval()
-
-    @torch.no_grad()
-    def forecast(data: ParticleSet, n_samples: int) -> Array:
-        n, types = data.n_particles, torch.from_numpy(data.types)
-        given = data.positions_nm[:, :N_GIVEN]
-        known = encode_windows(model, torch.from_numpy(view.given(given)).float(), types)
-        generator = torch.Generator().manual_seed(settings.seed)
-        seen_ahead = sampled(model, known, n, n_samples, settings, generator)
-        return np.stack([view.from_model(given, sample) for sample in seen_ahead])
-
-    more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate,
-                   "loss on predicted frames alone": settings.predicted_only})  # fmt: skip
-    return Fitted(
-        forecast, f"positions, charges, {settings.solver_steps} solver steps{more}", seconds, n_parameters(model)
     )
 
 
@@ -277,47 +229,6 @@ def sampled(
     return np.stack(samples)
 
 
-@dataclass(frozen=True, eq=False)
-class WindowView:
-    """How LaM-SLidE sees windows `(n, n_frames, n_particles, 3)`: given frames about the mean of the last one's
-    particles in units of `scale_nm`; those to predict likewise or, with `weights`, as the difference from the
-    extrapolation, frame by frame in units of `scales_nm` (n_new,)."""
-
-    scale_nm: float
-    scales_nm: Array
-    weights: Array | None
-
-    @staticmethod
-    def of(data: ParticleSet, weights: Array | None) -> WindowView:
-        """Measure the scales on a set."""
-        x = data.positions_nm
-        about = x - _centre(x[:, :N_GIVEN])
-        scale = float(np.sqrt((about[:, :N_GIVEN] ** 2).mean()))
-        if weights is None:
-            return WindowView(scale, np.full(N_NEW, float(np.sqrt((about**2).mean()))), None)
-        left = x[:, N_GIVEN:] - extrapolate(x[:, :N_GIVEN], weights)
-        return WindowView(scale, np.sqrt((left**2).mean(axis=(0, 2, 3))), weights)
-
-    def given(self, given: Array) -> Array:
-        return (given - _centre(given)) / self.scale_nm
-
-    def to_model(self, windows: Array) -> Array:
-        given, ahead = windows[:, :N_GIVEN], windows[:, N_GIVEN:]
-        rest = (ahead - self._base(given)) / self.scales_nm[:, None, None]
-        return np.concatenate([self.given(given), rest], axis=1)
-
-    def from_model(self, given: Array, seen: Array) -> Array:
-        """Given frames and predicted ones as the model sees them -> predicted positions, nm."""
-        return self._base(given) + seen * self.scales_nm[:, None, None]
-
-    def _base(self, given: Array) -> Array:
-        return _centre(given) if self.weights is None else extrapolate(given, self.weights)
-
-
-def _centre(given: Array) -> Array:
-    return given[:, -1:].mean(axis=2, keepdims=True)
-
-
 def n_parameters(model: torch.nn.Module) -> int:
     """Return how many numbers of a model are learned."""
     return sum(p.numel() for p in model.parameters())
@@ -327,13 +238,3 @@ def beyond(switches: dict[str, bool]) -> str:
     """Return the end of a method's note: the switches that are on and in no paper."""
     on = [name for name, value in switches.items() if value]
     return f"; beyond the paper: {', '.join(on)}" if on else ""
-
-
-METHODS: dict[str, Callable[[ParticleSet, ParticleSet, Settings], Fitted]] = {
-    "frozen": frozen,
-    "constant-velocity": constant_velocity,
-    "polynomial": polynomial,
-    "egnn": egnn,
-    "lam-slide": lam_slide,
-    "pair-forces": pair_forces,
-}

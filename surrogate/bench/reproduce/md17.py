@@ -8,20 +8,28 @@ forecasts that too: out of distribution.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.reproduce.forecast_errors import Estimate, block_means, estimate, forecast_errors
-from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, N_SAMPLES, Settings
+from surrogate.bench.reproduce.forecast_errors import Estimate, block_means, estimate
+from surrogate.bench.reproduce.forecast_methods import (
+    N_GIVEN,
+    N_NEW,
+    N_SAMPLES,
+    Array,
+    MethodAccount,
+    Settings,
+    check_known,
+    measured,
+)
 from surrogate.bench.reproduce.md17_data import MD17_MOLECULES, make_trajectories, read_md17_ethanol, read_windows
 from surrogate.bench.reproduce.md17_methods import METHODS
 from surrogate.bench.reproduce.published import PUBLISHED_MD17
-from systems.errors import UnknownNameError, nearest
 from systems.files.whole_file import create_whole
 
 if TYPE_CHECKING:
@@ -47,18 +55,6 @@ class MoleculeRow:
 
     def to_dict(self) -> dict[str, Any]:
         return vars(self) | {"ade": self.ade.to_dict(), "fde": self.fde.to_dict()}
-
-
-@dataclass(frozen=True)
-class MethodAccount:
-    """What a method cost and what is to be said of it."""
-
-    method: str
-    note: str
-    n_parameters: int
-    training_s: float
-    cpu_s: float
-    forecast_s: float
 
 
 @dataclass(frozen=True)
@@ -88,16 +84,12 @@ class MoleculeReproduction:
 
 def check_names(molecules: Sequence[str], methods: Sequence[str]) -> None:
     """Raise UnknownNameError for a molecule or a method that is not known, naming the nearest."""
-    for kind, asked, known in (("molecule", molecules, MD17_MOLECULES), ("method", methods, tuple(METHODS))):
-        for one in asked:
-            if one not in known:
-                raise UnknownNameError(f"unknown {kind} {one!r}; known: {', '.join(known)}.{nearest(one, list(known))}")
+    check_known(molecule=(molecules, MD17_MOLECULES), method=(methods, METHODS))
 
 
 def reproduce_molecules(
-    folder: Path,
-    *,
     settings: Settings,
+    *,
     molecules: Sequence[str] = MD17_MOLECULES,
     methods: Sequence[str] = tuple(METHODS),
     time_ps: float = 200.0,
@@ -106,42 +98,36 @@ def reproduce_molecules(
     progress: ProgressFn | None = None,
     report: Callable[[MethodAccount], None] | None = None,
 ) -> MoleculeReproduction:
-    """Make the trajectories in `folder` (what is there is kept), fit each method to all molecules, forecast each.
+    """Make the trajectories in `settings.folder`, fit each method to all molecules, forecast each; what is there stays.
 
     `windows` of each molecule by split, the protocol's when not given. Writes md17.json. Raises UnknownNameError, and
     InputError for files of other settings or trajectories that are too short.
     """
     check_names(molecules, methods)
-    paths = make_trajectories(molecules, folder, time_ps=time_ps, seed=settings.seed, progress=progress)
+    paths = make_trajectories(molecules, settings.folder, time_ps=time_ps, seed=settings.seed, progress=progress)
     span, counts = N_GIVEN + N_NEW, windows or WINDOWS
     learned = [read_windows(path, counts, span) for path in paths.values()]
     tested = [*learned, *([read_md17_ethanol(md17_ethanol, span)] if md17_ethanol and "ethanol" in molecules else [])]
+    tests = [(m, m.windows(m.starts["test"])) for m in tested]
     rows: list[MoleculeRow] = []
     accounts: list[MethodAccount] = []
     for method in dict.fromkeys(methods):
-        cpu = time.process_time()
-        fitted = METHODS[method](learned, settings)
-        cpu, began = time.process_time() - cpu, time.perf_counter()
-        rows += [_row(method, m, fitted.forecast) for m in tested]
-        took = time.perf_counter() - began
-        accounts.append(MethodAccount(method, fitted.note, fitted.n_parameters, round(fitted.seconds, 1),
-                                      round(cpu, 1), round(took, 2)))  # fmt: skip
+        account, errors = measured(method, partial(METHODS[method], learned, settings), tests)
+        rows += [_row(method, m, *found) for m, found in zip(tested, errors, strict=True)]
+        accounts.append(account)
         if report is not None:
             report(accounts[-1])
     result = MoleculeReproduction(tuple(rows), tuple(accounts), time_ps, settings.budget_s, settings.seed)
-    create_whole(folder / f"{NAME}.json", json.dumps(result.to_dict(), indent=1))
+    create_whole(settings.folder / f"{NAME}.json", json.dumps(result.to_dict(), indent=1))
     return result
 
 
-def _row(method: str, m: MoleculeWindows, forecast: Callable[[str, Any, int], Any]) -> MoleculeRow:
-    windows = m.windows(m.starts["test"])
-    predicted = forecast(m.name, windows[:, :N_GIVEN], N_SAMPLES)
-    found = forecast_errors(predicted, windows[:, N_GIVEN:])
-    ade, fde = (_estimate(_A_PER_NM * errors, m.blocks["test"]) for errors in found)
-    return MoleculeRow(method, m.label, ade, fde, len(windows), m.n_independent("test"))
+def _row(method: str, m: MoleculeWindows, *errors_nm: Array) -> MoleculeRow:
+    ade, fde = (_estimate(_A_PER_NM * errors, m.blocks["test"]) for errors in errors_nm)
+    return MoleculeRow(method, m.label, ade, fde, len(errors_nm[0]), m.n_independent("test"))
 
 
-def _estimate(errors: np.ndarray[Any, np.dtype[np.float64]], blocks: np.ndarray[Any, np.dtype[np.int64]]) -> Estimate:
+def _estimate(errors: Array, blocks: np.ndarray[Any, np.dtype[np.int64]]) -> Estimate:
     """The mean over windows, its interval from independent stretches drawn again."""
     spread = estimate(block_means(errors, blocks))
     shift = float(errors.mean()) - spread.value

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, Settings, beyond, n_parameters, sampled
+from surrogate.bench.reproduce.forecast_methods import (
+    N_GIVEN,
+    N_NEW,
+    Fitted,
+    Settings,
+    beyond,
+    constant_velocity,
+    frozen,
+    latent_forecaster,
+    n_parameters,
+    sampled,
+)
 from surrogate.bench.reproduce.md17_views import Array, BodyFrame, LinearForecast, MoleculeView
 from surrogate.data.molecule_windows import MoleculeWindows
 
@@ -17,37 +27,12 @@ if TYPE_CHECKING:
 
     from surrogate.models.lam_slide.model import LamSlide
 
-# Name of a molecule, given frames (n, n_given, n_atoms, 3) nm, number of samples -> (K, n, n_new, n_atoms, 3) nm.
-MoleculeForecast = Callable[[str, Array, int], Array]
 _ELEMENTS = (1, 6, 7, 8)
 _HELD = 32
 _BLOCK = 250
 
 
-@dataclass(frozen=True)
-class FittedToMolecules:
-    """A method ready to forecast; `seconds` of training, `note` what goes beyond the papers."""
-
-    forecast: MoleculeForecast
-    note: str
-    seconds: float = 0.0
-    n_parameters: int = 0
-
-
-def frozen(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
-    """The last given frame."""
-    return FittedToMolecules(lambda name, given, n: np.repeat(given[:, -1:], N_NEW, axis=1)[None], "")
-
-
-def constant_velocity(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
-    """The step between the last two given frames, again and again."""
-    ahead = np.arange(1, N_NEW + 1)[None, :, None, None]
-    return FittedToMolecules(
-        lambda name, given, n: (given[:, -1:] + ahead * (given[:, -1:] - given[:, -2:-1]))[None], ""
-    )
-
-
-def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[MoleculeWindows]:
     """Independent modes, each an autoregression over two frames (`models.baselines.NormalModes`), without its noise."""
     import torch
 
@@ -55,43 +40,41 @@ def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fi
     from surrogate.models.baselines.trainer import normal_modes_of
     from surrogate.models.interface import Molecule
 
-    models: dict[str, tuple[MoleculeWindows, NormalModes]] = {}
+    models: dict[str, NormalModes] = {}
     for m in molecules:
         starts = m.every_start["train"]
         triples = m.windows(starts[:: max(1, len(starts) // 10_000)])[:, N_GIVEN - 3 : N_GIVEN]
-        models[m.name] = m, normal_modes_of(_inside_each(m, triples)[1], N_NEW)
+        models[m.name] = normal_modes_of(_inside_each(m, triples)[1], N_NEW)
 
     @torch.no_grad()
-    def forecast(name: str, given: Array, n_samples: int) -> Array:
-        m, model = models[name]
+    def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:
+        model = models[m.name]
         body, inside = _inside_each(m, given[:, -2:])
         noise = torch.zeros(len(given), *model.noise_shape(m.n_atoms))
         about = Molecule(torch.from_numpy(m.elements), torch.ones(m.n_atoms), torch.zeros((0, 2), dtype=torch.int64))
         chunk = model.next_chunk(torch.from_numpy(inside).float(), about, noise)
         return body.leave(chunk.frames_nm.double().numpy())[None]
 
-    return FittedToMolecules(forecast, "last two frames; one model a molecule")
+    return Fitted(forecast, "last two frames; one model a molecule")
 
 
-def linear(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+def linear(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[MoleculeWindows]:
     """The best linear forecast from all given frames in the body frame (`LinearForecast`)."""
-    by_name = {m.name: (m, LinearForecast.fit(m)) for m in molecules}
+    by_name = {m.name: LinearForecast.fit(m) for m in molecules}
 
-    def forecast(name: str, given: Array, n_samples: int) -> Array:
-        m, fitted = by_name[name]
-        return fitted.forecast(m, given)[None]
+    def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:
+        return by_name[m.name].forecast(m, given)[None]
 
-    return FittedToMolecules(forecast, "ten frames; one model a molecule")
+    return Fitted(forecast, "ten frames; one model a molecule")
 
 
-def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[MoleculeWindows]:
     """EGNN from the last given frame and the step to it, one model for all molecules, told of elements and bonds."""
     import torch
 
     from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig
     from surrogate.models.particles.trainer import Jump, train_egnn
 
-    by_name = {m.name: m for m in molecules}
     training = settings.training("egnn")
     model = EgnnJump(
         EgnnJumpConfig(n_types=len(_ELEMENTS), n_new=N_NEW, lag_ps=molecules[0].lag_ps, from_velocity=False)
@@ -117,8 +100,8 @@ def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMo
     seconds = train_egnn(model, draw, held, training)
 
     @torch.no_grad()
-    def forecast(name: str, given: Array, n_samples: int) -> Array:
-        m, found = by_name[name], []
+    def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:
+        found = []
         for begin in range(0, len(given), _BLOCK):
             block = given[begin : begin + _BLOCK]
             j = jump(m, block, block[:, -1]).to(torch.device(settings.device))
@@ -127,10 +110,10 @@ def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMo
         return np.concatenate(found)[None]
 
     note = "last two frames, bonds" + beyond({"any start": settings.any_start})
-    return FittedToMolecules(forecast, note, seconds, n_parameters(model))
+    return Fitted(forecast, note, seconds, n_parameters(model))
 
 
-def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> FittedToMolecules:
+def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[MoleculeWindows]:
     """LaM-SLidE: ten given frames, one model for all molecules, told of elements."""
     import torch
 
@@ -160,8 +143,8 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
     model.eval()
 
     @torch.no_grad()
-    def forecast(name: str, given: Array, n_samples: int) -> Array:
-        view = views[name]
+    def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:
+        view = views[m.name]
         kinds, n = torch.from_numpy(view.molecule.elements).to(device), view.molecule.n_atoms
         x = torch.from_numpy(view.given(given)).float().to(device)
         generator, blocks = torch.Generator().manual_seed(settings.seed), []
@@ -176,7 +159,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
                 "any start": settings.any_start,
                 "loss on predicted frames alone": settings.predicted_only,
                 "clean conditioning frames": settings.clean_conditioning}  # fmt: skip
-    return FittedToMolecules(
+    return Fitted(
         forecast,
         f"ten frames, elements, {settings.solver_steps} solver steps{beyond(switches)}",
         seconds,
@@ -186,29 +169,12 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
 
 def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
     """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
-    from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
-    from surrogate.models.lam_slide.model import LamSlide
+    from surrogate.models.lam_slide.config import AutoencoderConfig
 
-    sizes = {"n_latents": 32, "per_token": 1, "width": 128, "layers": 6} if large else (
-        {"n_latents": 4, "per_token": 4, "width": 192, "layers": 5})  # fmt: skip
-    return LamSlide(
-        LamSlideConfig(
-            canonical=False,
-            position_scale_nm=1.0,
-            autoencoder=AutoencoderConfig(n_latents=sizes["n_latents"], latent_dim=32, n_octaves=3, type_weight=0.01),
-            approximator=ApproximatorConfig(
-                chunk_frames=N_GIVEN + N_NEW,
-                loss_on_given=not settings.predicted_only,
-                clean_conditioning=settings.clean_conditioning,
-                n_conditioning=N_GIVEN,
-                latents_per_token=sizes["per_token"],
-                width=sizes["width"],
-                n_layers=sizes["layers"],
-                position_weight=0.0,
-                distance_weight=0.0,
-            ),
-        )
-    )
+    autoencoder = AutoencoderConfig(n_latents=32 if large else 4, latent_dim=32, n_octaves=3, type_weight=0.01)
+    if large:
+        return latent_forecaster(settings, autoencoder, latents_per_token=1, width=128, n_layers=6)
+    return latent_forecaster(settings, autoencoder, latents_per_token=4, width=192, n_layers=5)
 
 
 def _drawn(m: MoleculeWindows, batch: int, generator: torch.Generator, *, any_start: bool) -> Array:
@@ -229,9 +195,9 @@ def _inside_each(m: MoleculeWindows, frames: Array) -> tuple[BodyFrame, Array]:
     return BodyFrame.of(m, frames), inside
 
 
-METHODS: Mapping[str, Callable[[Sequence[MoleculeWindows], Settings], FittedToMolecules]] = {
-    "frozen": frozen,
-    "constant-velocity": constant_velocity,
+METHODS: Mapping[str, Callable[[Sequence[MoleculeWindows], Settings], Fitted[MoleculeWindows]]] = {
+    "frozen": lambda molecules, settings: frozen(),
+    "constant-velocity": lambda molecules, settings: constant_velocity(),
     "normal-modes": normal_modes,
     "linear": linear,
     "egnn": egnn,

@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.reproduce.forecast_errors import Estimate, estimate, forecast_errors, ratio
-from surrogate.bench.reproduce.forecast_methods import METHODS, N_GIVEN, N_SAMPLES, Array, Settings
+from surrogate.bench.reproduce.forecast_errors import Estimate, estimate, ratio
+from surrogate.bench.reproduce.forecast_methods import (
+    N_GIVEN,
+    N_SAMPLES,
+    Array,
+    MethodAccount,
+    Settings,
+    check_known,
+    measured,
+)
+from surrogate.bench.reproduce.n_body_methods import METHODS
 from surrogate.bench.reproduce.published import PUBLISHED
-from systems.errors import InputError, UnknownNameError, nearest
+from systems.errors import InputError
 from systems.files.whole_file import create_whole
 
 if TYPE_CHECKING:
-    from surrogate.data.particle_sets import ParticleSet
     from surrogate.progress import ProgressFn
 
-# The published sizes: training, validation and test trajectories (LaM-SLidE, section 4.3; GeoTDM).
-N_TRAIN, N_VALIDATION, N_TEST = 3000, 2000, 2000
+# The published sizes: trajectories of each split (LaM-SLidE, section 4.3; GeoTDM). Theirs of validation stop trainings
+# early; ours choose the polynomial and draw the curve of training, and are a tenth of those of test.
+PUBLISHED_SIZES = {"train": 3000, "validation": 2000, "test": 2000}
+SIZES = PUBLISHED_SIZES | {"validation": 200}
 # The method whose published row proves the data alike.
 _OUR_ANCHOR = "egnn"
 
@@ -32,22 +41,20 @@ class Row:
     """One of our methods: errors over the test trajectories in the table's unit, the median of ADE (a few close
     encounters carry the mean), ADE over our EGNN's, and what it cost."""
 
-    method: str
     ade: Estimate
     fde: Estimate
     median_ade: float
     over_egnn: Estimate | None
-    n_parameters: int
-    training_s: float
-    cpu_s: float
-    forecast_s: float
-    note: str
+    account: MethodAccount
+
+    @property
+    def method(self) -> str:
+        return self.account.method
 
     def to_dict(self) -> dict[str, Any]:
-        record = dict(vars(self))
-        for key in ("ade", "fde", "over_egnn"):
-            record[key] = None if record[key] is None else record[key].to_dict()
-        return record
+        errors = {"ade": self.ade.to_dict(), "fde": self.fde.to_dict(), "median_ade": self.median_ade}
+        over = None if self.over_egnn is None else self.over_egnn.to_dict()
+        return {**errors, "over_egnn": over, **vars(self.account)}
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class Reproduction:
         return {
             "name": self.name,
             "sizes": self.sizes,
-            "published_sizes": {"train": N_TRAIN, "validation": N_VALIDATION, "test": N_TEST},
+            "published_sizes": PUBLISHED_SIZES,
             "budget_s": self.budget_s,
             "seed": self.seed,
             "samples": N_SAMPLES,
@@ -77,76 +84,49 @@ class Reproduction:
 
 def check_names(name: str, methods: Sequence[str]) -> None:
     """Raise UnknownNameError for a task or a method that is not known, naming the nearest."""
-    for kind, asked, known in (("task", [name], list(PUBLISHED)), ("method", list(methods), list(METHODS))):
-        for one in asked:
-            if one not in known:
-                raise UnknownNameError(f"unknown {kind} {one!r}; known: {', '.join(known)}.{nearest(one, known)}")
+    check_known(task=([name], PUBLISHED), method=(methods, METHODS))
 
 
 def reproduce(
     name: str,
-    folder: Path,
+    settings: Settings,
     *,
     methods: Sequence[str] = tuple(METHODS),
-    settings: Settings,
-    n_train: int = N_TRAIN,
-    n_validation: int | None = None,
-    n_test: int = N_TEST,
+    sizes: Mapping[str, int] = SIZES,
     workers: int | None = None,
     progress: ProgressFn | None = None,
     report: Callable[[Row], None] | None = None,
 ) -> Reproduction:
-    """Run one task in `folder`: data in NAME.h5 (what is there is kept), training states and curves, NAME.json.
+    """Run one task in `settings.folder`: data in NAME.h5, training states and curves, NAME.json; what is there stays.
 
-    `n_validation` is a tenth of `n_test` when not given: the published protocol names 2,000 and uses them for early
-    stopping, here they choose the polynomial and draw the curve of training. Raises UnknownNameError for
+    `sizes`: trajectories of each split, by its name. Raises UnknownNameError for
     unknown names and InputError for sizes below 2, for a folder with other data, and for splits that overlap.
     """
     from surrogate.bench.reproduce.n_body_data import SEED_STRIDE, make_sets
     from surrogate.data.particle_sets import check_disjoint, read_set
 
     check_names(name, methods)
-    sizes = {"train": n_train, "validation": n_validation or max(2, n_test // 10), "test": n_test}
     for split, n in sizes.items():
         if not 2 <= n <= SEED_STRIDE:
             raise InputError(f"{n} {split} trajectories; between 2 and {SEED_STRIDE} can be made.")
-    path = folder / f"{name}.h5"
-    make_sets(name, path, sizes, workers=workers, progress=progress)
+    path = settings.folder / f"{name}.h5"
+    make_sets(name, path, dict(sizes), workers=workers, progress=progress)
     train, validation, test = (read_set(path, split, n) for split, n in sizes.items())
     check_disjoint([train, validation, test])
     rows: list[Row] = []
     anchor: Array | None = None
     # EGNN first: the others' rows are given relative to it.
     for method in sorted(dict.fromkeys(methods), key=lambda m: m != _OUR_ANCHOR):
-        row, ades = _measure(method, train, validation, test, settings, anchor)
-        anchor = ades if method == _OUR_ANCHOR else anchor
-        rows.append(row)
+        fit = partial(METHODS[method], train, validation, settings)
+        account, [(ade, fde)] = measured(method, fit, [(test, test.positions_nm)])
+        anchor = ade if method == _OUR_ANCHOR else anchor
+        over = None if anchor is None else ratio(ade, anchor)
+        rows.append(Row(estimate(ade), estimate(fde), float(np.median(ade)), over, account))
         if report is not None:
-            report(row)
-    result = Reproduction(name, tuple(rows), sizes, settings.budget_s, settings.seed)
-    create_whole(folder / f"{name}.json", json.dumps(result.to_dict(), indent=1))
+            report(rows[-1])
+    result = Reproduction(name, tuple(rows), dict(sizes), settings.budget_s, settings.seed)
+    create_whole(settings.folder / f"{name}.json", json.dumps(result.to_dict(), indent=1))
     return result
-
-
-def _measure(
-    method: str,
-    train: ParticleSet,
-    validation: ParticleSet,
-    test: ParticleSet,
-    settings: Settings,
-    anchor: Array | None,
-) -> tuple[Row, Array]:
-    cpu = time.process_time()
-    fitted = METHODS[method](train, validation, settings)
-    cpu, began = time.process_time() - cpu, time.perf_counter()
-    predicted = fitted.forecast(test, N_SAMPLES)
-    took = time.perf_counter() - began
-    ade, fde = forecast_errors(predicted, test.positions_nm[:, N_GIVEN:])
-    anchor = ade if method == _OUR_ANCHOR else anchor
-    over = None if anchor is None else ratio(ade, anchor)
-    row = Row(method, estimate(ade), estimate(fde), float(np.median(ade)), over, fitted.n_parameters,
-              round(fitted.seconds, 1), round(cpu, 1), round(took, 2), fitted.note)  # fmt: skip
-    return row, ade
 
 
 def table_lines(result: Reproduction) -> list[str]:
@@ -165,6 +145,6 @@ def table_lines(result: Reproduction) -> list[str]:
 def row_line(row: Row) -> str:
     """Return one of our rows, as it stands in the table."""
     over = "" if row.over_egnn is None else str(row.over_egnn)
-    cost = f"{row.training_s:.0f} s" if row.n_parameters else "-"
+    cost = f"{row.account.training_s:.0f} s" if row.account.n_parameters else "-"
     figures = f"{row.ade!s:>22} {row.fde!s:>24} {row.median_ade:>#8.3g} {over:>20} {cost:>9}"
-    return f"  {row.method:<18}{figures}  {row.note}"
+    return f"  {row.method:<18}{figures}  {row.account.note}"

@@ -12,17 +12,10 @@ import torch
 from typer.testing import CliRunner
 
 from surrogate.bench.reproduce.forecast_errors import estimate, forecast_errors, ratio
-from surrogate.bench.reproduce.forecast_methods import (
-    METHODS,
-    N_GIVEN,
-    Settings,
-    WindowView,
-    best_polynomial,
-    extrapolate,
-    polynomial_weights,
-)
+from surrogate.bench.reproduce.forecast_methods import N_GIVEN, Settings, extrapolate, polynomial_weights
 from surrogate.bench.reproduce.n_body import reproduce, table_lines
 from surrogate.bench.reproduce.n_body_data import make_sets, make_systems, split_seeds
+from surrogate.bench.reproduce.n_body_methods import METHODS, WindowView, best_polynomial
 from surrogate.bench.reproduce.published import PUBLISHED
 from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
@@ -235,7 +228,8 @@ def test_the_velocity_of_a_pair_that_turns_between_two_frames_needs_more_than_tw
 
 def test_the_whole_way_prints_our_rows_under_the_published(tmp_path: Path) -> None:
     settings = Settings(tmp_path, budget_s=None, steps=3, solver_steps=2)
-    run = lambda s: reproduce("n-body-spring", tmp_path, settings=s, n_train=6, n_validation=2, n_test=3, workers=1)  # noqa: E731
+    sizes = {"train": 6, "validation": 2, "test": 3}
+    run = lambda s: reproduce("n-body-spring", s, sizes=sizes, workers=1)  # noqa: E731
     result = run(settings)
     assert {row.method for row in result.rows} == set(METHODS)
     lines = table_lines(result)
@@ -273,6 +267,6 @@ def test_bad_names_are_refused_in_one_line_with_the_nearest(
 
 def test_unknown_names_are_refused_in_python_too(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown task 'md17'"):
-        reproduce("md17", tmp_path, settings=Settings(tmp_path))
+        reproduce("md17", Settings(tmp_path))
     with pytest.raises(InputError, match="1 train trajectories"):
-        reproduce("n-body-spring", tmp_path, settings=Settings(tmp_path), n_train=1)
+        reproduce("n-body-spring", Settings(tmp_path), sizes={"train": 1, "validation": 2, "test": 2})
