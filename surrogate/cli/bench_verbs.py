@@ -92,7 +92,7 @@ def cost_error(
     """
     from surrogate.bench.cost_error.cost_page import markdown
     from surrogate.bench.cost_error.sweep import cost_error as run
-    from surrogate.bench.cost_error.sweep_settings import CostErrorConfig
+    from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Sweep
 
     result = run(
         reference,
@@ -100,11 +100,7 @@ def cost_error(
         weights,
         out,
         CostErrorConfig(time_ps=parse_time_ps(time, "--time"), rounds=rounds, seed=seed),
-        solvers=solver,
-        steps=steps,
-        precisions=None if precision is None else [one.value for one in precision],
-        batches=batch,
-        compiled=compile,
+        Sweep(solver, steps, None if precision is None else [one.value for one in precision], batch, compile),
         report=lambda line: None if quiet or as_json else typer.echo(f"running: {line}", err=True),
     )
     if as_json:

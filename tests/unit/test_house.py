@@ -44,7 +44,6 @@ MANY_PARAMETERS = {
     "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
     "surrogate/training/loop.py:run_stage": "callbacks beside the settings",
-    "surrogate/bench/cost_error/sweep.py:cost_error": "settings of the sweep, one by one",
 }
 
 

@@ -23,7 +23,7 @@ import torch
 from surrogate.bench.cost_error.cost_page import write_cost_error
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
-from surrogate.bench.cost_error.sweep_settings import USUAL_BATCH, CostErrorConfig, Setting, choose_settings
+from surrogate.bench.cost_error.sweep_settings import USUAL_BATCH, CostErrorConfig, Setting, Sweep, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
@@ -44,25 +44,16 @@ def cost_error(
     weights: Sequence[str | Path],
     folder: Path,
     config: CostErrorConfig,
+    sweep: Sweep,
     *,
-    solvers: Sequence[str] | None = None,
-    steps: Sequence[int] | None = None,
-    precisions: Sequence[str] | None = None,
-    batches: Sequence[int] | None = None,
-    compiled: bool = False,
     report: ReportFn = lambda line: None,
 ) -> dict[str, Any]:
     """Measure weights, by name or file, at the settings of `choose_settings`; see `run_cost_error`."""
     from surrogate.data.shipped import weights_path
     from surrogate.data.weights import load_weights
 
-    def settings(one: Weights) -> list[Setting]:
-        return choose_settings(
-            one, solvers=solvers, steps=steps, precisions=precisions, batches=batches, compiled=compiled
-        )
-
     loaded = [load_weights(weights_path(name)) for name in weights]
-    chosen = [(one, settings(one)) for one in loaded]  # what cannot be is said before anything is read
+    chosen = [(one, choose_settings(one, sweep)) for one in loaded]  # what cannot be is said before anything is read
     first, second = find_trajectories(reference), find_trajectories(replicate)
     return run_cost_error(chosen, first, second, folder, config, report=report)
 

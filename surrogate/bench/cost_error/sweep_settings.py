@@ -51,16 +51,19 @@ class CostErrorConfig:
             raise InputError("times must be positive; rounds and threads at least 1.")
 
 
-def choose_settings(
-    weights: Weights,
-    *,
-    solvers: Sequence[str] | None = None,
-    steps: Sequence[int] | None = None,
-    precisions: Sequence[str] | None = None,
-    batches: Sequence[int] | None = None,
-    compiled: bool = False,
-) -> list[Setting]:
-    """Return the settings to run: all combinations of what is given. Without solvers those that take a batch at once.
+@dataclass(frozen=True)
+class Sweep:
+    """What is gone through: all combinations of what is given; None leaves the choice to `choose_settings`."""
+
+    solvers: Sequence[str] | None = None
+    steps: Sequence[int] | None = None
+    precisions: Sequence[str] | None = None
+    batches: Sequence[int] | None = None
+    compiled: bool = False
+
+
+def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
+    """Return the settings to run. Without solvers those that take a batch at once.
 
     Where neither precisions nor batches are given, the usual solver at the usual steps is run in both precisions, alone
     and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
@@ -70,21 +73,23 @@ def choose_settings(
     from surrogate.sampling.config import RolloutConfig
 
     known = weights.model.solvers
-    unknown = [name for name in solvers or () if name not in known]
+    unknown = [name for name in sweep.solvers or () if name not in known]
     if unknown:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
-    chosen: list[str | None] = [*(solvers or [name for name in known if name not in ADAPTIVE])] or [None]
+    chosen: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
     own = RolloutConfig.solver_steps
-    numbers = (steps or STEPS) if known else (own,)
+    numbers = (sweep.steps or STEPS) if known else (own,)
     found = [
         Setting(solver, n, precision, batch)
-        for solver, n, precision, batch in product(chosen, numbers, precisions or ("auto",), batches or (USUAL_BATCH,))
+        for solver, n, precision, batch in product(
+            chosen, numbers, sweep.precisions or ("auto",), sweep.batches or (USUAL_BATCH,)
+        )
     ]
     usual = Setting(chosen[0], own if own in numbers else max(numbers))
-    if not (precisions or batches):
+    if not (sweep.precisions or sweep.batches):
         with_bf16 = choose_precision("auto", suits=weights.model.bf16_by_default).bf16
         found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
         found += [replace(usual, batch=1)]
-    if compiled:
+    if sweep.compiled:
         found += [replace(usual, compile=True)]
     return list(dict.fromkeys(found))

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.stress.frame_statistics import measure_validity
+from surrogate.bench.stress.other_arithmetic import openmm_of
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import find_deviations, match_domain
 from systems.chemistry.validity import Geometry
@@ -155,26 +156,10 @@ def measure_odd_inputs(weights: Weights, *, chunks: int = 4, seed: int = 0) -> l
 
 def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
     """A frame `(n_atoms, 3)` nm of MD at 50 K more than the training's, None for weights that OpenMM cannot follow."""
-    from md_reference.forces.forcefield import resolve
-    from md_reference.forces.spec import ForceFieldSpec
-    from md_reference.run.config import Conditions
-    from md_reference.run.engine import Engine
-
-    conditions, scene = weights.domain.conditions, weights.domain.scene
     try:
-        spec = resolve(scene, ForceFieldSpec.of(conditions))
-        with Engine(
-            scene,
-            Conditions(
-                force=spec,
-                temperature_k=conditions["temperature_k"] + _HOT_K,
-                timestep_ps=conditions["timestep_ps"],
-                seed=seed,
-            ),
-        ) as engine:
-            engine.minimise()
-            engine.thermalise()
-            engine.step(round(5.0 / conditions["timestep_ps"]))
+        timestep_ps = weights.domain.conditions["timestep_ps"]
+        with openmm_of(weights.domain, timestep_ps, seed, hotter_k=_HOT_K) as engine:
+            engine.step(round(5.0 / timestep_ps))
             return engine.positions()
     except (KeyError, SurromdError):
         return None

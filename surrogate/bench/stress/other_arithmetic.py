@@ -137,9 +137,11 @@ def measure_solvers(weights: Weights, *, chunks: int, seed: int = 0) -> list[dic
 
 
 @contextmanager
-def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator[Engine]:
-    """OpenMM under the conditions of training, minimised and with velocities. Raises KeyError where the domain does not
-    say one of these, and what `Engine` raises."""
+def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int, *, hotter_k: float = 0.0) -> Iterator[Engine]:
+    """Yield OpenMM under the conditions of training, `hotter_k` above their temperature, minimised and with velocities.
+
+    Raises KeyError where the domain does not say one of these, and what `Engine` raises.
+    """
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.config import Conditions
@@ -151,7 +153,7 @@ def openmm_of(domain: TrainingDomain, timestep_ps: float, seed: int) -> Iterator
         domain.scene,
         Conditions(
             force=spec,
-            temperature_k=conditions["temperature_k"],
+            temperature_k=conditions["temperature_k"] + hotter_k,
             friction_per_ps=conditions.get("friction_per_ps") or 1.0,
             timestep_ps=timestep_ps,
             seed=seed,

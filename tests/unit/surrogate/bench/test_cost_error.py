@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from surrogate.bench.cost_error.cost_page import crossings, markdown
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.sweep import run_cost_error
-from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, choose_settings
+from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, Sweep, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.cli import main
 from surrogate.data.weights import Weights, load_weights, save_weights
@@ -129,13 +129,13 @@ def test_runs_that_were_trained_on_are_refused(
 
 
 def test_settings_are_combinations_of_what_is_asked(weights: Weights) -> None:
-    usual = choose_settings(weights)
+    usual = choose_settings(weights, Sweep())
     assert Setting("fitted", 4) in usual and Setting("multistep", 10, batch=1) in usual
     assert not any(s.solver == "dopri5" or s.compile for s in usual) and len(set(usual)) == len(usual)
-    one = choose_settings(weights, solvers=["dopri5"], steps=[2], precisions=["fp32"], batches=[1, 4], compiled=True)
+    one = choose_settings(weights, Sweep(["dopri5"], [2], ["fp32"], [1, 4], compiled=True))
     assert [s.label for s in one] == ["dopri5 2, fp32, batch 1", "dopri5 2, fp32, batch 4", "dopri5 2, compiled"]
     with pytest.raises(InputError, match="knows no solver 'rk4'"):
-        choose_settings(weights, solvers=["rk4"])
+        choose_settings(weights, Sweep(solvers=["rk4"]))
 
 
 def test_a_whole_benchmark_is_written_and_gone_on_with(
