@@ -8,12 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import InputError, SimulationError, SurromdError
+from systems.errors import SimulationError, SurromdError
 from systems.files.whole_file import create_whole
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data.weights import TrainingDomain, Weights
+    from surrogate.training.trainer import Trainer
 
 # Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
 # with a guard that helps.
@@ -183,11 +184,13 @@ def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
 
 def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _Rolled) -> list[str]:
     """Return what would help, what is likeliest first."""
+    from surrogate.models.registry import architecture
     from surrogate.training.loss_curves import series
 
     found = _nearer_weights(weights)
-    if _hydrogens_could_be_placed(weights) and 2 * rolled.n_with_hydrogen >= rolled.n_stretched:
-        found.append('hydrogens placed about the heavy atoms instead of learned (model.hydrogens = "placed")')
+    trainer: Trainer = architecture(weights.model.arch).trainer()
+    if 2 * rolled.n_with_hydrogen >= rolled.n_stretched and (better := trainer.stabler(weights)) is not None:
+        found.append(f"{better.reason} ({better.key} = {json.dumps(better.value)})")
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
     rows = list(stages.values())[-1] if stages else []
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
@@ -222,19 +225,3 @@ def _nearer_weights(weights: Weights) -> list[str]:
         if not any(find_deviations(member.scene, domain) for member in own.members):
             return [f"to go on from weights that know such molecules (`start_from='{name}'`), or to roll those"]
     return []
-
-
-def _hydrogens_could_be_placed(weights: Weights) -> bool:
-    from surrogate.data.features.hydrogen_shapes import hydrogen_sites
-    from surrogate.models.lam_slide.config import LamSlideConfig
-
-    config = weights.model.config
-    if not isinstance(config, LamSlideConfig) or config.graph or config.on_heavy_atoms:
-        return False
-    if "from" in weights.provenance or "H" not in weights.domain.scene.elements:
-        return False
-    try:
-        hydrogen_sites(weights.domain.scene)
-    except InputError:
-        return False
-    return True

@@ -11,7 +11,7 @@ from surrogate.data.features.residue_layout import residue_layout
 from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds
 from surrogate.data.references import References
-from surrogate.data.weights import load_weights, read_header
+from surrogate.data.weights import Weights, load_weights, read_header
 from surrogate.models.architecture import Survey
 from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
@@ -66,6 +66,16 @@ class LamSlideTrainer(Trainer):
             if (many or lags) and survey.equilibrium:
                 found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
         return tuple(choice for choice in found if not _is_set(choice.key, request))
+
+    def stabler(self, weights: Weights) -> Choice | None:
+        """Return that hydrogens be placed, where they are learned as atoms and could be."""
+        config: LamSlideConfig = weights.model.config
+        scene = weights.domain.scene
+        if config.graph or config.on_heavy_atoms or "from" in weights.provenance or "H" not in scene.elements:
+            return None
+        if not _works(hydrogen_sites, scene):
+            return None
+        return Choice("model.hydrogens", "placed", "hydrogens placed about the heavy atoms instead of learned")
 
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""

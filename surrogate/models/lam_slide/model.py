@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.autoencoder import AtomCode, Autoencoder
+from surrogate.models.lam_slide.codes.atom_code import AtomCode
 from surrogate.models.lam_slide.codes.atom_tags import AtomEncoder, Atoms, Told, bonds_between, hold_hydrogens
+from surrogate.models.lam_slide.codes.autoencoder import Autoencoder
+from surrogate.models.lam_slide.codes.base import Code
 from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.further_noise import REDRAWS, generators
@@ -24,6 +26,15 @@ from systems.imposed import RIGID_BONDS
 # Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all
 # others.
 MAX_REDRAWS = 12
+
+
+def code_of(config: LamSlideConfig) -> Code:
+    """Return the code that a configuration asks for: of atoms or residues in a few latents, or the atoms themselves."""
+    if config.latents_are_atoms:
+        return AtomCode()
+    if config.residues is not None:
+        return ResidueAutoencoder(config.autoencoder, config.residues, config.position_scale_nm)
+    return Autoencoder(config.autoencoder)
 
 
 class LamSlide(Surrogate):
@@ -46,15 +57,8 @@ class LamSlide(Surrogate):
         ae = config.autoencoder
         self.atom_encoder = AtomEncoder(config.atoms, ae.identifier_dim) if config.graph else None
         tag_dim = ae.identifier_dim if config.graph else 0
-        # Of latents that are atoms: of each of them.
-        n_latents, latent_dim = (1, 3) if config.latents_are_atoms else (ae.n_latents, ae.latent_dim)
-        self.autoencoder: Autoencoder | AtomCode
-        if config.latents_are_atoms:
-            self.autoencoder = AtomCode()
-        elif config.residues is not None:
-            self.autoencoder = ResidueAutoencoder(ae, config.residues, config.position_scale_nm)
-        else:
-            self.autoencoder = Autoencoder(ae)
+        self.autoencoder = code_of(config)
+        n_latents, latent_dim = self.autoencoder.n_latents, self.autoencoder.latent_dim
         self.approximator = Approximator(
             config.approximator, n_latents, latent_dim, tag_dim, of_atoms=config.latents_are_atoms
         )

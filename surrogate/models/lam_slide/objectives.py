@@ -7,9 +7,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.codes.atom_tags import Atoms, Told
-from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
+from surrogate.models.lam_slide.codes.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.model import LamSlide
 
 # The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
@@ -46,18 +45,17 @@ def autoencoder_loss(
     numbers = elements.expand(batch, n_atoms)
     latents = model.autoencoder.encode(x - rest, numbers, identifiers)
     noise = torch.randn(latents.shape, generator=generator).to(x.device)
-    decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_elements=c.type_weight > 0)
+    decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_types=c.type_weight > 0)
     position, distance = reconstruction_losses(x, decoded.positions + rest)
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
-    if decoded.element_logits is not None:
+    if decoded.type_logits is not None:
         types = model.autoencoder.types(numbers)
-        terms["type"] = F.cross_entropy(decoded.element_logits.flatten(0, 1), types.flatten())
+        terms["type"] = F.cross_entropy(decoded.type_logits.flatten(0, 1), types.flatten())
         loss = loss + c.type_weight * terms["type"]
-    if isinstance(model.autoencoder, ResidueAutoencoder):
-        terms["frame"] = model.autoencoder.frame_loss(x, decoded.positions)
-        terms["torsion"] = model.autoencoder.torsion_loss(x, decoded.positions)
-        loss = loss + c.frame_weight * terms["frame"] + c.torsion_weight * terms["torsion"]
+    for name, (share, term) in model.autoencoder.stage_one_terms(x, decoded.positions).items():
+        terms[name] = term
+        loss = loss + share * term
     return loss, {k: v.detach() for k, v in terms.items()}
 
 
@@ -123,7 +121,6 @@ def flow_loss(
         distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
         loss = loss + c.position_weight * position + c.distance_weight * distance
         terms |= {"position": position.detach(), "distance": distance.detach()}
-        if isinstance(model.autoencoder, ResidueAutoencoder):
-            frame = model.autoencoder.frame_loss(clean, decoded, w)
+        if (frame := model.autoencoder.frame_loss(clean, decoded, w)) is not None:
             loss, terms["frame"] = loss + c.frame_weight * frame, frame.detach()
     return loss, terms

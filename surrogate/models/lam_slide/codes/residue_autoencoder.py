@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from surrogate.models.lam_slide.autoencoder import Autoencoder, Decoded
+from surrogate.models.lam_slide.codes.autoencoder import Autoencoder
+from surrogate.models.lam_slide.codes.base import Decoded
 from surrogate.models.lam_slide.codes.residue_code import (
     FRAME_CLAMP_NM,
     N_SLOTS,
@@ -46,11 +47,18 @@ class ResidueAutoencoder(Autoencoder):
         """Atoms `(b, n_atoms, 3)` (scaled), identifiers `(b, n_residues)` -> latents `(b, n_latents, dim)`."""
         return super().encode(self.residues.to_residues(x), self.types(elements), identifiers, mask)
 
-    def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
+    def decode(self, latents: Tensor, identifiers: Tensor, *, with_types: bool = False) -> Decoded:
         """Latents, identifiers `(b, n_residues)` -> atoms `(b, n_atoms, 3)` (scaled), type logits `(b, n_residues,
         types)`."""
-        decoded = super().decode(latents, identifiers, with_elements=with_elements)
-        return Decoded(self.residues.to_atoms(decoded.positions), decoded.element_logits)
+        decoded = super().decode(latents, identifiers, with_types=with_types)
+        return Decoded(self.residues.to_atoms(decoded.positions), decoded.type_logits)
+
+    def stage_one_terms(self, x: Tensor, decoded: Tensor) -> dict[str, tuple[float, Tensor]]:
+        """Return the frame loss and the torsion loss of atoms `(b, n_atoms, 3)` with their weights (Table 12)."""
+        return {
+            "frame": (self.config.frame_weight, self.frame_loss(x, decoded)),
+            "torsion": (self.config.torsion_weight, self.torsion_loss(x, decoded)),
+        }
 
     def frame_loss(self, x: Tensor, decoded: Tensor, weight: Tensor | float = 1.0) -> Tensor:
         """Return the frame loss of atoms `(..., n_atoms, 3)`: the mean error over frames and atoms, scaled units;

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from surrogate.data.features.residue_layout import residue_layout
-from surrogate.models.lam_slide.autoencoder import reconstruction_losses
+from surrogate.models.lam_slide.codes.autoencoder import reconstruction_losses
 from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoencoder
 from surrogate.models.lam_slide.codes.residue_code import (
     N_SLOTS,

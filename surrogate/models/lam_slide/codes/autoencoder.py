@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from surrogate.models.lam_slide.codes.base import Code, Decoded
 from surrogate.models.lam_slide.config import AutoencoderConfig
 from surrogate.models.layers import CrossAttentionBlock, fourier_features
 
 MAX_ATOMIC_NUMBER = 54
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """Positions `(b, n_atoms, 3)` in scaled units and, when asked for, element logits `(b, n_atoms, elements)`."""
-
-    positions: Tensor
-    element_logits: Tensor | None
 
 
 def draw_identifiers(n_atoms: int, pool: int, batch: int, generator: torch.Generator | None) -> Tensor:
@@ -30,12 +21,13 @@ def draw_identifiers(n_atoms: int, pool: int, batch: int, generator: torch.Gener
     return torch.rand(batch, pool, generator=generator, device=device).argsort(dim=1)[:, :n_atoms]
 
 
-class Autoencoder(nn.Module):
+class Autoencoder(Code):
     """Encoder [x, m, u] -> Z (Algorithm 2) and decoder Z, u -> x, m (Algorithm 3)."""
 
     def __init__(self, config: AutoencoderConfig) -> None:
         super().__init__()
         self.config = c = config
+        self.n_latents, self.latent_dim = c.n_latents, c.latent_dim
         self.identifiers = nn.Embedding(c.identifier_pool, c.identifier_dim)
         self.elements = nn.Embedding(MAX_ATOMIC_NUMBER + 1, 16)
         coordinate_dim = 3 * (1 + 2 * c.n_octaves)
@@ -60,7 +52,7 @@ class Autoencoder(nn.Module):
 
     def tags(self, identifiers: Tensor) -> Tensor:
         """Identifiers `(b, n)` -> what tells atoms apart, `(b, n, identifier_dim)`; such tags given stay as they are
-        (lam_slide.atoms makes them of the covalent graph)."""
+        (codes.atom_tags makes them of the covalent graph)."""
         tags: Tensor = identifiers if identifiers.is_floating_point() else self.identifiers(identifiers)
         return tags
 
@@ -84,32 +76,16 @@ class Autoencoder(nn.Module):
         z = self.to_latent(latents).float()
         return F.layer_norm(z, (self.config.latent_dim,))
 
-    def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
+    def decode(self, latents: Tensor, identifiers: Tensor, *, with_types: bool = False) -> Decoded:
         """Latents `(b, n_latents, dim)`, identifiers `(b, n)` -> positions `(b, n, 3)` (scaled), element logits."""
         context = F.layer_norm(latents, (self.config.latent_dim,))
         # The residual stream and the last layer stay in float32: bf16 would round positions to 0.001 nm.
         h = self.query(self.tags(identifiers)).float()
         for block in self.decoder:
             h = block(h, context)
-        logits = self.to_element(h).float() if with_elements else None
+        logits = self.to_element(h).float() if with_types else None
         with torch.autocast(h.device.type, enabled=False):
             return Decoded(self.to_position(h.float()), logits)
-
-
-class AtomCode(nn.Module):
-    """No stage one: a frame's latents are its atoms' displacements from the template, and come back as they are."""
-
-    def n_entities(self, n_atoms: int) -> int:
-        return n_atoms
-
-    def types(self, elements: Tensor) -> Tensor:
-        return elements
-
-    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
-        return x
-
-    def decode(self, latents: Tensor, identifiers: Tensor, *, with_elements: bool = False) -> Decoded:
-        return Decoded(latents, None)
 
 
 def pair_distances(x: Tensor) -> Tensor:
