@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from surrogate.api import (
+        bursts,
         campaign,
         compare,
         demo,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _VERBS = (
+    "bursts",
     "campaign",
     "compare",
     "demo",
@@ -49,6 +51,7 @@ _ELSEWHERE = {
 
 __all__ = [
     "Simulation",
+    "bursts",
     "campaign",
     "compare",
     "demo",

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.data.shipped import weights_path
+from surrogate.verbs.bursts import bursts
 from surrogate.verbs.compare import compare
 from surrogate.verbs.options import CampaignOptions, DemoOptions, PathLike, Trajectories, WindowsOptions
 from surrogate.verbs.outputs import check_outputs, find_trajectories
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison
 
 __all__ = [
+    "bursts",
     "campaign",
     "compare",
     "demo",

@@ -173,6 +173,14 @@ class CompareOptions(Overwriting):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BurstOptions(Quiet, Seeded):
+    """What `bursts` can be told."""
+
+    n_bursts: int = option("Short runs in all, as many from each state.", 300, within=(2, 100_000))
+    burst_ps: float = option("Length of each.", 10.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class DemoOptions(Quiet, Seeded):
     """What `demo` can be told."""
 
