@@ -20,6 +20,7 @@ import numpy.typing as npt
 from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError, TrajectoryError
 from systems.files.checksums import Checksums, check_frames_read, frame_checksums
+from systems.files.outside import UNREADABLE
 from systems.files.whole_file import refuse_existing
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
@@ -186,7 +187,7 @@ class Hdf5Reader(TrajectoryReader):
             block = max(_STRIDED_READ_FRAMES // stride, 1) * stride
             parts = [column[s : min(s + block, stop)][::stride] for s in range(start, stop, block)]
             return np.concatenate(parts).astype(np.float32, copy=False)
-        except (OSError, RuntimeError, ValueError) as error:
+        except UNREADABLE as error:
             if not self._file:
                 raise InputError(f"{self.path} is closed.") from error
             reason = str(error).splitlines()[0]
