@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.elements import ATOMIC_NUMBERS
-from systems.errors import InputError, TrajectoryError
+from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.checksums import Checksums, check_frames_read, frame_checksums
 from systems.files.outside import UNREADABLE
 from systems.files.whole_file import refuse_existing
@@ -190,8 +190,9 @@ class Hdf5Reader(TrajectoryReader):
         except UNREADABLE as error:
             if not self._file:
                 raise InputError(f"{self.path} is closed.") from error
-            reason = str(error).splitlines()[0]
-            raise TrajectoryError(f"{self.path} is damaged in frames {start} to {stop} ({reason}).") from error
+            raise TrajectoryError(
+                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
+            ) from error
 
     def close(self) -> None:
         self._file.close()
