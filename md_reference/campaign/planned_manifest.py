@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -28,7 +27,7 @@ def new_manifest(campaign: Campaign) -> Manifest:
             replica=run.replica,
             seed=run.config.seed,
             file=run.file,
-            settings=_plain(flat_settings(run.config)),
+            settings=flat_settings(run.config),
             n_frames_wanted=run.config.n_frames,
         )
         for run in campaign.runs
@@ -41,10 +40,6 @@ def new_manifest(campaign: Campaign) -> Manifest:
         programs={"python": platform.python_version()} | {name: version(name) for name in ("openmm", "distributed")},
         started=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-
-
-def _plain(value: Any) -> Any:
-    return json.loads(json.dumps(value))
 
 
 def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
@@ -68,7 +63,7 @@ def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
             raise refuse("scenes", name, "without it")
         asked = new.scenes[name]
         for key in ("source", "source_sha256", "preparation"):
-            was, now = getattr(scene, key), _plain(getattr(asked, key))
+            was, now = getattr(scene, key), getattr(asked, key)
             if key == "source" and scene.source_sha256 and scene.source_sha256 == asked.source_sha256:
                 continue  # the same file, moved
             if was != now:

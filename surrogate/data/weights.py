@@ -15,6 +15,7 @@ from surrogate.models.interface import Surrogate
 from surrogate.models.registry import architecture
 from surrogate.models.stiff import StiffPlan, StiffTerms
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
+from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
@@ -22,8 +23,6 @@ from systems.scene import Scene
 FORMAT = "surromd-weights-1"
 # Settings that are no sizes (an interval in ps) may be as large as this, however small the model.
 _LEAST_SIZE = 1_000_000
-# What Python and torch raise on values that no model has.
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, AssertionError)
 _STIFF = "stiff."
 
 
@@ -193,7 +192,7 @@ def load_weights(path: str | Path) -> Weights:
     try:
         _check_sizes(header.config, len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
         model = arch.model(arch.config(header.config))
-    except (*UNREADABLE, ArithmeticError, SurromdError) as error:
+    except (*UNREADABLE, ArithmeticError, AssertionError, SurromdError) as error:
         raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
     stiff = _stiff_terms(path, header.stiff, state)
     try:
