@@ -87,7 +87,8 @@ def companions(path: Path) -> tuple[Path, ...]:
 
 
 def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> TrajectoryReader:
-    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, or any format that MDTraj or MDAnalysis reads.
+    """Open a trajectory for reading: ours, MDTraj's HDF5, a DCD, any format that MDTraj or MDAnalysis reads, or an
+    ASE trajectory where ase is installed.
 
     `top` names a structure or topology file for formats without topology; a DCD of ours finds its companions itself. A
     file without our record has `record == {}` and `flags is None`; one without times has `times_known` False.
@@ -107,6 +108,10 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         from systems.trajectory.dcd_file import DcdReader
 
         return DcdReader(path, top)
+    if path.suffix.lower() == ".traj":
+        from systems.trajectory.ase_file import AseReader
+
+        return AseReader(path, top)
     from systems.trajectory.foreign_scenes import is_mdtraj_format
 
     if is_mdtraj_format(path) and not is_hdf5:

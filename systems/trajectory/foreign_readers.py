@@ -169,9 +169,8 @@ class MdanalysisReader(TrajectoryReader):
                 self.n_frames, self.n_atoms = int(self._reader.n_frames), int(self._reader.n_atoms)
                 self.time_ps, self.times_known = self._times()
         except (ValueError, TypeError) as error:
-            hint = "; an ASE file is converted by `ase convert x.traj x.xyz`" if suffix == ".traj" else ""
             raise TrajectoryError(
-                f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {first_line(error)}{hint}."
+                f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {first_line(error)}."
             ) from error
         except Exception as error:  # each of its readers raises its own kinds
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error

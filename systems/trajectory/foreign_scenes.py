@@ -178,7 +178,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
         positions_nm=positions,
         provenance={"source": top.name},
     )
-    return _with_orders(with_bonds_by_distance(scene))
+    return with_orders(with_bonds_by_distance(scene))
 
 
 def _bare_topology(top: Path) -> Any:
@@ -218,7 +218,8 @@ def _chain_id(chain: Any) -> str:
     return str(given) if given else chr(ord("A") + chain.index % 26)
 
 
-def _with_orders(scene: Scene) -> Scene:
+def with_orders(scene: Scene) -> Scene:
+    """Return the scene with bond orders and charges by valence, unchanged where they cannot be told."""
     try:
         orders, charges = perceive(list(scene.elements), scene.bonds)
     except ValenceError:

@@ -79,5 +79,5 @@ def test_what_cannot_be_read_says_what_is_missing(files: list[Path], tmp_path: P
         compare(files[0], [files[1]], lag_ps=1.0)
     ase = tmp_path / "run.traj"
     ase.write_bytes(b"- of Ulm")
-    with pytest.raises(SurromdError, match=r"ase convert"):
+    with pytest.raises(SurromdError, match=r"run.traj .* by ase"):
         compare(ase, [files[1]], lag_ps=1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
@@ -84,8 +85,30 @@ def test_formats_without_topology_say_so(folder: Path, tmp_path: Path) -> None:
         assert reader.scene is None and reader.n_frames == N
     with pytest.raises(TrajectoryError, match=r"a\.mdcrd cannot be read: .*`top"):
         open_trajectory(folder / "a.mdcrd")
+
+
+def test_an_ase_trajectory(frames: np.ndarray, tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    """Positions in Å, no times; the file's elements, bonds by distance. What ase cannot read is refused."""
+    ase = pytest.importorskip("ase")
+    from ase.io.trajectory import Trajectory
+
+    with Trajectory(str(tmp_path / "x.traj"), "w") as out:
+        for x in frames:
+            out.write(ase.Atoms(alanine_dipeptide.elements, positions=10.0 * x))
+    with open_trajectory(tmp_path / "x.traj") as reader:
+        assert reader.read() == pytest.approx(frames, abs=1e-6) and not reader.times_known
+        assert np.array_equal(reader.read(3, 9, 2), reader.read()[3:9:2])
+        assert reader.read_cells() is None
+        assert reader.scene is not None and reader.scene.molecule_key == alanine_dipeptide.molecule_key
+    (tmp_path / "bad.traj").write_bytes(b"- of Ulm")
+    with pytest.raises(TrajectoryError, match=r"bad\.traj cannot be read by ase"):
+        open_trajectory(tmp_path / "bad.traj")
+
+
+def test_an_ase_trajectory_without_ase_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "x.traj").write_bytes(b"- of Ulm")
-    with pytest.raises(TrajectoryError, match="ase convert"):
+    monkeypatch.setitem(sys.modules, "ase.io.trajectory", None)
+    with pytest.raises(TrajectoryError, match=r"pip install ase.*ase convert"):
         open_trajectory(tmp_path / "x.traj")
 
 
