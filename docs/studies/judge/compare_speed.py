@@ -3,7 +3,8 @@
 Three trajectories of alanine dipeptide (reference, candidate, replicate) are made up: torsions hop between three states
 and wiggle inside them, atoms shake by 2 pm, as many frames as asked for, one per ps. Then `surromd compare` runs on the
 files in a process of its own, reading and report included, and its wall time, processor time and greatest memory are
-printed; `--profile` says where the time goes. Other files than made-up ones: `--files REF TRAJ REPLICATE`.
+printed; `--profile` says where the time goes. Other files than made-up ones: `--files REF TRAJ REPLICATE`; `--paths
+TRAJ TOP` makes three of one trajectory of a large molecule, 200 frames along it with noise.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ SCENE = "alanine-dipeptide"
 TRANSITIONS = np.array([[0.988, 0.010, 0.002], [0.010, 0.988, 0.002], [0.010, 0.010, 0.980]])
 CENTRES_RAD = np.radians([[-75.0, 150.0], [-70.0, -20.0], [60.0, 40.0]])
 SHAKE_NM = 0.002
+PATH_FRAMES = 200
 # Processor time: on a busy machine wall time says little about where it goes.
 _PROFILED = """
 import atexit, cProfile, sys, time
@@ -114,6 +116,28 @@ def write_trajectory(path: Path, n_frames: int, seed: int) -> Path:
     return path
 
 
+def noisy_path(frames: npt.NDArray[np.float32], seed: int, n_frames: int = PATH_FRAMES) -> npt.NDArray[np.float32]:
+    """Return `n_frames` along `frames` `(n, n_atoms, 3)` nm, a frame more or less, every atom shaken by 4 pm."""
+    rng, last = np.random.default_rng(seed), len(frames) - 1
+    at = np.clip(np.linspace(0, last, n_frames) + rng.normal(0, 1, n_frames), 0, last).round().astype(int)
+    return (frames[at] + rng.normal(0, 2 * SHAKE_NM, (n_frames, *frames.shape[1:]))).astype(np.float32)
+
+
+def write_paths(trajectory: Path, top: Path, folder: Path) -> list[Path]:
+    """Write three noisy paths along a trajectory, frames called 1 ps, and return their files."""
+    from systems.trajectory.codec import open_trajectory, open_writer
+
+    with open_trajectory(trajectory, top=top) as reader:
+        scene, frames = reader.scene, reader.read()
+    assert scene is not None
+    paths = []
+    for seed in range(3):
+        paths.append(folder / f"path_{seed}.h5")
+        with open_writer(paths[-1], scene, {"temperature_k": 300.0}, overwrite=True) as writer:
+            writer.append(noisy_path(frames, seed), np.arange(PATH_FRAMES) + 1.0)
+    return paths
+
+
 def time_compare(files: Sequence[Path], report: Path, profile: Path | None = None) -> Timing:
     """Run `surromd compare` on (reference, candidate, replicate) in a process of its own and measure it.
 
@@ -158,12 +182,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--files", type=Path, nargs=3, metavar=("REF", "TRAJ", "REPLICATE"), default=None)
+    parser.add_argument("--paths", type=Path, nargs=2, metavar=("TRAJ", "TOP"), default=None)
     parser.add_argument("--profile", action="store_true", help="run once more under cProfile and say where time goes")
     parser.add_argument("--report", type=Path, default=None, help="keep the report here (.html)")
     parser.add_argument("--json", type=Path, default=None)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         names = ("reference.h5", "candidate.h5", "replicate.h5")
+        if args.paths is not None:
+            args.files = write_paths(*args.paths, Path(folder))
         files = args.files or [write_trajectory(Path(folder) / x, args.frames, k) for k, x in enumerate(names)]
         report = args.report or Path(folder) / "report.html"
         timing = time_compare(files, report)

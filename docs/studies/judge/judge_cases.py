@@ -3,7 +3,8 @@
     python docs/studies/judge/judge_cases.py FOLDER [-o docs/judge_cases.md]
 
 FOLDER holds ala2.pdb and trajectory-1.dcd to trajectory-4.dcd, runs of 10 ns of alanine dipeptide at 1 ps. The first is
-the reference, the third the replicate; every case is made of the second, but where it says otherwise.
+the reference, the third the replicate; every case is made of the second, but where it says otherwise. Two are simulated
+anew with OpenMM as those runs were, one of them too hot.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,12 +31,13 @@ Frames = npt.NDArray[np.float32]
 @dataclass(frozen=True)
 class Case:
     """`make(reference, candidate, another)` are frames `(n, n_atoms, 3)` nm; due are one of `statuses` and `said`, a
-    pattern in verdict, findings or notes (empty: nothing is found)."""
+    pattern in verdict, findings or notes (empty: nothing is found). `temperature_k`: at which MD is run for it."""
 
     name: str
     make: Callable[[Frames, Frames, Frames], Frames]
     statuses: tuple[str, ...]
     said: str = ""
+    temperature_k: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,8 @@ CASES = (
     Case("two runs joined in one file",
          lambda r, x, y: np.concatenate([x[:4000], y[4000:]]), (*FAIR, "different"), "jumps once .*first at 4 ns"),
     Case("0.3 ns of the same MD", lambda r, x, y: x[:300], ("undecided",), "too few to judge by"),
+    Case("0.3 ns of MD made here, at 300 K", lambda r, x, y: x, FAIR, "", 300.0),
+    Case("0.3 ns of MD made here, at 350 K", lambda r, x, y: x, WRONG, "vibrate as at 3[3-6]. K", 350.0),
 )  # fmt: skip
 
 
@@ -91,6 +96,31 @@ def load_runs(folder: Path) -> list[Ensemble]:
     return [load_ensemble([folder / f"trajectory-{k}.dcd"], top=top, lag_ps=1.0) for k in (1, 2, 3, 4)]
 
 
+def simulate(folder: Path, temperature_k: float) -> Frames:
+    """Return 300 ps of MD as the runs in `folder` were made (its README), but for the temperature."""
+    from surrogate import api
+    from surrogate.judge.read.ensemble import load_ensemble
+
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "md.h5"
+        api.reference(
+            folder / "ala2.pdb",
+            path,
+            time_ps=300.0,
+            save_every_ps=1.0,
+            equilibrate_ps=20.0,
+            temperature_k=temperature_k,
+            force_field="ff99SB-ILDN",
+            solvent="amber99-obc",
+            friction_per_ps=91.0,
+            timestep_fs=2.0,
+            hydrogen_mass_da=None,
+            seed=1,
+            quiet=True,
+        )
+        return np.array(load_ensemble([path], template=load_runs(folder)[0].scene).segments[0])
+
+
 def run_cases(folder: Path, cases: Sequence[Case] = CASES) -> list[Outcome]:
     """Judge every case."""
     from surrogate.judge.comparison import compare
@@ -98,10 +128,11 @@ def run_cases(folder: Path, cases: Sequence[Case] = CASES) -> list[Outcome]:
 
     runs = load_runs(folder)
     reference, candidate, _, another = (np.array(r.segments[0]) for r in runs)
-    made = [
-        replace(runs[1], label=case.name, segments=[np.ascontiguousarray(case.make(reference, candidate, another))])
-        for case in cases
-    ]
+    made = []
+    for case in cases:
+        own = candidate if case.temperature_k is None else simulate(folder, case.temperature_k)
+        frames = np.ascontiguousarray(case.make(reference, own, another))
+        made.append(replace(runs[1], label=case.name, segments=[frames]))
     found = compare(runs[0], made, runs[2], options=Options(peptide_recipe=False))
     return [_outcome(case, judgement, found) for case, judgement in zip(cases, found.judgements, strict=True)]
 

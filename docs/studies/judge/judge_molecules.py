@@ -47,10 +47,10 @@ MOLECULES = (
     Molecule("caffeine", "drug", "smiles:Cn1c(=O)c2c(ncn2C)n(C)c1=O", 2000.0),
     Molecule("ibuprofen", "drug", "smiles:CC(C)Cc1ccc(cc1)C(C)C(=O)O", 10_000.0),
     Molecule("lidocaine", "drug", "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 10_000.0),
-    Molecule("valine", "peptide", "ACE-VAL-NME", 4000.0),
-    Molecule("trialanine", "peptide", "ac-ala3-nhme", 1000.0),
-    Molecule("SDFS", "peptide", "SDFS", 500.0),
-    Molecule("chignolin", "protein", "chignolin", 300.0, every_ps=0.5),
+    Molecule("valine", "peptide", "ACE-VAL-NME", 1000.0),
+    Molecule("trialanine", "peptide", "ac-ala3-nhme", 300.0),
+    Molecule("SDFS", "peptide", "SDFS", 200.0),
+    Molecule("chignolin", "protein", "chignolin", 80.0, every_ps=0.2),
     Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 40.0, every_ps=0.2),
 )
 

@@ -60,7 +60,7 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     coordinates = [[projection.project(x) for x in segments] for segments in features]
     model = msm.fit_model(projection, coordinates[0], lag)
     if model is None:
-        return [], [], [(name, "the reference visits too few states")]
+        return [], [], [(name, "the reference visits too few states, or none that hold together")]
     noise_ps = lag_ps * noise_timescale(len(model.centres), lag, trio.reference.features.n_frames)
     if not len(model.timescales) or lag_ps * model.timescales[0] < noise_ps:
         return [], [], [(name, "its slowest process cannot be told from noise")]
