@@ -113,7 +113,7 @@ def simulate(folder: Path, temperature_k: float) -> Frames:
             force_field="ff99SB-ILDN",
             solvent="amber99-obc",
             friction_per_ps=91.0,
-            timestep_fs=2.0,
+            timestep_ps=0.002,
             hydrogen_mass_da=None,
             seed=1,
             quiet=True,

@@ -37,8 +37,12 @@ class Read:
     n_held: int
 
 
-def calibrate(runs: Sequence[Ensemble], lengths_ps: Sequence[float], most: int = 30) -> list[Read]:
+def calibrate(
+    runs: Sequence[Ensemble], lengths_ps: Sequence[float], most: int = 30, truth_ps: float = math.inf
+) -> list[Read]:
     """Return what the worth of pieces of each length is read as, at most `most` pieces of a length.
+
+    Of reference and replicate the first `truth_ps` are used.
 
     Raises InputError for fewer than three runs, or runs without φ and ψ.
     """
@@ -50,6 +54,8 @@ def calibrate(runs: Sequence[Ensemble], lengths_ps: Sequence[float], most: int =
         raise InputError(f"{len(runs)} runs: a reference, a replicate and one to cut candidates from are needed.")
     torsions, geometry, probes = backbone(runs[0].scene), reference_geometry(runs[0]), reference_probes(runs[0])
     reference, replicate, *others = (measure(run, torsions, geometry, probes) for run in runs)
+    n_truth = round(min(truth_ps, reference.total_ps) / runs[0].lag_ps)
+    reference, replicate = reference.frames(0, n_truth), replicate.frames(0, n_truth)
     found = []
     for length_ps in lengths_ps:
         n = round(length_ps / runs[0].lag_ps)
@@ -83,8 +89,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="REF", help="three or more long runs of one simulation")
     parser.add_argument("--lengths", nargs="+", default=["500ps", "1ns", "2ns", "5ns", "10ns", "20ns"])
     parser.add_argument("--most", type=int, default=30, help="pieces of each length at most")
+    parser.add_argument("--truth", default=None, help="use so much of reference and replicate")
     args = parser.parse_args(arguments)
-    found = calibrate(load_runs(args.runs), [parse_time_ps(x) for x in args.lengths], args.most)
+    truth_ps = math.inf if args.truth is None else parse_time_ps(args.truth)
+    found = calibrate(load_runs(args.runs), [parse_time_ps(x) for x in args.lengths], args.most, truth_ps)
     sys.stdout.write(report(found) + "\n")
 
 

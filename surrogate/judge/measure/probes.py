@@ -34,6 +34,7 @@ _MANY_RESIDUES = 5
 _MANY_ATOMS = 100
 _FLAT_RING_NM = 0.01
 _ROUNDS = 5
+_BACKBONE = ("N", "CA", "C", "O", "OXT")
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,16 +312,29 @@ def _contact_pairs(scene: Scene) -> tuple[IntArray, float]:
 
 def _ends(scene: Scene) -> tuple[int, int] | None:
     """The two heavy atoms furthest apart in bonds (the lowest such pair), None below four bonds; of chains of three
-    residues and more the first and the last alpha carbon, lest a long side chain pass for the end."""
-    import networkx as nx
-
+    residues and more the first and the last alpha carbon, of shorter ones atoms of the backbone or of caps, lest a long
+    side chain pass for the end."""
     from systems.chemistry.graph import bonded_graph
 
     alphas = _alpha_carbons(scene)
     chains = [scene.chain_of_residue[r] for r in scene.residue_of_atom[alphas].tolist()]
     if len(alphas) >= 3 and chains.count(chains[0]) >= 3:
         return int(alphas[0]), int(alphas[len(chains) - 1 - chains[::-1].index(chains[0])])
-    graph = bonded_graph(scene).subgraph(scene.heavy_idx.tolist())
+    called: dict[int, set[str]] = {}
+    for i in scene.heavy_idx.tolist():
+        called.setdefault(int(scene.residue_of_atom[i]), set()).add(scene.atom_names[i])
+    chain = [
+        i
+        for i in scene.heavy_idx.tolist()
+        if scene.atom_names[i] in _BACKBONE or not {"N", "CA", "C"} <= called[int(scene.residue_of_atom[i])]
+    ]
+    return _furthest(bonded_graph(scene).subgraph(chain))
+
+
+def _furthest(graph: Any) -> tuple[int, int] | None:
+    """The two atoms of a graph furthest apart in bonds, None below four."""
+    import networkx as nx
+
     best, longest = None, 3
     for component in nx.connected_components(graph):
         start = min(component)

@@ -48,6 +48,18 @@ def test_ends_are_those_of_the_chain() -> None:
     assert ends is not None and [scene.atom_names[i] for i in ends] == ["CA", "CA"]
 
 
+def test_a_long_side_chain_is_no_end_of_a_short_chain() -> None:
+    """Lysine between caps: longest along its side chain; its ends are the caps'. A drug has no side chains."""
+    from systems.prepare.peptide import build_peptide
+    from systems.source import prepare
+
+    scene = build_peptide("ACE-LYS-NME")
+    ends = _ends(scene)
+    assert ends is not None
+    assert {scene.residue_names[scene.residue_of_atom[i]] for i in ends} == {"ACE", "NME"}
+    assert _ends(prepare("smiles:CCCCCC")) is not None
+
+
 def test_both_ends_of_an_interval_share_a_unit() -> None:
     errors = (1.0, 0.1)
     worth = Worth("x", "distribution", "x", 3400.0, 380.0, None, "", 0.1, (80.0, 1e4), errors, errors, errors)
