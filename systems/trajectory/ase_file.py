@@ -10,8 +10,9 @@ import numpy as np
 from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.scene import Scene
-from systems.trajectory.base import Float32Array, Float64Array, TrajectoryReader
+from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import scene_from_structure, with_orders
+from systems.trajectory.frame_block import Float32Array, Float64Array
 
 _NM = 0.1
 
