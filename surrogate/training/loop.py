@@ -102,16 +102,24 @@ class Ema:
             p.copy_(self.shadow[name])
 
 
+@dataclass(frozen=True)
+class StagePlace:
+    """Where a stage runs and writes: its resume `state` (.safetensors), the `log` of its curves (.csv), the device.
+    `resume`: go on from the state, where there is one."""
+
+    state: Path
+    log: Path
+    device: torch.device
+    resume: bool = False
+
+
 def run_stage(
     module: nn.Module,
     config: StageConfig,
     loss_fn: Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]],
     validate_fn: Callable[[], dict[str, float]],
+    place: StagePlace,
     *,
-    state_path: Path,
-    log_path: Path,
-    resume: bool,
-    device: torch.device,
     progress: ProgressFn | None = None,
     on_save: Callable[[float], None] | None = None,
     warn: Callable[[str], None] | None = None,
@@ -124,6 +132,7 @@ def run_stage(
     `warn` hears of a gradient that has outgrown all others (stderr if None). Raises SimulationError when the loss stops
     being finite; the last saved state stays.
     """
+    device = place.device
     fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
     watch = Watch()
     decay: list[nn.Parameter] = []
@@ -138,9 +147,9 @@ def run_stage(
     ema = Ema(module, config.ema_decay)
     generator = torch.Generator().manual_seed(config.seed + SEEDS_APART * fabric.global_rank)
     step, spent_s = 0, 0.0
-    if resume and state_path.exists():
+    if place.resume and place.state.exists():
         step, spent_s = load_state(
-            state_path, module, ema, optimiser, generator, config, process=(fabric.global_rank, fabric.world_size)
+            place.state, module, ema, optimiser, generator, config, process=(fabric.global_rank, fabric.world_size)
         )
     last = time.monotonic()
     next_validation = spent_s + config.validate_every_s
@@ -163,7 +172,7 @@ def run_stage(
             raise SimulationError(
                 f"training stage {config.name!r}: loss or gradient is not finite at step {step}"
                 f"{f', first in {where}' if where else ''}; lower the learning rate (now {config.learning_rate:g}). "
-                f"The last good state is {state_path}."
+                f"The last good state is {place.state}."
             )
         if (warning := watch.see(step, float(norm))) and fabric.is_global_zero:
             (warn or _to_stderr)(f"training stage {config.name!r}: {warning}")
@@ -185,10 +194,10 @@ def run_stage(
                 if on_save is not None:
                     on_save(spent_s)
             sums, n_summed = {}, 0
-            append_row(log_path, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
+            append_row(place.log, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
                                   "learning_rate": config.learning_rate * factor, **metrics,
                                   "warnings": watch.n_warnings})  # fmt: skip
-            save_state(state_path, module, ema, optimiser, generators, step, spent_s, config)
+            save_state(place.state, module, ema, optimiser, generators, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
             # Validation is not training: it is left out of the budget.

@@ -14,7 +14,7 @@ from surrogate.data.weights import save_weights
 from surrogate.models.architecture import Architecture
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.settings import build
-from surrogate.training.loop import StageConfig, run_stage
+from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
 
@@ -99,12 +99,11 @@ class WalkTrainer(Trainer):
         def start(advance: AdvanceFn) -> Path:
             stage = StageConfig("walk", training.batch, training.learning_rate, training.budget_s, training.steps,
                                 warmup_steps=1, seed=training.seed, bf16=False)  # fmt: skip
-            run_stage(
-                model, stage, loss_fn, validate, state_path=request.out.with_suffix(".walk.train.safetensors"),
-                log_path=request.out.with_suffix(".csv"), resume=False, device=torch.device("cpu"),
-                progress=lambda name, share, metrics: advance(name, share),
-            )  # fmt: skip
-            request.out.with_suffix(".walk.train.safetensors").unlink()
+            state = request.out.with_suffix(".walk.train.safetensors")
+            run_stage(model, stage, loss_fn, validate,
+                      StagePlace(state, request.out.with_suffix(".csv"), torch.device("cpu")),
+                      progress=lambda name, share, metrics: advance(name, share))  # fmt: skip
+            state.unlink()
             save_weights(request.out, model, training_domain(frames), provenance_of(frames, {"seed": training.seed}))
             return request.out
 

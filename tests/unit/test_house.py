@@ -38,12 +38,9 @@ MANY_PARAMETERS = {
     "surrogate/judge/rows/shape/contact_rows.py:_mean_row": "the fields of a row, by name",
     "surrogate/judge/rows/shape/wasserstein_rows.py:_row": "the fields of a row, by name",
     "surrogate/models/lam_slide/objectives.py:flow_loss": "the loss' tensors, by name",
-    "surrogate/models/lam_slide/trainer.py:_stage_one": "what both stages share is not yet one value",
-    "surrogate/models/lam_slide/trainer.py:_stage_two": "what both stages share is not yet one value",
     "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
     "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
-    "surrogate/training/loop.py:run_stage": "callbacks beside the settings",
 }
 
 

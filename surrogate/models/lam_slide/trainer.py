@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from surrogate.models.lam_slide.subjects import Subject, normalise_latents, pick
 from surrogate.models.precision import bf16_pays
 from surrogate.models.stiff import StiffTerms
 from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from systems.errors import InputError
 from systems.units import whole_steps
@@ -137,12 +137,13 @@ def train_lam_slide(
     if not resume and is_first_process():
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
+    places = [StagePlace(state, log_path, device, resume) for state in states]
+    shown = _Shown(model, subjects, unseen, kinds, strides)
     if start is None:
         one, two = config.stages(with_autoencoder=model.first_stage is not None)
         spent_one = 0.0
         if model.first_stage is not None:
-            spent_one = _stage_one(model, model.first_stage, subjects, unseen, one, states[0], log_path, resume,
-                                   progress)  # fmt: skip
+            spent_one = _stage_one(shown, model.first_stage, one, places[0], progress)
         normalise_latents(model, subjects, config.seed)
     else:
         _check_start(start, first, model_config)
@@ -161,8 +162,7 @@ def train_lam_slide(
         save_weights(out, whole, of, _provenance(sets, config, spent_one, spent_s, start),
                      stiff=stiff)  # fmt: skip
 
-    spent_two = _stage_two(model, subjects, unseen, two, states[1], log_path, resume, progress, write, config, kinds,
-                           strides)  # fmt: skip
+    spent_two = _stage_two(shown, config, two, places[1], progress, write)
     if is_first_process():
         write(spent_two)
         for path in states:
@@ -228,9 +228,22 @@ def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
     return strides
 
 
-def _stage_one(model: LamSlide, trained: nn.Module, subjects: Sequence[Subject], unseen: Sequence[Subject],
-               stage: StageConfig, state: Path, log: Path, resume: bool,
-               progress: ProgressFn | None) -> float:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What both stages are shown: molecules to learn from, and those held out whole. `kinds` (n_frames,) of the windows
+    from each frame on (data.rarity), where the network is told; `strides` that windows are drawn with."""
+
+    model: LamSlide
+    subjects: list[Subject]
+    unseen: list[Subject]
+    kinds: npt.NDArray[np.int64] | None
+    strides: tuple[int, ...]
+
+
+def _stage_one(
+    shown: _Shown, trained: nn.Module, stage: StageConfig, place: StagePlace, progress: ProgressFn | None
+) -> float:
+    model, subjects, unseen = shown.model, shown.subjects, shown.unseen
     starts = [subject.frames.window_starts(1, validation=False) for subject in subjects]
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -250,8 +263,7 @@ def _stage_one(model: LamSlide, trained: nn.Module, subjects: Sequence[Subject],
             if some
         }
 
-    return run_stage(trained, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
-                     device=model.latent_mean.device, progress=progress)  # fmt: skip
+    return run_stage(trained, stage, loss_fn, validate, place, progress=progress)
 
 
 def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
@@ -266,9 +278,11 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
     return torch.where(backwards, idx.flip(1), idx)
 
 
-def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Subject], stage: StageConfig, state: Path,
-               log: Path, resume: bool, progress: ProgressFn | None, write: Any, config: TrainingConfig,
-               kinds: npt.NDArray[np.int64] | None, strides: tuple[int, ...]) -> float:  # fmt: skip
+def _stage_two(
+    shown: _Shown, config: TrainingConfig, stage: StageConfig, place: StagePlace, progress: ProgressFn | None,
+    write: Callable[[float], None],
+) -> float:  # fmt: skip
+    model, subjects, unseen, kinds, strides = shown.model, shown.subjects, shown.unseen, shown.kinds, shown.strides
     length, device = model.config.approximator.chunk_frames, model.latent_mean.device
     if len(strides) > 1:
         wide = [StrideSampler.of(subject.frames, length, strides) for subject in subjects]
@@ -330,12 +344,11 @@ def _stage_two(model: LamSlide, subjects: Sequence[Subject], unseen: Sequence[Su
     def on_save(spent_s: float) -> None:
         write(spent_s)
         if spent_s >= next_snapshot[0]:
-            out = state.with_name(state.name.replace(".flow.train.safetensors", ".safetensors"))
+            out = place.state.with_name(place.state.name.replace(".flow.train.safetensors", ".safetensors"))
             shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
             next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
 
-    return run_stage(model.second_stage, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
-                     device=device, progress=progress, on_save=on_save)  # fmt: skip
+    return run_stage(model.second_stage, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
 
 
 def _held_windows(

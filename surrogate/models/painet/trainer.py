@@ -16,7 +16,7 @@ from surrogate.data.weights import Weights, save_weights
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet, Structure
 from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
@@ -117,8 +117,8 @@ def train_painet(
                     "every_frame": config.every_frame}  # fmt: skip
         save_weights(out, model, domain, provenance_of(frames, {**settings, "training_s": round(spent_s, 1)}, start))
 
-    spent = run_stage(model, stage, loss_fn, validate, state_path=state, log_path=log_path, resume=resume,
-                      device=device, progress=progress, on_save=write)  # fmt: skip
+    place = StagePlace(state, log_path, device, resume)
+    spent = run_stage(model, stage, loss_fn, validate, place, progress=progress, on_save=write)
     if is_first_process():
         write(spent)
         state.unlink(missing_ok=True)

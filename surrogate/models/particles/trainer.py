@@ -13,7 +13,7 @@ from surrogate.data.particle_sets import ParticleSet
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from surrogate.models.particles.model import EgnnJump, PairForces
-from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 
 # Share of LaM-SLidE's budget that the autoencoder gets.
 STAGE_ONE_SHARE = 0.35
@@ -293,9 +293,6 @@ def _run(
         stage,
         loss_fn,
         validate,
-        state_path=training.state(stage.name),
-        log_path=training.log,
-        resume=training.resume,
-        device=torch.device(training.device),
+        StagePlace(training.state(stage.name), training.log, torch.device(training.device), training.resume),
         progress=training.progress,
     )

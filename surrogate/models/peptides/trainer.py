@@ -20,7 +20,7 @@ from surrogate.models.lam_slide.objectives import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.training.loop import ProgressFn, StageConfig, run_stage
+from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from systems.errors import InputError
 
@@ -174,8 +174,8 @@ def train_peptides(
     if not resume:
         for path in (state, log):
             path.unlink(missing_ok=True)
-    spent = run_stage(model.flow, stage, loss_fn, validate, state_path=state, log_path=log, resume=resume,
-                      device=device, progress=progress, on_save=write)  # fmt: skip
+    place = StagePlace(state, log, device, resume)
+    spent = run_stage(model.flow, stage, loss_fn, validate, place, progress=progress, on_save=write)
     write(spent)
     state.unlink(missing_ok=True)
     return out

@@ -17,7 +17,7 @@ from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.objectives import flow_loss
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
-from surrogate.training.loop import StageConfig, learning_rate_factor, run_stage
+from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.files.toml_file import read_toml
 from systems.scene import Scene
@@ -105,8 +105,7 @@ def test_training_stops_on_nan_and_says_where(tmp_path: Path) -> None:
 
     with pytest.raises(SimulationError, match="not finite at step 0"):
         run_stage(module, StageConfig("toy", 1, 1e-3, steps=3, bf16=False), loss_fn, dict,
-                  state_path=tmp_path / "s", log_path=tmp_path / "l.csv", resume=False,
-                  device=torch.device("cpu"))  # fmt: skip
+                  StagePlace(tmp_path / "s", tmp_path / "l.csv", torch.device("cpu")))  # fmt: skip
     assert torch.isfinite(module.weight).all(), "the last good parameters are kept"
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from surrogate.training.devices import choose_device, is_first_process
 from surrogate.training.health import FACTOR, IN_A_ROW, Watch, first_not_finite
-from surrogate.training.loop import StageConfig, append_row, run_stage
+from surrogate.training.loop import StageConfig, StagePlace, append_row, run_stage
 from surrogate.training.loss_curves import plot_curves, read_curves, series
 from systems.errors import InputError, SimulationError
 
@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 from torch import nn
 from surrogate.training.devices import open_fabric
-from surrogate.training.loop import StageConfig, run_stage
+from surrogate.training.loop import StageConfig, StagePlace, run_stage
 
 folder = Path(sys.argv[1])
 fabric = open_fabric("cpu", False)
@@ -37,8 +37,8 @@ def loss(generator):
     return (model(x) - x.sum(1, keepdim=True)).square().mean(), {}
 
 stage = StageConfig("line", 4, 1e-2, steps=30, warmup_steps=1, bf16=False, validate_every_s=1e9)
-run_stage(model, stage, loss, lambda: {}, state_path=folder / "s.train.safetensors", log_path=folder / "l.csv",
-          resume=False, device=torch.device("cpu"))
+run_stage(model, stage, loss, lambda: {},
+          StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")))
 torch.save({"x": torch.stack(seen), "weights": model.state_dict(), "world": fabric.world_size},
            folder / f"rank{fabric.global_rank}.pt")
 """
@@ -76,8 +76,8 @@ def test_two_processes_train_one_model_on_twice_the_data(tmp_path: Path) -> None
 
 
 def run(folder: Path, model: nn.Module, loss, stage: StageConfig, warn=None) -> None:
-    run_stage(model, stage, loss, dict, state_path=folder / "s.train.safetensors", log_path=folder / "l.csv",
-              resume=False, device=torch.device("cpu"), warn=warn)  # fmt: skip
+    run_stage(model, stage, loss, dict,
+              StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu")), warn=warn)  # fmt: skip
 
 
 def test_devices_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

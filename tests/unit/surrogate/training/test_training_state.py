@@ -10,7 +10,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from surrogate.training.loop import StageConfig, run_stage
+from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from systems.errors import InputError
 
 STAGE = StageConfig("toy", 4, 1e-2, steps=6, bf16=False, validate_every_s=0.0)
@@ -33,8 +33,9 @@ def train(folder: Path, *, resume: bool, stop_at: int | None = None) -> torch.Te
         if stop_at is not None and share >= stop_at / 6:
             raise Stop
 
-    run_stage(module, STAGE, loss_fn, dict, state_path=folder / "s.train.safetensors", log_path=folder / "l.csv",
-              resume=resume, device=torch.device("cpu"), progress=progress)  # fmt: skip
+    run_stage(module, STAGE, loss_fn, dict,
+              StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu"), resume),
+              progress=progress)  # fmt: skip
     return module.weight.detach().clone()
 
 
