@@ -1,27 +1,30 @@
-"""Atomic weights, covalent radii, and the element of a PDB atom name."""
+"""Atomic weights, covalent radii and metals (gemmi's table, but for what it has otherwise), and the element of a PDB
+atom name."""
 
 from __future__ import annotations
 
-from systems.chemistry.residues import template_for
+from functools import cache
+from typing import Any
 
-# Symbol: (standard atomic weight in Da, IUPAC 2021 abridged; covalent radius in nm, Cordero et al., Dalton 2008, 2832).
-_TABLE: dict[str, tuple[float, float]] = {
-    "H": (1.008, 0.031), "He": (4.0026, 0.028), "Li": (6.94, 0.128), "Be": (9.0122, 0.096), "B": (10.81, 0.084),
-    "C": (12.011, 0.076), "N": (14.007, 0.071), "O": (15.999, 0.066), "F": (18.998, 0.057), "Ne": (20.180, 0.058),
-    "Na": (22.990, 0.166), "Mg": (24.305, 0.141), "Al": (26.982, 0.121), "Si": (28.085, 0.111), "P": (30.974, 0.107),
-    "S": (32.06, 0.105), "Cl": (35.45, 0.102), "Ar": (39.95, 0.106), "K": (39.098, 0.203), "Ca": (40.078, 0.176),
-    "Sc": (44.956, 0.170), "Ti": (47.867, 0.160), "V": (50.942, 0.153), "Cr": (51.996, 0.139), "Mn": (54.938, 0.150),
-    "Fe": (55.845, 0.142), "Co": (58.933, 0.138), "Ni": (58.693, 0.124), "Cu": (63.546, 0.132), "Zn": (65.38, 0.122),
-    "Ga": (69.723, 0.122), "Ge": (72.630, 0.120), "As": (74.922, 0.119), "Se": (78.971, 0.120), "Br": (79.904, 0.120),
-    "Kr": (83.798, 0.116), "Rb": (85.468, 0.220), "Sr": (87.62, 0.195), "Mo": (95.95, 0.154), "Ru": (101.07, 0.146),
-    "Rh": (102.91, 0.142), "Pd": (106.42, 0.139), "Ag": (107.87, 0.145), "Cd": (112.41, 0.144), "Sn": (118.71, 0.139),
-    "Sb": (121.76, 0.139), "Te": (127.60, 0.138), "I": (126.90, 0.139), "Xe": (131.29, 0.140), "Cs": (132.91, 0.244),
-    "Ba": (137.33, 0.215), "Pt": (195.08, 0.136), "Au": (196.97, 0.136), "Hg": (200.59, 0.132), "Pb": (207.2, 0.146),
+from systems.chemistry.residues import template_for
+from systems.elements import ATOMIC_NUMBERS
+
+# Standard atomic weights in Da, IUPAC 2021 abridged. gemmi's are older (sulfur 32.065, not 32.06), and the masses of
+# these elements are inputs of shipped weights.
+_WEIGHTS_DA = {
+    "H": 1.008, "He": 4.0026, "Li": 6.94, "Be": 9.0122, "B": 10.81, "C": 12.011, "N": 14.007, "O": 15.999,
+    "F": 18.998, "Ne": 20.18, "Na": 22.99, "Mg": 24.305, "Al": 26.982, "Si": 28.085, "P": 30.974, "S": 32.06,
+    "Cl": 35.45, "Ar": 39.95, "K": 39.098, "Ca": 40.078, "Sc": 44.956, "Ti": 47.867, "V": 50.942, "Cr": 51.996,
+    "Mn": 54.938, "Fe": 55.845, "Co": 58.933, "Ni": 58.693, "Cu": 63.546, "Zn": 65.38, "Ga": 69.723, "Ge": 72.63,
+    "As": 74.922, "Se": 78.971, "Br": 79.904, "Kr": 83.798, "Rb": 85.468, "Sr": 87.62, "Mo": 95.95, "Ru": 101.07,
+    "Rh": 102.91, "Pd": 106.42, "Ag": 107.87, "Cd": 112.41, "Sn": 118.71, "Sb": 121.76, "Te": 127.6, "I": 126.9,
+    "Xe": 131.29, "Cs": 132.91, "Ba": 137.33, "Pt": 195.08, "Au": 196.97, "Hg": 200.59, "Pb": 207.2,
 }  # fmt: skip
-_NOT_METALS = frozenset(
-    ("H", "He", "B", "C", "N", "O", "F", "Ne", "Si", "P", "S", "Cl", "Ar", "Ge", "As", "Se", "Br", "Kr", "Sb", "Te",
-     "I", "Xe")
-)  # fmt: skip
+# Covalent radii in nm where Cordero et al. (Dalton Trans. 2008, 2832) give several, of which gemmi has the smallest:
+# sp3 carbon, high spin.
+_RADII_NM = {"C": 0.076, "Mn": 0.150, "Fe": 0.142, "Co": 0.138}
+# Elements whose names are seldom the beginning of another atom's: these are also known by an atom's name alone.
+_COMMON = frozenset(_WEIGHTS_DA)
 # Names of ions that are not their element's: CHARMM's, and those of the Protein Data Bank.
 _ION_NAMES = {"SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb",
               "BAR": "Ba", "CAD": "Cd", "IOD": "I", "BRO": "Br", "CU1": "Cu", "3CO": "Co", "3NI": "Ni"}  # fmt: skip
@@ -32,18 +35,32 @@ _TWO_LETTER_IN_LIGANDS = ("Cl", "Br", "Si", "Se", "Na", "Mg", "Zn", "Fe", "Li", 
 
 
 def atomic_weight_da(symbol: str) -> float:
-    """Standard atomic weight in dalton. Raises KeyError for a symbol the table lacks."""
-    return _TABLE[symbol][0]
+    """Standard atomic weight in dalton. Raises KeyError for what is no element."""
+    return _WEIGHTS_DA.get(symbol) or float(_element(symbol).weight)
+
+
+def covalent_radius_nm(symbol: str) -> float:
+    """Covalent radius in nm. Raises KeyError for what is no element."""
+    return _RADII_NM.get(symbol) or round(_element(symbol).covalent_r / 10.0, 4)
 
 
 def is_element(symbol: str) -> bool:
-    """Whether the table has this symbol."""
-    return symbol in _TABLE
+    """Whether this is the symbol of a chemical element."""
+    return symbol in ATOMIC_NUMBERS
 
 
 def is_metal(symbol: str) -> bool:
-    """Whether this is a metal of the table."""
-    return symbol in _TABLE and symbol not in _NOT_METALS
+    """Whether this is the symbol of a metal."""
+    return is_element(symbol) and bool(_element(symbol).is_metal)
+
+
+@cache
+def _element(symbol: str) -> Any:
+    from gemmi import Element
+
+    if not is_element(symbol):
+        raise KeyError(symbol)
+    return Element(symbol)
 
 
 def is_lone_ion(symbol: str) -> bool:
@@ -56,12 +73,7 @@ def ion_symbol(name: str) -> str | None:
     upper = name.strip().upper()
     bare = upper.rstrip("+-").rstrip("0123456789").rstrip("+-") or upper
     symbol = _ION_NAMES.get(upper, bare.capitalize())
-    return symbol if is_lone_ion(symbol) else None
-
-
-def covalent_radius_nm(symbol: str) -> float:
-    """Covalent radius in nm. Raises KeyError for a symbol the table lacks."""
-    return _TABLE[symbol][1]
+    return symbol if symbol in _COMMON and is_lone_ion(symbol) else None
 
 
 def repeats_name(name_field: str, residue_name: str, symbol: str) -> bool:
@@ -84,7 +96,7 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     symbol = written.strip("0123456789+- ").capitalize()
     if symbol == "D":
         return "H"
-    if symbol in _TABLE and not repeats_name(name_field, residue_name, symbol):
+    if _is_stated(symbol, name_field) and not repeats_name(name_field, residue_name, symbol):
         return symbol
     name = name_field.strip().upper()
     letters = name.lstrip("0123456789'\"*")
@@ -100,4 +112,12 @@ def element_symbol(name_field: str, residue_name: str, written: str, *, hetero: 
     if residue in ("MSE", "SEC") and two == "Se":
         return two
     first = "H" if letters[0] == "D" and name != letters else letters[0]
-    return first if first in _TABLE else (two if two in _TABLE else None)
+    return first if first in _COMMON else (two if two in _COMMON else None)
+
+
+def _is_stated(symbol: str, name_field: str) -> bool:
+    """Whether an element column is believed. A rare element whose symbol also begins a usual name (HO: holmium, or the
+    hydrogen HO2 of a program that fills the column with names) must be the atom's whole name."""
+    if symbol in _COMMON or not is_element(symbol):
+        return symbol in _COMMON
+    return name_field.strip().upper() == symbol.upper() or symbol[0] not in "BCFHNOPS"

@@ -15,6 +15,7 @@ from systems.prepare.clashes import check_contacts
 from systems.prepare.read.records import AtomRecord
 from systems.scene import Scene
 from systems.source import prepare
+from systems.trajectory.topology_file import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 ROWS = [
@@ -205,3 +206,23 @@ def test_a_table_of_energies_after_the_atoms_is_no_atoms(tmp_path: Path) -> None
     assert said(read(tmp_path, [*ROWS, "TER", "#BEGIN_POSE_ENERGIES_TABLE x.pdb", *table])) == ""
     with pytest.raises(InputError, match="no record of the PDB format"):
         read(tmp_path, [*ROWS[:3], "ATQM  " + ROWS[3][6:], *ROWS[4:]])
+
+
+@pytest.mark.parametrize(
+    ("name", "residue", "column", "element"),
+    [(" W1 ", "POM", "W", "W"), ("IR1 ", "IRI", "IR", "Ir"), ("HO  ", "HO3", "HO", "Ho"), (" U  ", "IUM", "U", "U"),
+     # a program that fills the column with the first letters of names
+     (" HO2", "LIG", "HO", "H"), (" CM ", "LIG", "CM", "Cm"), (" CM1", "LIG", "CM", "C"), (" NO1", "LIG", "NO", "N"),
+     ("MW  ", "SOL", "", None), (" W  ", "W", "", None)],
+)  # fmt: skip
+def test_every_element_is_legal_in_its_column_and_only_the_usual_ones_in_names(name, residue, column, element) -> None:
+    assert element_symbol(name, residue, column, hetero=True) == element
+
+
+def test_an_unusual_metal_is_no_reason_to_refuse_a_file(tmp_path: Path) -> None:
+    lines = pdb_text(ALA2).splitlines()
+    tungsten = "HETATM   99  W   W       9      50.000  50.000  50.000  1.00  0.00           W  "
+    path = tmp_path / "a.pdb"
+    path.write_text("\n".join([*lines[: ALA2.n_atoms + 1], "TER", tungsten, "END", ""]))
+    scene = prepare(str(path))
+    assert molecule_key(scene) == molecule_key(ALA2)
