@@ -53,7 +53,7 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
 
 def _choose(scene: Scene) -> str:
-    rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene, m)]
+    rest = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene.elements, m)]
     others = [m for m in rest if uncovered_residue(part_of(scene, m), "ff14SB") is not None]
     if not others:
         return "ff14SB"
@@ -112,7 +112,7 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
     templated: list[IntArray] = []
     others: list[IntArray] = []
     for atoms in molecules_of(scene):
-        known = len(atoms) == 1 or is_water(scene, atoms)
+        known = len(atoms) == 1 or is_water(scene.elements, atoms)
         if not known and spec.force_field != "gaff2":
             known = uncovered_residue(part_of(scene, atoms), spec.protein) is None
         (templated if known else others).append(atoms)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import networkx as nx
@@ -23,9 +23,9 @@ def molecules_of(scene: Scene) -> list[IntArray]:
     return [np.array(sorted(part), dtype=np.int64) for part in sorted(nx.connected_components(graph), key=min)]
 
 
-def is_water(scene: Scene, atoms: IntArray) -> bool:
+def is_water(elements: Sequence[str], atoms: IntArray) -> bool:
     """Return whether a molecule's atoms are those of water."""
-    return len(atoms) == 3 and sorted(scene.elements[i] for i in atoms.tolist()) == ["H", "H", "O"]
+    return len(atoms) == 3 and sorted(elements[i] for i in atoms.tolist()) == ["H", "H", "O"]
 
 
 def merge(n_atoms: int, parts: Iterable[tuple[IntArray, Any]]) -> Any:

@@ -72,7 +72,7 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         scene = _with_caps_joined(scene)
     topology = scene.to_openmm_topology()
     wanted = [*chain_files(spec.force_field)]
-    needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene, m) for m in molecules_of(scene))
+    needs_water = spec.is_explicit or any(len(m) == 1 or is_water(scene.elements, m) for m in molecules_of(scene))
     water = water_file(spec.force_field, spec.solvent) if needs_water else None
     if water is not None:
         wanted.append(water)
@@ -147,7 +147,7 @@ def _with_virtual_sites(topology: Any, scene: Scene, force_field: Any, names: di
 
 def _with_water_named(scene: Scene) -> Scene:
     """Return the scene with every water molecule called HOH, the name by which OpenMM knows what is rigid."""
-    water = {int(scene.residue_of_atom[m[0]]) for m in molecules_of(scene) if is_water(scene, m)}
+    water = {int(scene.residue_of_atom[m[0]]) for m in molecules_of(scene) if is_water(scene.elements, m)}
     names = tuple("HOH" if r in water else name for r, name in enumerate(scene.residue_names))
     return scene if names == scene.residue_names else replace(scene, residue_names=names)
 

@@ -84,12 +84,12 @@ def measured_platform(
     Raises UnknownNameError for a platform that is not here, PreparationError for a scene without parameters.
     """
     spec, requested = conditions.force, conditions.platform
-    by_size = _by_size(scene, spec, requested, max_threads)
+    by_size = _by_size(scene.n_atoms, spec, requested, max_threads)
     if requested not in ("auto", "CPU") or (requested == "CPU" and max_threads == 1) or not measuring_allowed():
         return by_size
     if spec.force_field == "gfn2-xtb":
         return replace(by_size, name="Reference", threads=1, reason="the quantum program takes all the time of a step")
-    candidates = _candidates(scene, requested, max_threads)
+    candidates = _candidates(scene.n_atoms, requested, max_threads)
     key = timing_key(scene, spec)
     known = recall(key)
     missing = [(name, threads) for name, threads in candidates if f"{name}/{threads}" not in known]
@@ -135,18 +135,18 @@ def _name(timing: Timing) -> str:
     return timing.platform if timing.threads == 1 else f"{timing.platform} on {timing.threads} threads"
 
 
-def _by_size(scene: Scene, spec: ForceFieldSpec, requested: str, max_threads: int) -> PlatformChoice:
-    choice = choose_platform(scene.n_atoms, requested, born=spec.solvent != "vacuum")
+def _by_size(n_atoms: int, spec: ForceFieldSpec, requested: str, max_threads: int) -> PlatformChoice:
+    choice = choose_platform(n_atoms, requested, born=spec.solvent != "vacuum")
     # Unmeasured: the CPU platform's threads are worth it from about a thousand atoms on.
-    if choice.name == "CPU" and scene.n_atoms >= 1000 and max_threads > 1:
+    if choice.name == "CPU" and n_atoms >= 1000 and max_threads > 1:
         return replace(choice, threads=max_threads, reason=f"{choice.reason}, {max_threads} threads from 1000 on")
     return choice
 
 
-def _candidates(scene: Scene, requested: str, max_threads: int) -> list[tuple[str, int]]:
+def _candidates(n_atoms: int, requested: str, max_threads: int) -> list[tuple[str, int]]:
     """Return what is worth timing, the likeliest winners first."""
     threads = [1]
-    if scene.n_atoms < _THREADS_TIMED_ATOMS:
+    if n_atoms < _THREADS_TIMED_ATOMS:
         max_threads = 1
     while threads[-1] * 2 <= max_threads:
         threads.append(threads[-1] * 2)
@@ -155,7 +155,7 @@ def _candidates(scene: Scene, requested: str, max_threads: int) -> list[tuple[st
     found = [("CPU", n) for n in threads if "CPU" in platforms()]
     if requested == "CPU":
         return found
-    if scene.n_atoms <= _REFERENCE_TIMED_ATOMS:
+    if n_atoms <= _REFERENCE_TIMED_ATOMS:
         found.append(("Reference", 1))
     return found + [(name, 1) for name in _DEVICES if name in platforms()]
 

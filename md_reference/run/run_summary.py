@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K
-from systems.scene import Scene
 
 _G_ML_PER_DA_NM3 = 1.66053906660e-3
 # Fewer frames than this carry no error bar.
@@ -59,10 +58,10 @@ def drift(time_ps: npt.ArrayLike, energy_kj_mol: npt.ArrayLike, n_dof: int) -> d
 
 
 def summarise(
-    scene: Scene,
     time_ps: npt.ArrayLike,
     scalars: dict[str, npt.NDArray[np.float64]],
     *,
+    mass_da: float,
     ensemble: str,
     temperature_k: float,
     n_dof: int,
@@ -88,8 +87,7 @@ def summarise(
     if len(known.get("volume_nm3", ())):
         volume = mean_and_error(known["volume_nm3"])
         out["volume_nm3"] = volume
-        mass = float(scene.masses_da.sum())
-        out["density_g_ml"] = mean_and_error(mass * _G_ML_PER_DA_NM3 / known["volume_nm3"])
+        out["density_g_ml"] = mean_and_error(mass_da * _G_ML_PER_DA_NM3 / known["volume_nm3"])
     return out
 
 

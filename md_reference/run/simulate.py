@@ -273,9 +273,9 @@ class _Run:
             block = min(max(1, round(max(_BLOCK_S, FLUSH_SHARE * flushed_s) / per_frame_s)), 1000, 2 * block)
         time_ps, scalars = writer.series()
         summary = summarise(
-            self.scene,
             time_ps,
             scalars,
+            mass_da=float(self.scene.masses_da.sum()),
             ensemble=config.ensemble,
             temperature_k=config.temperature_k,
             n_dof=engine.n_dof,

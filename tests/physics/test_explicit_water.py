@@ -54,7 +54,7 @@ def test_the_solute_comes_first_whole_and_the_box_is_neutral_and_dense() -> None
     density = wet.masses_da.sum() / np.linalg.det(wet.cell_nm) / AVOGADRO_NM3
     assert 0.97 < density < 1.03
     molecules = molecules_of(wet)
-    assert sum(is_water(wet, m) for m in molecules) == len(molecules) - 1 - wet.elements.count("Na") * 2
+    assert sum(is_water(wet.elements, m) for m in molecules) == len(molecules) - 1 - wet.elements.count("Na") * 2
     assert wet.elements.count("Na") == wet.elements.count("Cl") == round(0.2 * sum(map(len, molecules)) / 3 / 55.4)
 
 

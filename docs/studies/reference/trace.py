@@ -1,8 +1,8 @@
 """Functions that are handed a value: how many distinct functions of the project get the Scene in `reference`, the
 windows in `train`, and the trajectories in `compare`.
 
-A function counts once, whatever it is called with, when one of its parameters holds the value; methods of the value's
-own class do not count. Run with another checkout on PYTHONPATH to count there:
+A function counts once, when one of its parameters holds the value or a list of such values; its own constructor and
+comparisons do not count. Run with another checkout on PYTHONPATH to count there:
 
     python docs/studies/reference/trace.py [reference | train | compare] [--list]
 """
@@ -35,6 +35,8 @@ def receivers(run: Callable[[], object], names: tuple[str, ...]) -> dict[str, se
     found: dict[str, set[str]] = {}
 
     def is_one(value: Any) -> bool:
+        if isinstance(value, list | tuple | dict) and value:
+            return is_one(next(iter(value.values() if isinstance(value, dict) else value)))
         return type(value).__name__ in names and type(value).__module__.split(".")[0] in ("systems", "surrogate")
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
@@ -65,7 +67,7 @@ def main(verb: str, *, listed: bool) -> None:
         ref, other = Path(folder) / "ref.h5", Path(folder) / "other.h5"
 
         def reference(out: Path = ref, seed: int = 1) -> object:
-            return sm.reference("alanine-dipeptide", out, time_ps=20.0, save_every_ps=0.2, seed=seed)
+            return sm.reference("alanine-dipeptide", out, time_ps=100.0, save_every_ps=0.1, seed=seed)
 
         if verb != "reference":
             reference()
