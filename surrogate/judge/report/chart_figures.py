@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,6 +37,8 @@ _DASHES: dict[str, Any] = {
     "other": (0, (1, 1.5)),
 }
 _MAX_NAMES = 12
+# Characters in a line of a name beside its bar.
+_NAME_WIDTH = 20
 # Of the height of the axes: what a line of small print takes.
 _NAME_HEIGHT = 0.07
 
@@ -49,7 +52,8 @@ def draw_chart(chart: Chart, temperature_k: float) -> list[Figure]:
         beyond = f"; {100 * outside:.2g} % of the candidate's frames lie outside" if outside > 0 else ""
         return [Figure(histogram(chart), f"Distribution of {chart.label}{beyond}")]
     if isinstance(chart, BarChart):
-        return [Figure(_bars(chart), _caption(chart.title, chart.caption))]
+        shown = f"The first {_MAX_NAMES} of {len(chart.names)}." if len(chart.names) > _MAX_NAMES else ""
+        return [Figure(_bars(chart), _caption(chart.title, " ".join(filter(None, (chart.caption, shown)))))]
     return [Figure(_lines(chart), _caption(chart.title, chart.caption))]
 
 
@@ -107,10 +111,18 @@ def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
             axes.annotate(line.name, (x, y), xytext=(-2, 3), textcoords="offset points", ha="right", fontsize=7)
 
 
+def short_name(name: str) -> str:
+    """Return a name in at most two lines that leave a narrow picture room for what they name; what is cut off ends in
+    an ellipsis."""
+    lines = textwrap.wrap(name, _NAME_WIDTH, max_lines=2, placeholder=" …")
+    return "\n".join(lines) if len(name) > _NAME_WIDTH else name
+
+
 def _bars(chart: BarChart) -> str:
     """Dots with error bars, one row per name: the names stay legible where upright bars would have to turn them."""
-    names = chart.names[:_MAX_NAMES]
+    names = [short_name(name) for name in chart.names[:_MAX_NAMES]]
     n = len(names)
+    height = 0.36 if any("\n" in name for name in names) else 0.24
     series = (
         (chart.reference, chart.reference_low, chart.reference_high, TEXT, "o", -0.2),
         (chart.candidate, chart.candidate_low, chart.candidate_high, CANDIDATE, "s", 0.0),
@@ -125,12 +137,12 @@ def _bars(chart: BarChart) -> str:
             if low is not None and high is not None:
                 axes.hlines(at, low[:n], high[:n], color=colour, linewidth=1.2)
             axes.plot(values[:n], at, linestyle="none", marker=marker, markersize=3.5, color=colour)
-        axes.set_yticks(range(n), labels=names)
+        axes.set_yticks(range(n), labels=names, fontsize=7 if height > 0.3 else 9)
         axes.set_ylim(n - 0.5, -0.5)
         axes.set_xlabel(chart.y_label)
         axes.grid(axis="y", color=LINE, linewidth=0.4)
 
-    return draw(chart.title, (CURVE_SIZE[0], max(1.2, 0.6 + 0.24 * n)), paint)
+    return draw(chart.title, (CURVE_SIZE[0], max(1.2, 0.6 + height * n)), paint)
 
 
 def _landscape(chart: Landscape, temperature_k: float) -> list[Figure]:

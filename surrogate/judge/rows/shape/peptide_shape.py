@@ -16,6 +16,7 @@ Skipped = tuple[str, str]
 
 _ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 _MOST_POINTS = 400
+_LEAST_IN_NS_PS = 2000.0
 _MOST_RESIDUES = 2
 _LEAST_RESIDUES = 5
 _TOLERANCE = 5.0
@@ -42,19 +43,20 @@ def along_time(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
 def _series_chart(trio: Trio, values: Sequence[FloatArray], title: str, y_label: str) -> LineChart:
     shortest = min(map(len, values))
     step = max(1, -(-shortest // _MOST_POINTS))
-    lag_ns = 1e-3 * trio.reference.features.lag_ps
+    lag_ps = trio.reference.features.lag_ps
+    unit, scale = ("ns", 1e-3) if shortest * lag_ps >= _LEAST_IN_NS_PS else ("ps", 1.0)
     lines = []
     for role, series in zip(_ROLES, values, strict=True):
         y: FloatArray = series[:shortest:step]
         if y_label.endswith("°"):
             # An angle that runs over the end of its range is no jump across the picture.
             y = np.asarray(np.where(np.append(np.abs(np.diff(y)) > 180.0, False), np.nan, y), dtype=np.float64)
-        lines.append(Line(role, role, np.arange(len(y), dtype=np.float64) * step * lag_ns, y))
+        lines.append(Line(role, role, np.arange(len(y), dtype=np.float64) * step * lag_ps * scale, y))
     return LineChart(
         section="structure",
         title=title,
         caption=f"First segment of each trajectory, every {step}. frame." if step > 1 else "First segment of each.",
-        x_label="time / ns",
+        x_label=f"time / {unit}",
         y_label=y_label,
         lines=tuple(lines),
     )

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -245,3 +246,37 @@ def test_a_scene_without_torsions_still_has_a_page(tmp_path: Path) -> None:
     written = write_report(compare(made[0], [made[1]]), tmp_path / "water.html")
     text = written.html.read_text("utf-8")
     assert "the scene has no φ or ψ torsion" in text and not Page(text).open
+
+
+def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
+    """Names of hydrogen bonds once took the whole width: axes without room, names cut off at the left."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    from surrogate.judge.report import chart_figures
+    from surrogate.judge.report.chart_figures import short_name
+
+    name = "NZ-HZ1 (LYS 19) ... OE1 (GLU 17) and 5 equal"
+    assert short_name("CA (LYS 10)") == "CA (LYS 10)"
+    assert all(len(line) <= 22 for line in short_name(name).splitlines()) and len(short_name(name).splitlines()) == 2
+    seen: list[float] = []
+
+    def draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None]) -> str:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.add_subplot()
+        paint(figure, axes)
+        figure.draw_without_rendering()
+        seen.append(min(t.get_window_extent().x0 for t in axes.get_yticklabels()))
+        seen.append(axes.get_position().width)
+        return ""
+
+    chart = BarChart("structure", "x", "", "frames / %", (name, name), *(np.array([1.0, 2.0]) for _ in range(3)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chart_figures, "draw", draw)
+        chart_figures.draw_chart(chart, 300.0)
+        patch.setattr(chart_figures, "short_name", lambda name: name)
+        chart_figures.draw_chart(chart, 300.0)
+    assert seen[0] >= 0 and seen[1] > 0.4
+    assert seen[2] < 0 or seen[3] < 0.4, "negative control: whole names do not fit"
