@@ -16,7 +16,7 @@ from result_tables import TABLES, read_table, table_markdown
 
 
 def test_every_table_of_results_can_be_shown_and_is_shown() -> None:
-    pages = "".join(page.read_text(encoding="utf-8") for page in TABLES.parent.glob("*.md"))
+    pages = "".join(page.read_text(encoding="utf-8") for page in TABLES.parents[1].rglob("*.md"))
     shown = set(re.findall(r"```\{results\} (\w+)", pages))
     assert shown == {path.stem for path in TABLES.glob("*.json")}
     for name in shown:
