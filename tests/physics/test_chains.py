@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from energies import energy_terms
 from md_reference.forces import nonstandard
 from md_reference.forces.capped_residues import cap
 from md_reference.forces.forcefield import build_system, resolve
@@ -25,24 +26,10 @@ from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
-from systems.scene import FloatArray, Scene
+from systems.scene import Scene
 from systems.source import prepare
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
-
-
-def energies(system: Any, positions_nm: FloatArray) -> dict[str, float]:
-    """Energy in kJ/mol by force, in double precision."""
-    import openmm
-
-    for group, force in enumerate(system.getForces()):
-        force.setForceGroup(group)
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
-    context.setPositions(positions_nm)
-    return {
-        force.getName(): context.getState(energy=True, groups={group}).getPotentialEnergy()._value
-        for group, force in enumerate(system.getForces())
-    }
 
 
 def leap_scene(
@@ -93,7 +80,10 @@ def test_phosphorylated_residues_have_tleaps_energies(name: str, tmp_path: Path)
     scene, theirs = leap_scene(f"ACE ALA {name} GLY NME", tmp_path, ("protein.ff14SB", "phosaa14SB"))
     spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
     assert spec.force_field == "ff14SB"
-    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    ours, expected = (
+        energy_terms(build_system(scene, spec), scene.positions_nm),
+        energy_terms(theirs, scene.positions_nm),
+    )
     for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
         assert ours[force] == pytest.approx(expected[force], abs=0.02), force
     # Impropers of rings depend on the order of their atoms (`regrouping`): two of 4.6 kJ/mol in a tyrosine.
@@ -115,8 +105,8 @@ def test_a_template_gives_each_term_of_the_molecule_it_was_made_of(name: str) ->
     assert template.spread_e == pytest.approx(0.0, abs=1e-6)
     ours = app.ForceField(io.StringIO(template.xml)).createSystem(scene.to_openmm_topology(), removeCMMotion=False)
     x = scene.positions_nm + 0.005 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
-    theirs = energies(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
-    for force, energy in energies(ours, x).items():
+    theirs = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
+    for force, energy in energy_terms(ours, x).items():
         assert energy == pytest.approx(theirs[force], abs=1e-4), force
 
 
@@ -227,7 +217,10 @@ def test_nucleic_acids_have_tleaps_energies(sequence: str, source: str, tmp_path
     scene, theirs = leap_scene(sequence, tmp_path, (source,))
     spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
     assert spec.force_field == "ff14SB"
-    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    ours, expected = (
+        energy_terms(build_system(scene, spec), scene.positions_nm),
+        energy_terms(theirs, scene.positions_nm),
+    )
     for force, energy in expected.items():
         if force in ours:
             assert ours[force] == pytest.approx(energy, rel=2e-4, abs=0.3), force
@@ -256,7 +249,10 @@ def test_a_glycopeptide_has_tleaps_energies(names: dict[str, str], tmp_path: Pat
     scene, theirs = glycopeptide(tmp_path, names)
     spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
     assert spec.force_field == "ff14SB"
-    ours, expected = energies(build_system(scene, spec), scene.positions_nm), energies(theirs, scene.positions_nm)
+    ours, expected = (
+        energy_terms(build_system(scene, spec), scene.positions_nm),
+        energy_terms(theirs, scene.positions_nm),
+    )
     for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
         assert ours[force] == pytest.approx(expected[force], rel=1e-5, abs=0.05), force
     assert ours["PeriodicTorsionForce"] == pytest.approx(expected["PeriodicTorsionForce"], abs=0.3)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from energies import energy_terms
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.small_molecules import gaff, parameter_cache
 from md_reference.forces.small_molecules.ambertools import find_ambertools
@@ -61,20 +62,6 @@ def shuffled(scene: Scene, order: np.ndarray) -> Scene:
     )
 
 
-def terms(system: Any, positions_nm: FloatArray) -> dict[str, float]:
-    """Energy in kJ/mol by force, in double precision."""
-    import openmm
-
-    for group, force in enumerate(system.getForces()):
-        force.setForceGroup(group)
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
-    context.setPositions(positions_nm)
-    return {
-        force.getName(): context.getState(energy=True, groups={group}).getPotentialEnergy()._value
-        for group, force in enumerate(system.getForces())
-    }
-
-
 def sander(prmtop: str, positions_nm: FloatArray, folder: Path, *, igb: int = 6) -> dict[str, float]:
     """Energies in kJ/mol of Amber's sander, by its own names (igb=6: vacuum)."""
     tools = find_ambertools()
@@ -112,7 +99,7 @@ def test_each_term_equals_sanders(name: str, cache_home: Path, tmp_path: Path) -
     scene = scene_of(name)
     x = distorted(scene)
     theirs = sander(gaff.parameters(scene), x, tmp_path)
-    ours = terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
+    ours = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), x)
     # sander prints four decimals of a kcal/mol and has 332.0522 for Coulomb's constant, OpenMM 332.0637: 3.5e-5.
     pairs = theirs["VDWAALS"] + theirs["EEL"] + theirs["1-4VDW"] + theirs["1-4EEL"]
     coulomb = abs(theirs["EEL"]) + abs(theirs["1-4EEL"])
@@ -121,7 +108,7 @@ def test_each_term_equals_sanders(name: str, cache_home: Path, tmp_path: Path) -
     assert ours["PeriodicTorsionForce"] == pytest.approx(theirs["DIHED"], abs=2e-3)
     assert ours["NonbondedForce"] == pytest.approx(pairs, abs=5e-3 + 4e-5 * coulomb)
     # Negative control: the energies of another geometry differ by more than a hundred times these tolerances.
-    other = terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), distorted(scene, 1))
+    other = energy_terms(build_system(scene, ForceFieldSpec("gaff2", "vacuum", None, False)), distorted(scene, 1))
     for force in ("HarmonicBondForce", "HarmonicAngleForce"):
         assert abs(other[force] - ours[force]) > 0.2
 
@@ -142,14 +129,14 @@ def test_born_energy_equals_sanders(solvent: str, igb: int, radii: str, cache_ho
     born = next(f for f in system.getForces() if "GB" in type(f).__name__)
     if solvent == "obc2":
         born.setSurfaceAreaEnergy(0.0)
-        ours = terms(system, x)[born.getName()]
+        ours = energy_terms(system, x)[born.getName()]
     else:
         # The surface term is the energy that stays when all charges are zero.
-        ours = terms(system, x)[born.getName()]
+        ours = energy_terms(system, x)[born.getName()]
         for k in range(born.getNumParticles()):
             parameters = list(born.getParticleParameters(k))
             born.setParticleParameters(k, [0.0, *parameters[1:]])
-        ours -= terms(system, x)[born.getName()]
+        ours -= energy_terms(system, x)[born.getName()]
     assert ours == pytest.approx(theirs, rel=2e-4)
     assert abs(theirs) > 100.0
 
@@ -158,7 +145,10 @@ def test_born_energy_equals_sanders(solvent: str, igb: int, radii: str, cache_ho
 def test_native_and_custom_obc2_agree_for_gaff_molecules(cache_home: Path) -> None:
     scene = scene_of("acetamide")
     x, spec = distorted(scene), ForceFieldSpec("gaff2", "obc2", None, False)
-    native, custom = terms(build_system(scene, spec), x), terms(build_system(scene, spec, native_gb=False), x)
+    native, custom = (
+        energy_terms(build_system(scene, spec), x),
+        energy_terms(build_system(scene, spec, native_gb=False), x),
+    )
     assert native["GBSAOBCForce"] == pytest.approx(custom["CustomGBForce"], abs=1e-3)
 
 
@@ -173,15 +163,15 @@ def test_shuffled_atoms_have_the_same_energy_through_the_cache(name: str, cache_
     known = set((cache_home / "parameters").iterdir())
     x = distorted(scene)
     spec = ForceFieldSpec("gaff2", "vacuum", None, False)
-    here = terms(build_system(scene, spec), x)
+    here = energy_terms(build_system(scene, spec), x)
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(scene.n_atoms)
         other = shuffled(scene, order)
-        there = terms(build_system(other, spec), x[order])
+        there = energy_terms(build_system(other, spec), x[order])
         for force, energy in here.items():
             assert there[force] == pytest.approx(energy, abs=1e-9)
         # Negative control: the parameters in the old order give another energy.
-        wrong = terms(load_openmm(gaff.parameters(scene)).createSystem(removeCMMotion=False), x[order])
+        wrong = energy_terms(load_openmm(gaff.parameters(scene)).createSystem(removeCMMotion=False), x[order])
         assert abs(sum(wrong.values()) - sum(here.values())) > 1.0
     assert set((cache_home / "parameters").iterdir()) == known
 
@@ -234,12 +224,12 @@ def test_a_permuted_prmtop_keeps_every_term() -> None:
     text = gaff.parameters(scene)
     assert Prmtop(Prmtop(text).text()).fields == Prmtop(text).fields
     x = distorted(scene)
-    here = terms(load_openmm(text).createSystem(removeCMMotion=False), x)
+    here = energy_terms(load_openmm(text).createSystem(removeCMMotion=False), x)
     for seed in range(5):
         order = np.random.default_rng(seed).permutation(scene.n_atoms)
         moved = np.empty_like(x)
         moved[order] = x
-        there = terms(load_openmm(Prmtop(text).permuted(order).text()).createSystem(removeCMMotion=False), moved)
+        there = energy_terms(load_openmm(Prmtop(text).permuted(order).text()).createSystem(removeCMMotion=False), moved)
         for force, energy in here.items():
             assert there[force] == pytest.approx(energy, abs=1e-9)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from energies import energy_terms
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.small_molecules.ambertools import find_ambertools, run
 from md_reference.forces.spec import ForceFieldSpec
@@ -60,19 +61,6 @@ def sander(folder: Path, positions_nm: FloatArray, igb: int) -> dict[str, float]
     return {name.replace(" ", ""): float(value) * KJ_PER_KCAL for name, value in found}
 
 
-def terms(system: Any, positions_nm: FloatArray) -> dict[str, float]:
-    import openmm
-
-    for group, force in enumerate(system.getForces()):
-        force.setForceGroup(group)
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
-    context.setPositions(positions_nm)
-    return {
-        force.getName(): context.getState(energy=True, groups={group}).getPotentialEnergy()._value
-        for group, force in enumerate(system.getForces())
-    }
-
-
 @pytest.mark.parametrize(
     ("force_field", "solvent", "igb", "radii", "name"),
     [
@@ -90,7 +78,7 @@ def test_each_term_equals_ambers(
     x = scene.positions_nm + 0.004 * np.random.default_rng(0).normal(size=scene.positions_nm.shape)
     theirs = sander(tmp_path, x[of_theirs], igb)
     system = build_system(scene, ForceFieldSpec(force_field, solvent, None, False))
-    ours = terms(system, x)
+    ours = energy_terms(system, x)
     assert ours["HarmonicBondForce"] == pytest.approx(theirs["BOND"], abs=5e-3)
     assert ours["HarmonicAngleForce"] == pytest.approx(theirs["ANGLE"], abs=5e-3)
     assert ours["PeriodicTorsionForce"] == pytest.approx(theirs["DIHED"], abs=5e-3)
@@ -108,7 +96,7 @@ def test_each_term_equals_ambers(
     # Negative control: the other model's radii and functions are far outside this.
     other = build_system(scene, ForceFieldSpec(force_field, "obc2" if solvent == "gbn2" else "gbn2", None, False))
     wrong = next(f for f in other.getForces() if "GB" in type(f).__name__)
-    value = terms(other, x)[wrong.getName()]
+    value = energy_terms(other, x)[wrong.getName()]
     assert abs(value - with_zero_charges(other, wrong, x) - theirs["EGB"]) > 2 * within * abs(theirs["EGB"])
 
 
@@ -118,7 +106,7 @@ def test_arginine_has_its_radii_whatever_its_residue_is_called() -> None:
     scene = prepare("sequence:ACE-ARG-NME")
     unnamed = replace(scene, residue_names=("UNL",) * 3, atom_names=tuple(f"X{k}" for k in range(scene.n_atoms)))
     spec, x = ForceFieldSpec("ff14SB", "gbn2", None, False), scene.positions_nm
-    named, other = (terms(build_system(s, spec), x)["CustomGBForce"] for s in (scene, unnamed))
+    named, other = (energy_terms(build_system(s, spec), x)["CustomGBForce"] for s in (scene, unnamed))
     assert other == pytest.approx(named, abs=1e-9)
 
 
@@ -130,7 +118,7 @@ def with_zero_charges(system: Any, born: Any, x: FloatArray) -> float:
             born.setParticleParameters(k, 0.0, radius, scale)
         else:
             born.setParticleParameters(k, [0.0, *list(born.getParticleParameters(k))[1:]])
-    return terms(system, x)[born.getName()]
+    return energy_terms(system, x)[born.getName()]
 
 
 @pytest.mark.slow
