@@ -15,7 +15,7 @@ from surrogate.verbs.takes import takes
 from systems.errors import InputError
 
 if TYPE_CHECKING:
-    from surrogate.judge.bursts import BurstCheck
+    from surrogate.judge.burst_check import BurstCheck
 
 _NEEDED = ("force_field", "solvent", "temperature_k", "timestep_ps")
 
@@ -26,8 +26,8 @@ def bursts(rollout: Trajectories, *, options: BurstOptions) -> BurstCheck:
 
     `rollout`: a trajectory whose file says under which conditions its weights were trained, or several replicas.
     `n_bursts` starts are spread evenly over the rollout's metastable states; each is run for `burst_ps` with velocities
-    drawn anew (surrogate.judge.bursts). The result says whether transitions agree and how far reweighted populations
-    are from the rollout's; it is no worth in ns, and says nothing of states that the rollout never visits.
+    drawn anew (`surrogate.judge.burst_check`). The result says whether transitions agree and how far reweighted
+    populations are from the rollout's; it is no worth in ns, and says nothing of states that the rollout never visits.
     Raises InputError for a trajectory that does not say its conditions or has no two states, SimulationError when MD
     cannot be run from a frame.
     """
@@ -36,7 +36,7 @@ def bursts(rollout: Trajectories, *, options: BurstOptions) -> BurstCheck:
     from md_reference.run.config import Conditions
     from md_reference.run.engine import Engine
     from md_reference.run.frame_relaxation import Relaxer
-    from surrogate.judge.bursts import States, judge_bursts
+    from surrogate.judge.burst_check import States, judge_bursts
     from surrogate.judge.read.ensemble import load_ensemble
 
     paths = find_trajectories(rollout)

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from surrogate.judge.bursts import Burst, States, judge_bursts
+from surrogate.judge.burst_check import Burst, States, judge_bursts
 from surrogate.judge.read.ensemble import Ensemble
 from systems.errors import InputError
 from systems.scene import Scene
