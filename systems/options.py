@@ -11,6 +11,7 @@ import types
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
+from inspect import get_annotations
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -190,15 +191,17 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def options_of(kind: type) -> dict[str, Option]:
-    """Return the options of a dataclass by name, in order."""
+    """Return the options of a dataclass by name: its own, then those of its bases, each in the order they stand in."""
     return _options_of(kind)
 
 
 @cache
 def _options_of(kind: Hashable) -> dict[str, Option]:
-    hints = get_type_hints(cast(type, kind))
-    return {f.name: Option(f.name, hints[f.name], f.default, f.metadata[_KEY])
-            for f in fields(cast(Any, kind)) if _KEY in f.metadata}  # fmt: skip
+    made = cast(Any, kind)
+    hints = get_type_hints(made)
+    declared = {f.name: f for f in fields(made) if _KEY in f.metadata}
+    order = dict.fromkeys(name for each in made.__mro__ for name in get_annotations(each) if name in declared)
+    return {name: Option(name, hints[name], declared[name].default, declared[name].metadata[_KEY]) for name in order}
 
 
 def check_options(settings: Any) -> None:

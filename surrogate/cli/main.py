@@ -254,7 +254,7 @@ def rollout(
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareShown(Quiet, CompareOptions):
+class CompareShown(CompareOptions, Quiet):
     """What `compare` can be told, and what the command does about its result."""
 
     show_all: bool = option("Print every row, not the verdict alone.", False, words=("all",))

@@ -112,28 +112,24 @@ class MDSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions(Preparation, Replicated, MDSettings):
+class PlanOptions(MDSettings, Replicated, Preparation):
     """What `plan` can be told."""
 
     time_ps: float | None = option("Estimate the wall time of a run this long.", None)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ReferenceTime:
-    time_ps: float = option("Simulated time, such as 10ns.")
-    save_every_ps: float | None = option("Interval between saved frames.", None, unset="1ps")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReferenceOptions(Quiet, Overwriting, Resuming, Seeded, Preparation, Replicated, MDSettings, _ReferenceTime):
+class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """What `reference` can be told."""
 
+    time_ps: float = option("Simulated time, such as 10ns.")
+    save_every_ps: float | None = option("Interval between saved frames.", None, unset="1ps")
     save_velocities: bool = option("Keep them with each frame (.h5).", False)
     save_forces: bool = option("Keep them with each frame (.h5).", False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(Quiet, Overwriting, Resuming, Preparation, Replicated, RolloutConfig):
+class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriting, Quiet):
     """What `rollout` can be told."""
 
 
@@ -147,7 +143,7 @@ class CampaignOptions(Quiet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowsOptions(Quiet, Overwriting, Validated):
+class WindowsOptions(Validated, Overwriting, Quiet):
     """What `windows` can be told."""
 
     velocities: bool = option("Keep velocities, which painet learns from.", False)
@@ -173,7 +169,7 @@ class CompareOptions(Overwriting):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BurstOptions(Quiet, Seeded):
+class BurstOptions(Seeded, Quiet):
     """What `bursts` can be told."""
 
     n_bursts: int = option("Short runs in all, as many from each state.", 300, within=(2, 100_000))
@@ -181,7 +177,7 @@ class BurstOptions(Quiet, Seeded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(Quiet, Seeded):
+class DemoOptions(Seeded, Quiet):
     """What `demo` can be told."""
 
     reference_ps: float = option("Of each of two OpenMM runs.", 3_000.0, words=None)
@@ -190,7 +186,7 @@ class DemoOptions(Quiet, Seeded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions(Quiet, Overwriting, Resuming, Seeded, Validated):
+class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
     """What `train` can be told. What is left open is chosen to suit the references, and said with its reason."""
 
     arch: str | None = option(

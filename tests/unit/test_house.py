@@ -20,9 +20,6 @@ COMMON_NAMES = {"__init__", "architecture", "config", "model", "base", "choices"
 
 # May only become shorter: a line goes when what it names is mended.
 MANY_PARAMETERS = {
-    "surrogate/cli/bench_verbs.py:cost_error": "typer: one parameter an option",
-    "surrogate/cli/bench_verbs.py:stress": "typer: one parameter an option",
-    "surrogate/cli/reproduce_verb.py:reproduce": "typer: one parameter an option",
     "surrogate/judge/comparison.py:_judge": "the comparison's conditions, one by one",
     "surrogate/judge/rows/block_means.py:shift_row": "the fields of a row, by name",
     "surrogate/judge/rows/rows.py:observable_row": "the fields of a row, by name",

@@ -140,7 +140,8 @@ def test_what_the_command_line_may_not_say() -> None:
 
 def test_a_signature_lists_them_with_their_documentation() -> None:
     shown = inspect.signature(verb).parameters
-    assert list(shown)[:3] == ["scene", "time_ps", "save_every_ps"]
+    assert list(shown)[:3] == ["scene", "temperature_k", "guard"], "its own before those of its base"
+    assert list(shown).index("time_ps") > list(shown).index("quiet")
     assert list(shown)[-2:] == ["options", "config"]
     assert shown["time_ps"].default is inspect.Parameter.empty and shown["temperature_k"].default == 300.0
     text = inspect.getdoc(verb) or ""

@@ -1,10 +1,9 @@
 """Run time against error: a surrogate at many settings beside OpenMM at many lengths, on one core.
 
-`surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of
-the φ/ψ map against two held-out runs, its cost the processor time of this process, one thread. Before each of its parts
-OpenMM runs for a moment, so that the ratio of the two does not hang on what else the machine does. MD's own error is
-that of pieces of one held-out run against the whole of the other (`judge.worth`): it is taken to be the same at each
-time step, by simulated time.
+`surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of the φ/ψ map against two held-
+out runs, its cost the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so
+that the ratio of the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out
+run against the whole of the other (`judge.worth`): it is taken to be the same at each time step, by simulated time.
 """
 
 from __future__ import annotations
@@ -23,7 +22,14 @@ import torch
 from surrogate.bench.cost_error.cost_page import write_cost_error
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
-from surrogate.bench.cost_error.sweep_settings import USUAL_BATCH, CostErrorConfig, Setting, Sweep, choose_settings
+from surrogate.bench.cost_error.sweep_settings import (
+    USUAL_BATCH,
+    CostErrorConfig,
+    CostErrorOptions,
+    Setting,
+    Sweep,
+    choose_settings,
+)
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
@@ -31,6 +37,7 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.verbs.options import Trajectories
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError, StorageError, SurromdError
+from systems.options import part_of
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -43,8 +50,7 @@ def cost_error(
     replicate: Trajectories,
     weights: Sequence[str | Path],
     folder: Path,
-    config: CostErrorConfig,
-    sweep: Sweep,
+    options: CostErrorOptions,
     *,
     report: ReportFn = lambda line: None,
 ) -> dict[str, Any]:
@@ -53,9 +59,10 @@ def cost_error(
     from surrogate.data.weights import load_weights
 
     loaded = [load_weights(weights_path(name)) for name in weights]
+    sweep = part_of(options, Sweep)
     chosen = [(one, choose_settings(one, sweep)) for one in loaded]  # what cannot be is said before anything is read
     first, second = find_trajectories(reference), find_trajectories(replicate)
-    return run_cost_error(chosen, first, second, folder, config, report=report)
+    return run_cost_error(chosen, first, second, folder, part_of(options, CostErrorConfig), report=report)
 
 
 def run_cost_error(

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
+from surrogate.verbs.options import Quiet
 from systems.errors import InputError
+from systems.options import check_options, option
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -34,32 +36,42 @@ class Setting:
         return ", ".join(words + (["compiled"] if self.compile else []))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CostErrorConfig:
     """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
     `settle_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
 
-    time_ps: float = 20_000.0
-    settle_ps: float = 100.0
-    rounds: int = 4
-    slice_ps: float = 40.0
-    threads: int = 1
-    seed: int = 0
+    time_ps: float = option("Rolled at each setting, all replicas together.", 20_000.0)
+    settle_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
+    rounds: int = option("Parts, by turns with OpenMM.", 4, within=(1, None))
+    slice_ps: float = option("Of MD before each part.", 40.0, words=None)
+    threads: int = option("Of both.", 1, within=(1, None), words=None)
+    seed: int = option("Of every random number.", 0, within=(0, None))
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0 or self.threads < 1:
-            raise InputError("times must be positive; rounds and threads at least 1.")
+        check_options(self)
+        if self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0:
+            raise InputError("times must be positive.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sweep:
     """What is gone through: all combinations of what is given; None leaves the choice to `choose_settings`."""
 
-    solvers: Sequence[str] | None = None
-    steps: Sequence[int] | None = None
-    precisions: Sequence[str] | None = None
-    batches: Sequence[int] | None = None
-    compiled: bool = False
+    solvers: Sequence[str] | None = option("Only this; repeatable.", None, words=("solver",))
+    steps: Sequence[int] | None = option("Repeatable.", None, within=(1, None), unset=", ".join(map(str, STEPS)))
+    precisions: Sequence[str] | None = option(
+        "Repeatable.", None, choices=("auto", "fp32", "bf16"), words=("precision",)
+    )
+    batches: Sequence[int] | None = option(
+        "Replicas; repeatable.", None, within=(1, None), words=("batch",), unset=str(USUAL_BATCH)
+    )
+    compiled: bool = option("The usual setting compiled, too.", False, words=("compile",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostErrorOptions(CostErrorConfig, Sweep, Quiet):
+    """What `bench cost-error` can be told: what is the same for all settings, and which settings."""
 
 
 def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:

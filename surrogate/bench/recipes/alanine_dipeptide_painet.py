@@ -262,9 +262,10 @@ def judge(weights: Path, held: Path) -> IntegratorReport:
 
 def stress(weights: Path, folder: Path, lengths: list[int], guards: list[str]) -> dict[str, Any]:
     """Run `surromd stress` in lengths of `lengths` frames under each guard; sections that were run stay."""
+    from surrogate.bench.stress.stress_options import StressOptions
     from surrogate.bench.stress.trials import choose_config, stress_weights
 
-    config = choose_config(frames=lengths, guards=guards)
+    config = choose_config(StressOptions(frames=lengths, guards=guards))
     return stress_weights(weights, folder, config, report=lambda name: _say(f"stress: {name}\n"))
 
 

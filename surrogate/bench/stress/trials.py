@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from systems.errors import InputError, SimulationError, StorageError, SurromdErr
 from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:
+    from surrogate.bench.stress.stress_options import StressOptions
     from surrogate.data.weights import Weights
 
 SECTIONS = ("length", "invariance", "inputs", "precision", "batches", "solvers", "openmm")
@@ -55,24 +56,16 @@ class StressConfig:
 QUICK = StressConfig(frames=(1_000,), replicas=4, chunks=2, openmm_frames=20, compiled=False)
 
 
-def choose_config(
-    *,
-    quick: bool = False,
-    frames: Sequence[int] | None = None,
-    replicas: int | None = None,
-    guards: Sequence[str] | None = None,
-    sections: Sequence[str] | None = None,
-    seed: int = 0,
-) -> StressConfig:
+def choose_config(options: StressOptions) -> StressConfig:
     """Return the usual or the quick settings, with what is given in their place. Raises InputError."""
-    usual = QUICK if quick else StressConfig()
+    usual = QUICK if options.quick else StressConfig()
     return replace(
         usual,
-        frames=tuple(frames) if frames else usual.frames,
-        replicas=replicas or usual.replicas,
-        guards=tuple(guards) if guards else usual.guards,
-        sections=tuple(sections) if sections else usual.sections,
-        seed=seed,
+        frames=tuple(options.frames or usual.frames),
+        replicas=options.replicas or usual.replicas,
+        guards=tuple(options.guards or usual.guards),
+        sections=tuple(options.sections or usual.sections),
+        seed=options.seed,
     )
 
 

@@ -14,6 +14,7 @@ from md_reference.run.engine import Engine
 from surrogate.bench.stress.frame_statistics import measure_bonds, measure_drift, measure_validity
 from surrogate.bench.stress.odd_inputs import measure_invariance, measure_odd_inputs
 from surrogate.bench.stress.other_arithmetic import measure_batches, measure_openmm, measure_precision, openmm_of
+from surrogate.bench.stress.stress_options import StressOptions
 from surrogate.bench.stress.stress_page import markdown
 from surrogate.bench.stress.trials import StressConfig, choose_config, run_stress
 from surrogate.data.weights import Weights
@@ -165,7 +166,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
 
 def test_settings_are_checked() -> None:
     with pytest.raises(InputError, match=r"no section 'lenght'.*length"):
-        choose_config(sections=["lenght"])
+        choose_config(StressOptions(sections=["lenght"]))
     with pytest.raises(InputError, match="ten frames"):
-        choose_config(frames=[100], replicas=16)
-    assert choose_config(quick=True, frames=[5000]).frames == (5000,)
+        choose_config(StressOptions(frames=[100], replicas=16))
+    assert choose_config(StressOptions(quick=True, frames=[5000])).frames == (5000,)
