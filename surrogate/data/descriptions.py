@@ -1,4 +1,4 @@
-"""What a model is told of a scene: made here, because models reach no chemistry."""
+"""Input features of a scene as each model asks for them: made here, because models import no chemistry."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def describe(model: Surrogate, scene: Scene) -> Molecule:
-    """Return what this model wants to be told of a scene, which is posed as its frames are."""
+    """Return the input features of a scene that this model asks for; the scene is posed as its frames are."""
     molecule = Molecule.of(scene)
     if model.knows_chains:
         return replace(molecule, chain=chain_features(scene, model.config))

@@ -34,7 +34,7 @@ QUANTUM_NM = 2e-4
 _BLOCK = 8192
 # Frames beyond this are kept in a file.
 MEMORY_BYTES = 2_000_000_000
-# What frames are written into: an array or a data set of HDF5.
+# Frames are written into an array or a dataset of HDF5.
 Target = Any
 CONDITIONS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da")
 

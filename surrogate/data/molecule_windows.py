@@ -13,7 +13,7 @@ from systems.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# Of a trajectory, by time, for training, validation and test (GeoTDM, Han 2024).
+# Shares of a trajectory, by time, for training, validation and test (GeoTDM, Han 2024).
 SHARES = {"train": 0.6, "validation": 0.2, "test": 0.2}
 
 

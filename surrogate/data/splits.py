@@ -1,4 +1,4 @@
-"""Which frames are trained on and which are held out, and the proof that no stretch of motion is in both."""
+"""Splits of frames into training and validation, and the proof that no stretch of motion is in both."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _STIFF = "stiff."
 
 @dataclass(frozen=True)
 class TrainingDomain:
-    """What the weights were trained for. `scene` is the template: atom k of the model is its atom k, and canonical
+    """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
     `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
     far they go beyond that (systems.chemistry.limits.Limits; None in files of older versions).

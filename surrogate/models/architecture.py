@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What trajectories to train on say of themselves, no frame read yet.
+    """A summary of the trajectories to train on, made without reading their frames.
 
     `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of
     the longest trajectory of each of `scenes`, `n_frames` all that are trained on. `lag_ps`: time between frames.

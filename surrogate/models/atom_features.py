@@ -1,4 +1,4 @@
-"""What the covalent graph says of an atom, and where the molecule's template has it: features free of atom order."""
+"""Features of atoms from the covalent graph and from the molecule's template, independent of atom order."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def with_compiled_parts(model: _Model) -> _Model:
     if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
         raise InputError("compiling needs a C++ compiler (g++ or clang++), which is not on the PATH; leave it out.")
     copied = copy.deepcopy(model)
-    # Of a model that dresses another one, that one's.
+    # A model that wraps another one (such as heavy atoms with hydrogens placed): the inner one's networks.
     within = next((child for child in copied.children() if isinstance(child, Surrogate)), copied)
     lists = [child for child in within.children() if isinstance(child, nn.ModuleList)]
     parents: list[nn.Module] = [within, *lists]

@@ -48,7 +48,7 @@ def molecular_graph(molecule: Molecule, *, all_pairs: bool = False) -> Graph:
         pairs.append(full[full[:, 0] != full[:, 1]])
     kinds = torch.cat([torch.full((len(p),), kind, device=device) for kind, p in enumerate(pairs)])
     keys = torch.cat([p[:, 0] * n_atoms + p[:, 1] for p in pairs])
-    # Of a pair that is several things, the closest kind counts: a three-membered ring's bonds are bonds.
+    # A pair of several kinds counts as the closest: a three-membered ring's bonds are bonds.
     unique, place = torch.unique(keys, return_inverse=True)
     kind = torch.full((len(unique),), N_KINDS, device=device).scatter_reduce(0, place, kinds, "amin")
     receiver, sender = unique // n_atoms, unique % n_atoms

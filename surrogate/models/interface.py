@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Molecule:
-    """What a model is told of a scene, beside its frames.
+    """Input features of a scene, beside its frames.
 
     `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
     `bonds` (n_bonds, 2) int64; `atoms`: features of the covalent graph, and `chain`: of a peptide's

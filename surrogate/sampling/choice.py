@@ -1,4 +1,4 @@
-"""Which of the shipped weights roll a scene, where the user names none."""
+"""Choice of the shipped weights that roll a scene, where the user names none."""
 
 from __future__ import annotations
 

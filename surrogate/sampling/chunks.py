@@ -1,4 +1,4 @@
-"""Draws chunks of a model: canonical pose, noise from seeds, and batches that halve when memory runs out."""
+"""Draw chunks from a model: canonical pose, noise from seeds, and batches that halve when memory runs out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a rollout is asked to do."""
+"""Settings of a rollout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which part of a training domain a scene is rolled in: a molecule that was trained on or, by weights that know atoms
+"""Coverage of a scene by a training domain: a molecule that was trained on or, by weights that know atoms
 by their bonds, one that looks like those from within."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Is this scene what the weights were trained for? Asked before anything is computed."""
+"""Comparison of a scene with the training domain of weights, before anything is computed."""
 
 from __future__ import annotations
 

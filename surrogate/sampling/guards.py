@@ -1,4 +1,4 @@
-"""Every frame is checked as it is made, before it is written or anything follows from it."""
+"""Guard of a rollout: checks every frame as it is made, before it is written or conditions the next chunk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far apart a rollout's frames are: the weights' one spacing, or any lag in the range they were trained for."""
+"""Lag of a rollout, the time between its frames: the weights' one spacing, or any in the range of their training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in a rollout's files beside its frames, and what is said of it on the way."""
+"""Record of a rollout: settings, provenance and account in its files, and the lines shown while it runs."""
 
 from __future__ import annotations
 

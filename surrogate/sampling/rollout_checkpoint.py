@@ -1,4 +1,4 @@
-"""Where a rollout stands: written beside its first file after each flush, read by `resume`."""
+"""Checkpoint of a rollout: written beside its first file after each flush, read by `resume`."""
 
 from __future__ import annotations
 

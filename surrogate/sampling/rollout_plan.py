@@ -1,4 +1,4 @@
-"""What a rollout works with, settled before the first chunk."""
+"""Plan of a rollout: everything that is settled before the first chunk."""
 
 from __future__ import annotations
 

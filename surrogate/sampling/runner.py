@@ -146,7 +146,7 @@ def rollout(
             for writer, buffer in zip(writers, buffers, strict=True):
                 _flush(writer, buffer)
             header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
-            # Of a last chunk frames may be left out: no longer rollout could go on from its end.
+            # Frames of the last chunk may be left out: a longer rollout could not go on from its end.
             if state.steps < plan.n_steps:
                 save()
             flushed_at = time.monotonic()

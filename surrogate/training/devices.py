@@ -1,4 +1,4 @@
-"""Where a training runs: one CPU or GPU, or several started by torchrun, by Lightning Fabric.
+"""Devices of a training: one CPU or GPU, or several started by torchrun, by Lightning Fabric.
 
     torchrun [...] -m surrogate.cli.main train REF... -o model.safetensors [...]
 

@@ -1,4 +1,4 @@
-"""What weights say of themselves: what they were trained for, and how they were made."""
+"""Training domain and provenance of weights: what they cover, when, where and from what they were made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the verb `train` asks of an architecture: choices that suit the references, settings, and the training."""
+"""The interface between the verb `train` and an architecture: choices for the references, settings, the training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ AdvanceFn = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What a training was asked for. Times in s and ps; `device` is torch's name.
+    """A request for a training. Times in s and ps; `device` is torch's name.
 
     `start_from`: weights to go on from. `longest_lag_ps`: every spacing of frames up to this one is to be learned.
     `model`, `training`: the tables of the configuration file, as far as they are filled in.

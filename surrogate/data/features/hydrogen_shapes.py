@@ -1,4 +1,4 @@
-"""What a reference says of a scene's hydrogens: their sites from the bonds, shapes and turns from training frames."""
+"""Hydrogens of a reference: sites from the bonds, shapes and rotations from the training frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHAPE_FRAMES, _SHAPE_ATOMS = 20_000, 1_000_000
 # A nitrogen's hydrogens stand to one side where they rise so far above the plane (sine), root mean square: flat groups
 # swing through 0.2, pyramidal amines stand at 0.7 and more.
 _PYRAMIDAL = 0.45
-# Of a combination of features that is weighed, beside that of the strongest.
+# Least variance of a combination of features that is used, relative to the strongest.
 _LEAST_VARIANCE = 1e-8
 # The other side counts from this share of frames on.
 _LEAST_SHARE = 0.002

@@ -1,4 +1,4 @@
-"""Peptides taken apart into residues with internal coordinates (`models.chains`), and what these are in references."""
+"""Peptides as residues with internal coordinates (`models.peptides.chains`), and the scale of these in references."""
 
 from __future__ import annotations
 

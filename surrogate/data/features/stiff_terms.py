@@ -1,5 +1,5 @@
-"""What a reference says of a molecule's stiff terms (models.stiff): which bonds it holds rigid, and the distribution of
-all other bonds and angles given the torsions."""
+"""Stiff terms measured on a reference (models.stiff): which bonds it holds rigid, and the distribution of all other
+bonds and angles given the torsions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from systems.scene import Scene
 RIGID_NM = 2e-4
 _LOOKED_AT = 1000
 _BLOCK = 8192
-# Of what the features say of a term, beside their own power: for torsions that hardly turn.
+# Ridge of the regression of terms on features, relative to their power: for torsions that hardly turn.
 _RIDGE = 1e-3
 # Nearer to a straight line an angle leaves torsions about its bonds without meaning.
 _STRAIGHTEST_RAD = np.radians(165.0)

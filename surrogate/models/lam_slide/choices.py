@@ -1,4 +1,4 @@
-"""The training of LaM-SLidE as the verb `train` sees it: what suits the references, all settings, and the start."""
+"""LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from systems.selection import part_of
 
 # Frames from which on rare states are weighted in a further training: fewer do not tell how often they come.
 _FRAMES_FOR_RARE = 50_000
-# Of the recipes whose results README states.
+# The batch and the share of rare draws that the recipes use whose results the manual states.
 _MANY_BATCH = 32
 _RARE_DRAWS = 0.3
 _SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
 
 class LamSlideTrainer(Trainer):
-    """One molecule at one spacing of frames keeps the defaults wherever these take it."""
+    """Trains LaM-SLidE. One molecule at one spacing of frames gets the defaults if they hold its atoms."""
 
     goes_on = True
     learns_lags = True

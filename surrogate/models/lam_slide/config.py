@@ -31,7 +31,7 @@ class AutoencoderConfig:
     position_weight: float = 1.0
     distance_weight: float = 1.0
     type_weight: float = 0.01
-    # Of residues alone (Table 12).
+    # For residues as entities alone (Table 12).
     frame_weight: float = 1.0
     torsion_weight: float = 0.1
     # Share of stage-one samples whose identifiers are drawn at random (Algorithm 1; 1.0 is the paper). The others get
@@ -63,7 +63,7 @@ class ApproximatorConfig:
     tau_scale: float = 1.4
     position_weight: float = 0.25
     distance_weight: float = 0.25
-    # Of residues alone (Table 12).
+    # For residues as entities alone (Table 12).
     frame_weight: float = 0.25
     auxiliary_frames: int = 4
     # Shortest and longest spacing of frames, in ps: the network is told which it is asked for. None: one spacing alone.

@@ -9,9 +9,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-# Of the solver `fitted`: its steps are fitted to widths of 1 - FITTED_BELOW / n_steps times noise over signal. Exact
-# predictions of Gaussian data want about 0.6, 0.75, 0.85 and 0.95 of it at 2, 3, 4 and 6 steps; a trained network,
-# which leaves narrow directions too narrow, a little less.
+# Constant of the solver `fitted`: its steps are fitted to widths of 1 - FITTED_BELOW / n_steps times noise over
+# signal. Exact predictions of Gaussian data want about 0.6, 0.75, 0.85 and 0.95 of it at 2, 3, 4 and 6 steps; a
+# trained network, which leaves narrow directions too narrow, a little less.
 FITTED_BELOW = 0.8
 # Where adaptive steps end.
 ADAPTIVE_END = 0.999

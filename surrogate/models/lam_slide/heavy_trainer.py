@@ -1,4 +1,4 @@
-"""What training does of its own where the network works on heavy atoms: find sites, residues, and dress the model."""
+"""Training on heavy atoms alone: find hydrogen sites and residues, and wrap the trained network with their placer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from systems.selection import part_of
 @dataclass(frozen=True, eq=False)
 class HeavyTraining:
     """Frames, configuration and weights to go on from as a training of LaM-SLidE takes them, of heavy atoms alone, and
-    what its weights are dressed with: the placer of hydrogens and the domain of all atoms."""
+    what its weights are wrapped with: the placer of hydrogens and the domain of all atoms."""
 
     frames: TrainingFrames
     config: LamSlideConfig

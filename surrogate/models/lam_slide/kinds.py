@@ -1,4 +1,4 @@
-"""Kinds of windows: which rare state of a torsion a chunk of frames visits, so that a network can be told."""
+"""Kinds of windows: which rare state of a torsion a chunk of frames visits, for networks that take it as an input."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from surrogate.models.lam_slide.transformer import Approximator
 from systems.errors import InputError
 from systems.imposed import RIGID_BONDS
 
-# Of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much as all
-# others.
+# Redraws of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much
+# as all others.
 MAX_REDRAWS = 12
 
 
@@ -62,7 +62,7 @@ class LamSlide(Surrogate):
         self.approximator = Approximator(
             config.approximator, n_latents, latent_dim, tag_dim, of_atoms=config.latents_are_atoms
         )
-        # Of the frames that `next_chunk` returns; the shortest that it knows, until `at_lag` says otherwise.
+        # Spacing of the frames that `next_chunk` returns: the shortest of the range, until `at_lag` sets another.
         self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
         self.register_buffer("latent_mean", torch.zeros(n_latents, latent_dim))
         self.register_buffer("latent_scale", torch.ones(()))

@@ -1,4 +1,4 @@
-"""One molecule's frames as LaM-SLidE's two stages are shown them: frames, windows, latents, and the molecule itself."""
+"""Dataset of one molecule for LaM-SLidE's two stages: its frames, windows of them, their latents, input features."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BLOCK = 8192
 
 @dataclass(eq=False)
 class Subject:
-    """Frames of one molecule and what the model is told of it. `latents` (n_frames, n_latents, dim): those of all
+    """Frames of one molecule and its input features. `latents` (n_frames, n_latents, dim): those of all
     frames, once stage one is over, where poses stay and memory suffices."""
 
     frames: TrainingFrames

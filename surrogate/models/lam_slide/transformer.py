@@ -21,7 +21,7 @@ from surrogate.models.layers import KeysValues, ParallelBlock, TimeEmbedding, ro
 from systems.errors import InputError
 
 Rope = tuple[Tensor, Tensor]
-# Of each layer, what the conditioning frames say to later ones.
+# Keys and values of the conditioning frames, layer by layer.
 Memory = list[KeysValues]
 
 

@@ -1,4 +1,4 @@
-"""Types of atoms told from their surroundings, in rounds along bonds."""
+"""Types of atoms derived from their bonded surroundings, in rounds of message passing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The training of the model of peptides as the verb `train` sees it: what suits the references, settings, start."""
+"""The model of peptides behind the verb `train`: choices for the references, settings, and the start."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """LaM-SLidE for peptides of any sequence: residues as entities, coded exactly, and a flow over residues and time.
 
 An entity's identifier is its residue's type, its neighbours' types and its place in the chain; its code are the
-internal coordinates of `models.chains`, so that no first stage is trained and nothing of an unseen sequence is lost.
-The flow runs on innovations: of each coordinate at time t after the frame that is given, what its correlation with
-that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a chunk
-has its own time, so that one model serves all spacings.
+internal coordinates of `models.peptides.chains`, so that no first stage is trained and nothing of an unseen sequence
+is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
+with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
+chunk has its own time, so that one model serves all spacings.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Train the model of peptides (`models.lam_slide.peptides`) on runs of many sequences: one flow, no first stage."""
+"""Train the model of peptides (`models.peptides.model`) on runs of many sequences: one flow, no first stage."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class PeptideTraining:
 
 @dataclass(eq=False)
 class PeptideSubject:
-    """One sequence's frames, what the model is told of it, and the stretches that windows may be taken from."""
+    """One sequence's frames, its input features, and the stretches that windows may be taken from."""
 
     frames: TrainingFrames
     chain: ChainFeatures

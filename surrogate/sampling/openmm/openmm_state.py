@@ -1,4 +1,4 @@
-"""What `openmm.State` is to a simulation, of a surrogate: what it has, and a clear refusal of what it has not."""
+"""The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name."""
 
 from __future__ import annotations
 
