@@ -1,4 +1,4 @@
-"""Terms of a trajectory's frames that no model made: taken from a reference, and named in the record by whoever did."""
+"""Imposed terms: bonds and angles of a trajectory's frames that come from a reference and not from the model."""
 
 from __future__ import annotations
 

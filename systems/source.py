@@ -1,4 +1,4 @@
-"""A Scene from what the user names: a library system, a structure file, a SMILES string or a peptide sequence."""
+"""Scene from what the user names: a library system, a structure file, a SMILES string or a peptide sequence."""
 
 from __future__ import annotations
 

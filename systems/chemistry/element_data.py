@@ -1,5 +1,4 @@
-"""Atomic weights, covalent radii and metals (gemmi's table, but for what it has otherwise), and the element of a PDB
-atom name."""
+"""Elements: atomic weight, covalent radius, whether a metal (by gemmi), and the element of a PDB atom name."""
 
 from __future__ import annotations
 

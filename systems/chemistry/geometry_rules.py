@@ -1,4 +1,4 @@
-"""What the validity checks hold on to: found in a scene's bond graph, measured on reference frames."""
+"""Reference geometry for the validity checks: terms of a scene's bond graph, with their values in reference frames."""
 
 from __future__ import annotations
 

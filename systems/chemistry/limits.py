@@ -1,4 +1,4 @@
-"""What frames of a reference never do beyond `validity`: angles, flat centres, jumps, stillness and drift. For guards.
+"""Limits of a reference's frames beyond `validity`, for guards: angles, flat centres, jumps, stillness and drift.
 
 Every limit is measured on the reference: the farthest that its frames go from their mean, and half as far again; the
 least that they change from one to the next, and a third of it.

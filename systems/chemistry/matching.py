@@ -1,4 +1,4 @@
-"""One scene's atoms laid on another's: an isomorphism that keeps every handedness."""
+"""Matching of one scene's atoms to another's: a graph isomorphism that keeps every chirality."""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 Colour refinement (Weisfeiler and Lehman, 1968) on elements and ring sizes; stereocentres are found as atoms whose
 neighbours all differ, their handedness enters the colours, and the refinement goes on until nothing new appears. Known
 limits, not seen: axial chirality (allenes, hindered biaryls) and centres that only a fused ring system tells apart.
+RDKit's canonical ranks are not used: they tell apart equivalent atoms of rings (8 classes for
+1,4-dimethylcyclohexane, which has 6), they are no hash of a molecule, and training runs without RDKit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Is a frame still the molecule? Pure NumPy checks of frames, for the guards while rolling and for the judge after."""
+"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the judge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the library holds: names, groups, how each scene is made, and the papers whose data are of it.
+"""Contents of the library: names, groups, how each scene is made, and the papers whose data are of it.
 
 A molecule is simulated by the program's defaults, under whichever name; the papers' settings are asked for by theirs
 (systems.library.protocols). Model systems, which no force field knows, bring settings of their own: a dictionary of

@@ -1,4 +1,4 @@
-"""Chains that break: neighbours of one chain that no bond joins, refused or closed with the caps NME and ACE."""
+"""Chain breaks: neighbours of one chain that no bond joins, refused or closed with the caps NME and ACE."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands beside the molecules of a structure file: waters, ions and ligands, kept or left out."""
+"""Waters, ions and ligands beside the peptide of a structure file: kept or left out."""
 
 from __future__ import annotations
 

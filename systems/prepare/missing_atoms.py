@@ -1,4 +1,4 @@
-"""What a structure file leaves out of the residues that are known by their names: heavy atoms, and hydrogens."""
+"""Missing heavy atoms and hydrogens of the residues that are known by their names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which hydrogens OpenMM's Modeller is asked to put on each residue, and an account of what pH decided."""
+"""Protonation: the hydrogens OpenMM's Modeller is asked to add to each residue, and what the pH decided."""
 
 from __future__ import annotations
 

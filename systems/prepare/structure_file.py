@@ -1,4 +1,4 @@
-"""A Scene from a structure file: what is in it is chosen, bonded, completed and checked, and each repair is said."""
+"""Scene from a structure file: atoms chosen, bonds found, missing atoms added, geometry checked, repairs noted."""
 
 from __future__ import annotations
 

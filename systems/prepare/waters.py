@@ -1,4 +1,4 @@
-"""Waters of a structure file that are to stay: their bonds, and hydrogens where the file has none."""
+"""Waters that stay: their bonds, and hydrogens where the file has none."""
 
 from __future__ import annotations
 

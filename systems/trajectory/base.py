@@ -1,4 +1,4 @@
-"""What every trajectory writer and reader offers, whatever the format; and the checks that all of them share."""
+"""Base classes of trajectory writers and readers, and the checks that all formats share."""
 
 from __future__ import annotations
 

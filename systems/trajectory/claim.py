@@ -1,4 +1,4 @@
-"""The right to write an output: one process has it, from start to end."""
+"""Lock on an output file: one process writes it at a time."""
 
 from __future__ import annotations
 

@@ -3,6 +3,9 @@
 Blocks of bytes stand between 32-bit lengths: a header of 4 + 80 bytes (`CORD`, number of frames, first step, steps
 between frames, ..., time step in AKMA units as float32), a title, the number of atoms; then x, y and z of each frame,
 after the unit cell where there is one.
+
+Other libraries' DCD files are not used: MDTraj and MDAnalysis read a file that is cut short as far as it goes, OpenMM
+appends behind half a frame, and none cuts a file to a number of frames.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Hybrid-36 numbers of PDB files: decimal as far as the columns reach, then A000..ZZZZ and a000..zzzz."""
+"""Hybrid-36 numbers of PDB files: decimal as far as the columns reach, then A000..ZZZZ and a000..zzzz.
+
+gemmi decodes them as it reads a file and offers no function; biotite's takes `A0` for 100.
+"""
 
 from __future__ import annotations
 

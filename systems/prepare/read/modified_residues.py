@@ -1,4 +1,4 @@
-"""Residues under other names: selenomethionine, caps written into their neighbours, D- and modified amino acids."""
+"""Modified residues: selenomethionine, CHARMM's caps, names of D- and modified amino acids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records as a file has them, put right before anything is made of them: what is written twice, and what is no atom."""
+"""Clean-up of atom records: duplicates and virtual sites left out, repeated residue numbers told apart."""
 
 from __future__ import annotations
 

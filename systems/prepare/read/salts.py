@@ -1,4 +1,4 @@
-"""A drug and its counterions: which molecule of several is meant, and metals that are drawn as if they were bonded."""
+"""Salts: the one molecule that is meant beside counterions and water, and metals drawn with covalent bonds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SMILES to three dimensions: what is accepted, RDKit's embedding and clean-up, and stereo before and after."""
+"""SMILES to 3-D coordinates: accepted elements, RDKit's embedding and minimisation, a check that stereo is kept."""
 
 from __future__ import annotations
 
