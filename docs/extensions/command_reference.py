@@ -71,7 +71,7 @@ def command_markdown(words: list[str]) -> str:
     command = find_command(words)
     context = command.context_class(command, info_name=" ".join(["surromd", *words]))
     usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ")
-    usage = usage.replace("{", "").replace("}", "")
+    usage = usage.replace("{", "").replace("}", "").replace("[[", "[").replace("]]", "]")
     said = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
     table = [f"| `{_cell(written)}` | {_text(text)} |" for written, text in command_rows(command)]
     further = [f"| `{_cell(written)}` | {_text(text)} |" for written, text in file_rows(words)]
