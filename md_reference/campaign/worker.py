@@ -1,4 +1,4 @@
-"""What a campaign's workers do: prepare a scene, simulate one run from wherever it stands, say how far they are, stop.
+"""Tasks of a campaign's workers: prepare a scene, simulate one run from wherever it stands, report progress, stop.
 
 A run's file belongs to one task at a time (systems.trajectory.claim), and a task stops by itself, with a checkpoint,
 when the campaign that started it has not been heard of for a minute.

@@ -1,4 +1,4 @@
-"""What the forces of a scene are: the force field and the solvent, and what goes together."""
+"""Specification of the forces: force field, solvent, hydrogen masses and constraints, and which combinations exist."""
 
 from __future__ import annotations
 

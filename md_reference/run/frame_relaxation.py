@@ -1,4 +1,4 @@
-"""Relaxes the stiff bonds of a given frame while everything else is held near where it was."""
+"""Relax the stiff bonds of a given frame while everything else is held near where it was."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What this machine has to run on: its name, its cores, OpenMM's platforms and how each is set up."""
+"""The machine: its name, its cores, OpenMM's platforms and their properties."""
 
 from __future__ import annotations
 

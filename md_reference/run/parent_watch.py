@@ -1,4 +1,4 @@
-"""A worker process ends with the process that started it, whatever ended that one."""
+"""Watch over the parent process: a worker ends with the process that started it, whatever ended that one."""
 
 from __future__ import annotations
 

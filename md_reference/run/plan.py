@@ -1,4 +1,4 @@
-"""What a reference run of a scene will compute, what it leaves out, why, and what that saves on this machine."""
+"""Plan of a reference run: what it will compute, what it leaves out and why, and what that saves on this machine."""
 
 from __future__ import annotations
 

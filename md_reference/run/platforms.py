@@ -1,4 +1,4 @@
-"""Which OpenMM platform wins for a scene, and why: by measurement, or by its size where nothing may be timed."""
+"""Choice of the OpenMM platform for a scene: by measurement, or by its size where nothing may be timed."""
 
 from __future__ import annotations
 

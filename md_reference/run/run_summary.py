@@ -1,4 +1,4 @@
-"""What a finished run says about itself: temperature, energy and drift with their statistical errors."""
+"""Summary of a finished run: temperature, energy and drift with their statistical errors."""
 
 from __future__ import annotations
 

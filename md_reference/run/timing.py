@@ -1,4 +1,4 @@
-"""How long a step of a scene takes on each platform that is here: measured side by side, remembered on disk."""
+"""Timings of a step of a scene on each platform of this machine: measured side by side, remembered on disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference that training has not seen: the end of a trajectory, and files that are refused where it has."""
+"""Held-out reference: cut from the end of a trajectory, or refused where weights were trained on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rolls weights forward chunk by chunk in memory: what the benchmarks time, without guards and without files."""
+"""Roll weights forward chunk by chunk in memory: what the benchmarks time, without guards and without files."""
 
 from __future__ import annotations
 

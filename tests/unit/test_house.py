@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,6 +20,10 @@ MOST_PARAMETERS = 8
 COMMON_NAMES = {"__init__", "architecture", "config", "model", "base", "choices", "trainer"}
 
 # May only become shorter: a line goes when what it names is mended.
+WITHOUT_CONTRACT = {
+    "surrogate.models": "networks and entry points of one architecture lie in one folder: contract `architectures`",
+    "surrogate.models.lam_slide": "the same",
+}
 MANY_PARAMETERS = {
     "surrogate/judge/comparison.py:_judge": "the comparison's conditions, one by one",
     "surrogate/judge/rows/block_means.py:shift_row": "the fields of a row, by name",
@@ -103,6 +108,28 @@ def test_a_function_has_at_most_eight_parameters(repository: Path, tmp_path: Pat
         "    def is_wide(self, a, b, c, d, *, e, f, g, h, i): ...\n"
     )
     assert list(wide_functions(tmp_path / "wide.py")) == ["is_wide"]
+
+
+def folders_without_contract(root: Path) -> set[str]:
+    """Return the packages below `root` of whose modules no exhaustive contract of import-linter speaks."""
+    linter = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["importlinter"]
+    exhaustive = [c for c in linter["contracts"] if c.get("exhaustive")]
+    named = {container for contract in exhaustive for container in contract["containers"]}
+    folders = {file.parent.relative_to(root) for package in PACKAGES for file in (root / package).rglob("*.py")}
+    return {".".join(folder.parts) for folder in folders} - named
+
+
+def test_every_folder_has_a_contract(repository: Path, tmp_path: Path) -> None:
+    linter = tomllib.loads((repository / "pyproject.toml").read_text())["tool"]["importlinter"]
+    assert linter["exclude_type_checking_imports"] is False
+    assert folders_without_contract(repository) == WITHOUT_CONTRACT.keys()
+    for name in ("systems/named", "systems/forgotten"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "room.py").touch()
+    contracts = "".join(f"[[tool.importlinter.contracts]]\nexhaustive = {flag}\ncontainers = ['{name}']\n"
+                        for flag, name in (("true", "systems.named"), ("false", "systems.forgotten")))  # fmt: skip
+    (tmp_path / "pyproject.toml").write_text(contracts)
+    assert folders_without_contract(tmp_path) == {"systems.forgotten"}
 
 
 def test_no_modules_import_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

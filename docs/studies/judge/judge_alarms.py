@@ -1,4 +1,4 @@
-"""How often the judge raises a false alarm: `python docs/studies/judge/judge_alarms.py REF... --piece 20ns`.
+"""False alarms of the judge on one molecule: `python docs/studies/judge/judge_alarms.py REF... --piece 20ns`.
 
 Runs of one simulation are cut into pieces. Each piece is judged once as the candidate, against a piece of another run
 as the reference and one of a third as the replicate: nothing is wrong with any of them, so that every word worse than

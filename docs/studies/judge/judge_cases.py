@@ -1,4 +1,4 @@
-"""What the judge must say of trajectories that are wrong in a known way, and what it says:
+"""Known wrongs: what the judge must say of trajectories that are wrong in a known way, and what it says:
 
     python docs/studies/judge/judge_cases.py FOLDER [-o docs/judge_cases.md]
 

@@ -1,4 +1,4 @@
-"""What AM1-BCC charges cost, against atoms: processor seconds of antechamber and sqm, and a power law through them.
+"""Cost of AM1-BCC charges against atoms: processor seconds of antechamber and sqm, and a power law through them.
 
     python docs/studies/preparation/charge_cost.py [--largest 90]
 

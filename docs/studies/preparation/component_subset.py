@@ -1,4 +1,4 @@
-"""Writes systems/library/data/components.tsv.gz: residues of the wwPDB chemical component dictionary that chains are
+"""Write systems/library/data/components.tsv.gz: residues of the wwPDB chemical component dictionary that chains are
 made of.
 
     python docs/studies/preparation/component_subset.py [--output FILE]

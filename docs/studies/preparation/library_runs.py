@@ -1,4 +1,4 @@
-"""Every scene of the named_scenes, run for 10 ps by its paper's protocol, else by the defaults, and looked at:
+"""Every scene of the library, run for 10 ps by its paper's protocol, else by the defaults, and looked at:
 `python docs/studies/preparation/library_runs.py`.
 """
 

@@ -1,4 +1,4 @@
-"""Prints the handedness of C1 to C5 of the sugars in md_reference/forces/glycans.py, from the dictionary's ideal
+"""Print the handedness of C1 to C5 of the sugars in md_reference/forces/glycans.py, from the dictionary's ideal
 coordinates.
 
     python docs/studies/preparation/sugar_handedness.py

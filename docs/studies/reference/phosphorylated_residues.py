@@ -1,4 +1,4 @@
-"""Writes systems/library/data/phosaa14SB.xml: Amber's phosphorylated amino acids beside ff14SB, as an OpenMM force
+"""Write systems/library/data/phosaa14SB.xml: Amber's phosphorylated amino acids beside ff14SB, as an OpenMM force
 field.
 
     python docs/studies/reference/phosphorylated_residues.py [--output FILE]

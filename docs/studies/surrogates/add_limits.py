@@ -1,4 +1,4 @@
-"""Gives older weights the limits that guards need: `python docs/studies/surrogates/add_limits.py WEIGHTS REF... -o
+"""Give older weights the limits that guards need: `python docs/studies/surrogates/add_limits.py WEIGHTS REF... -o
 OUT`.
 
 `surromd train` measures limits itself. Tensors, configuration, geometry and provenance stay as they are.

@@ -1,4 +1,4 @@
-"""How far off one chunk of PAINET is: `python docs/studies/surrogates/one_chunk.py WEIGHTS REF`.
+"""Errors of one chunk of PAINET: `python docs/studies/surrogates/one_chunk.py WEIGHTS REF`.
 
 From states of a reference at constant energy, with velocities, that training has not seen, to where the reference
 stands one chunk later: root mean square errors per coordinate of positions and velocities, beside the frozen frame, a

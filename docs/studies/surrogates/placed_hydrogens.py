@@ -1,4 +1,4 @@
-"""How right placed hydrogens are: `python docs/studies/surrogates/placed_hydrogens.py REF... --on HELD [--frames
+"""Errors of placed hydrogens: `python docs/studies/surrogates/placed_hydrogens.py REF... --on HELD [--frames
 20000]`.
 
 Statistics are measured on REF; then the heavy atoms of HELD, frames of MD that were not used, are given hydrogens anew

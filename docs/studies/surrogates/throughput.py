@@ -1,4 +1,4 @@
-"""How fast LaM-SLidE trains and samples, in fp32 and bf16, and what share of the processor that is:
+"""Throughput of LaM-SLidE, trained and sampled in fp32 and bf16, and its share of the processor:
 `python docs/studies/surrogates/throughput.py [--threads 2] [--weights NAME]`.
 
 `peak` is the fastest product of two square matrices measured in the same run; the share is counted floating-point

@@ -1,4 +1,4 @@
-"""How long AM1-BCC charges take, and the lines that say so while they are computed."""
+"""Time that AM1-BCC charges take, expected from the number of atoms and told while they are computed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs that are not ours, and the folders they work in: neither outlives this process, whatever ends it.
+"""Other programs, run in folders of their own: neither outlives this process, whatever ends it.
 
 Each is guarded by a shell that holds the other end of a pipe. When this process ends, by `kill -9` too, the pipe
 closes, and the guard kills the program with all that it has started, or removes the folder. A guard has a session of

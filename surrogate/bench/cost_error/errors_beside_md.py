@@ -1,4 +1,4 @@
-"""What one rollout is worth beside MD: its errors against held-out reference, with error bars."""
+"""Errors of one rollout against held-out reference, with error bars, and its worth in MD."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a ns takes: the surrogate and OpenMM by turns, in processor seconds of this process."""
+"""Timing of the surrogate and of OpenMM by turns, in processor seconds for a ns."""
 
 from __future__ import annotations
 

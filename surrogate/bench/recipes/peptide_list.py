@@ -1,4 +1,4 @@
-"""Which peptides the weights `peptides` are trained on, and which are kept for testing and never trained on."""
+"""Peptides of the weights `peptides`: those for training, and those kept for testing and never trained on."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""What the methods of all forecasting tasks have in common: settings, extrapolation, the latent model, and the account
-of what each one costs. What goes beyond the published protocol is a field of `Settings` and said in a method's note."""
+"""Parts that the methods of all forecasting tasks share: settings, extrapolation, the latent model, costs.
+
+Whatever goes beyond the published protocol is a field of `Settings` and said in a method's note."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How forecasters of molecules see windows: the body frame, the best linear forecast, and what LaM-SLidE is shown."""
+"""Views of windows for forecasters of molecules: the body frame, the best linear forecast, and LaM-SLidE's input."""
 
 from __future__ import annotations
 

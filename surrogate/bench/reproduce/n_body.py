@@ -1,4 +1,4 @@
-"""`surromd reproduce NAME`: makes the data, trains, evaluates by the papers' definition, puts our rows under theirs."""
+"""The n-body tasks of `surromd reproduce`: data, methods, and errors by the papers' definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stress test reads off frames: how many are valid, when the first is not, and what drifts."""
+"""Statistics of frames in a stress test: the share of valid ones, the first invalid one, and drift."""
 
 from __future__ import annotations
 
