@@ -184,8 +184,8 @@ def reference_kind(folder: Path) -> Kind:
     config = MDConfig(time_ps=1.0, save_every_ps=0.2, timestep_ps=0.02, equilibrate_ps=0.2, platform="Reference",
                       force=ForceFieldSpec("auto", "auto"))  # fmt: skip
 
-    def stop(done: int, _: int) -> None:
-        if done >= 2:
+    def stop(done: int, total: int, note: str | None = None) -> None:
+        if note is None and done >= 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
