@@ -83,8 +83,8 @@ CASES = (
     Case("two runs joined in one file",
          lambda r, x, y: np.concatenate([x[:4000], y[4000:]]), (*FAIR, "different"), "jumps once .*first at 4 ns"),
     Case("0.3 ns of the same MD", lambda r, x, y: x[:300], ("undecided",), "too few to judge by"),
-    Case("0.3 ns of MD made here, at 300 K", lambda r, x, y: x, FAIR, "", 300.0),
-    Case("0.3 ns of MD made here, at 350 K", lambda r, x, y: x, WRONG, "vibrate as at 3[3-6]. K", 350.0),
+    Case("1 ns of MD made here, at 300 K", lambda r, x, y: x, FAIR, "", 300.0),
+    Case("1 ns of MD made here, at 350 K", lambda r, x, y: x, WRONG, "vibrate as at 3[3-6]. K", 350.0),
 )  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def load_runs(folder: Path) -> list[Ensemble]:
 
 
 def simulate(folder: Path, temperature_k: float) -> Frames:
-    """Return 300 ps of MD as the runs in `folder` were made (its README), but for the temperature."""
+    """Return 1 ns of MD as the runs in `folder` were made (its README), but for the temperature."""
     from surrogate import api
     from surrogate.judge.read.ensemble import load_ensemble
 
@@ -106,7 +106,7 @@ def simulate(folder: Path, temperature_k: float) -> Frames:
         api.reference(
             folder / "ala2.pdb",
             path,
-            time_ps=300.0,
+            time_ps=1000.0,
             save_every_ps=1.0,
             equilibrate_ps=20.0,
             temperature_k=temperature_k,

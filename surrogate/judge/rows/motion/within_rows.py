@@ -97,8 +97,10 @@ def _conditional_row(
     what: str,
 ) -> Row | None:
     """`angles`: for each torsion those of (reference, candidate, replicate); `states`: of each frame, -1 for none. None
-    where no state holds one frame in twenty of each of the three."""
-    shares = [np.bincount(np.concatenate(list(s)) + 1, minlength=2) / sum(map(len, s)) for s in states]
+    where no state holds one frame in twenty of each of the three, of all of it and of the equal length."""
+    n = min(s.features.n_frames for s in trio.samples)
+    flat = [np.concatenate(list(s)) + 1 for s in states]
+    shares = [np.bincount(x, minlength=2) / len(x) for whole in flat for x in (whole, whole[:n])]
     n_states = min(map(len, shares)) - 1
     kept = [k for k in range(n_states) if min(share[k + 1] for share in shares) >= _LEAST_SHARE]
     if not kept:

@@ -90,6 +90,21 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
 
 
+def test_a_reference_that_starts_in_one_state_breaks_no_short_candidate(simulate: Callable[..., Ensemble]) -> None:
+    """Its first frames, as many as the candidate has, are all in psi's beta basin: the other basin has no distance at
+    equal length, and none is made up."""
+    from systems.chemistry.geometry import torsion
+    from systems.chemistry.graph import backbone_torsions
+
+    three = [simulate(k, n) for k, n in ((41, 4_000), (42, 300), (43, 4_000))]
+    frames = three[0].segments[0][:]
+    beta = np.abs(torsion(frames, np.asarray(backbone_torsions(three[0].scene)["psi"][:1]))[:, 0]) > 2.0
+    ordered = np.concatenate([frames[beta][:600], frames[~beta], frames[beta][600:]])
+    found = compare(like(three[0], ordered, "ordered"), [three[1]], three[2], options=OPTIONS).judgements[0]
+    row = found.row("phi_given_psi")
+    assert np.isfinite(row.candidate.value) and row.verdict != "fails" and found.status != "broken", found.verdict
+
+
 def test_blocks_of_one_kind_are_exchanged_with_their_like() -> None:
     """Two kinds of blocks, unequally many on each side: without the kinds the sides look different."""
     rng = np.random.default_rng(0)
