@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def describe(model: Surrogate, scene: Scene) -> Molecule:
     """Return the input features of a scene that this model asks for; the scene is posed as its frames are."""
-    molecule = Molecule.of(scene)
+    molecule = replace(Molecule.of(scene), own=model.features(scene))
     if model.knows_chains:
         return replace(molecule, chain=chain_features(scene, model.config))
     return replace(molecule, atoms=features_of_scene(scene)) if model.knows_bonds else molecule

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ class References:
     spool: Path | None = None
     _read: dict[tuple[bool, bool], TrainingFrames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
+    @cached_property
     def survey(self) -> Survey:
         """Return what the files say of themselves. Raises InputError for a file without topology or times."""
         told = [_windows(path) if is_windows(path) else _trajectory(path) for path in (*self.paths, *self.held)]

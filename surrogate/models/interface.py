@@ -24,7 +24,7 @@ class Molecule:
 
     `elements` (n_atoms,) int64 atomic numbers, 0 for a particle of a model system; `masses_da` (n_atoms,) float32;
     `bonds` (n_bonds, 2) int64; `atoms`: features of the covalent graph, and `chain`: of a peptide's
-    residues, each for a model that asks for them.
+    residues, each for a model that asks for them; `own`: what a model makes of the scene itself (`Surrogate.features`).
     """
 
     elements: Tensor
@@ -32,6 +32,7 @@ class Molecule:
     bonds: Tensor
     atoms: AtomFeatures | None = None
     chain: ChainFeatures | None = None
+    own: Any = None
 
     @staticmethod
     def of(scene: Scene) -> Molecule:
@@ -50,7 +51,8 @@ class Molecule:
     def to(self, device: torch.device) -> Molecule:
         atoms = None if self.atoms is None else self.atoms.to(device)
         chain = None if self.chain is None else self.chain.to(device)
-        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), atoms, chain)
+        own = None if self.own is None else self.own.to(device)
+        return Molecule(self.elements.to(device), self.masses_da.to(device), self.bonds.to(device), atoms, chain, own)
 
     def permuted(self, order: Tensor) -> Molecule:
         """Return the molecule whose atom k is this one's atom order[k]."""
@@ -128,6 +130,11 @@ class Surrogate(nn.Module, ABC):
     def knows_chains(self) -> bool:
         """Whether the model wants a peptide's residues (`Molecule.chain`)."""
         return False
+
+    def features(self, scene: Scene) -> Any:
+        """Return input features of a scene that no other model knows, with a method `to(device)`: `Molecule.own` of
+        what `next_chunk` is given. None of a model without any."""
+        return None
 
     def at_lag(self, lag_ps: float) -> Surrogate:
         """Return this model, its weights shared, with frames `lag_ps` apart. Raises InputError where it was not trained

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 from command_line import run
+from surrogate.data.descriptions import describe
 from surrogate.models import registry
 from surrogate.models.conformance import SurrogateContract
 from surrogate.models.interface import Surrogate
@@ -90,6 +92,16 @@ def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
     for more, said in ((["--longest-lag", "5ps"], "--longest-lag"), (["--from", str(weights)], "--from")):
         refused = run("train", str(reference), *asked, *more)
         assert refused.exit_code == 1 and said in refused.stderr
+
+
+def test_what_it_makes_of_a_scene_reaches_its_network() -> None:
+    scene, model = load("alanine-dipeptide"), TestRandomWalk().make(22)
+    told = describe(model, scene).to(torch.device("cpu"))
+    assert told.own.tolist() == np.bincount(scene.bonds.ravel()).tolist()
+    noise = torch.ones(1, 22, 3, 3)
+    step = model.next_chunk(torch.zeros(1, 1, 22, 3), told, noise).frames_nm[0, 0, :, 0]
+    plain = model.next_chunk(torch.zeros(1, 1, 22, 3), replace(told, own=None), noise).frames_nm[0, 0, :, 0]
+    torch.testing.assert_close(step / plain, torch.where(told.own > 1, 1.0, 1.5))
 
 
 def test_it_is_listed_and_a_misspelt_name_meets_it() -> None:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -17,6 +18,7 @@ from surrogate.models.settings import build
 from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
+from systems.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,10 @@ class RandomWalk(Surrogate):
     def n_new(self) -> int:
         return self.config.n_new
 
+    def features(self, scene: Scene) -> Tensor:
+        """How many bonds each atom has, `(n_atoms,)`: atoms at the ends of bonds step further."""
+        return torch.from_numpy(np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)).float()
+
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return n_atoms, self.n_new, 3
 
@@ -54,6 +60,8 @@ class RandomWalk(Surrogate):
         solver: str | None = None, last_velocities_nm_ps: Tensor | None = None,
     ) -> Chunk:  # fmt: skip
         steps = self.log_step.exp()[molecule.elements][:, None, None] * noise
+        if molecule.own is not None:
+            steps = steps * torch.where(molecule.own > 1, 1.0, 1.5)[:, None, None]
         return Chunk(last_frames_nm[:, -1:] + steps.cumsum(2).transpose(1, 2))
 
 

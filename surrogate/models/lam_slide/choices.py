@@ -50,7 +50,7 @@ class LamSlideTrainer(Trainer):
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """See `Trainer.choose`."""
-        survey, found = references.survey(), list[Choice]()
+        survey, found = references.survey, list[Choice]()
         if request.start_from is not None:
             found = _rare_states(references, survey, self.settings(request).model)
         else:

@@ -20,7 +20,7 @@ class PeptideTrainer(Trainer):
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """See `Trainer.choose`."""
-        survey, known = references.survey(), PeptideConfig()
+        survey, known = references.survey, PeptideConfig()
         found = []
         if "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
             found.append(Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))

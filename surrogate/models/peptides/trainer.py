@@ -20,6 +20,7 @@ from surrogate.models.lam_slide.objectives import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
 from systems.errors import InputError
@@ -171,13 +172,15 @@ def train_peptides(
         save_weights(out, model, domain, provenance_of(sets[0], settings, None, sets[1:]))
 
     state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")
-    if not resume:
+    if not resume and is_first_process():
         for path in (state, log):
             path.unlink(missing_ok=True)
     place = StagePlace(state, log, device, resume)
     spent = run_stage(model.flow, stage, loss_fn, validate, place, progress=progress, on_save=write)
-    write(spent)
-    state.unlink(missing_ok=True)
+    if is_first_process():
+        write(spent)
+        state.unlink(missing_ok=True)
+    wait_for_all()
     return out
 
 
