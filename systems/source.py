@@ -6,7 +6,8 @@ from pathlib import Path
 
 from systems.errors import InputError
 from systems.library import named_scenes
-from systems.prepare.read.mol_file import SUFFIXES, suffix_of
+from systems.prepare.read.file_text import suffix_of
+from systems.prepare.read.mol_file import SUFFIXES
 from systems.prepare.read.peptide_mol2 import is_peptide_mol2
 from systems.prepare.structure_file import prepare_file
 from systems.scene import Scene

@@ -17,12 +17,12 @@ from systems.prepare.clashes import check_contacts
 from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
 from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
 from systems.prepare.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
+from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mmcif_file import is_component
 from systems.prepare.read.modified_residues import describe_residue, standardise
-from systems.prepare.read.mol_file import suffix_of
 from systems.prepare.read.peptide_mol2 import read_peptide_mol2
 from systems.prepare.read.records import AtomRecord
-from systems.prepare.read.structure_text import is_mmcif, read_structure, read_text
+from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
 from systems.prepare.structure import scene_from_records
 from systems.prepare.waters import complete_waters
 from systems.scene import Scene
@@ -40,7 +40,7 @@ def prepare_file(
     cap_breaks: bool = False,
 ) -> Scene:
     """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `systems.source.prepare`."""
-    if is_mmcif(path) and is_component(text := read_text(path)):
+    if is_mmcif(path) and is_component(text := structure_text(path)):
         from systems.prepare.component_file import scene_from_component
 
         return scene_from_component(text, path)

@@ -40,7 +40,13 @@ from systems.trajectory.frame_store import (
     read_run_id,
 )
 from systems.trajectory.hdf5_file import check_read, read_checksums, read_columns
-from systems.trajectory.topology_file import is_our_topology, refuse_other_topology, topology_path, write_topology
+from systems.trajectory.topology_file import (
+    is_our_topology,
+    refuse_other_topology,
+    topology_bytes,
+    topology_path,
+    write_topology,
+)
 
 
 def companions(path: Path) -> tuple[Path, Path]:
@@ -84,7 +90,8 @@ class DcdWriter(TrajectoryWriter):
     def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
         for file in (self.path, self._meta):
             refuse_existing(file, overwrite)
-        refuse_other_topology(self.path, self.scene, overwrite=overwrite)
+        topology = topology_bytes(self.scene)
+        refuse_other_topology(self.path, topology, overwrite=overwrite)
         made = [file for file in (self._meta, self._pdb, self.path) if not file.exists()]
         try:
             create_store(
@@ -96,7 +103,7 @@ class DcdWriter(TrajectoryWriter):
                 run_id=run_id,
                 checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
             )
-            write_topology(self.path, self.scene)
+            write_topology(self.path, topology)
             header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
             create_whole(self.path, header + title_bytes(self.scene.n_atoms))
         except SurromdError:

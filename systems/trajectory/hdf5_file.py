@@ -43,7 +43,7 @@ from systems.trajectory.frame_store import (
     read_record,
     read_run_id,
 )
-from systems.trajectory.topology_file import refuse_other_topology, topology_path, write_topology
+from systems.trajectory.topology_file import refuse_other_topology, topology_bytes, topology_path, write_topology
 
 _CHUNK_BYTES = 131_072
 _STRIDED_READ_FRAMES = 8192
@@ -67,9 +67,10 @@ class Hdf5Writer(TrajectoryWriter):
     ) -> None:
         self.path, self.scene = path, scene
         check_wanted(columns, path)
+        topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
         if not append:
             refuse_existing(path, overwrite)
-            refuse_other_topology(path, scene, overwrite=overwrite)
+            refuse_other_topology(path, topology, overwrite=overwrite)
             names = (FRAMES, *columns, *([] if scene.cell_nm is None else [CELLS]))
             create_store(
                 path,
@@ -85,8 +86,7 @@ class Hdf5Writer(TrajectoryWriter):
             check_same_topology(path, self._store.scene, scene)
             if "coordinates" not in self._store.file:
                 raise TrajectoryError(f"{path} holds no coordinates; it is the companion of a DCD file.")
-            if not append or not topology_path(path).exists():
-                write_topology(path, scene)
+            write_topology(path, topology)
             new = {key: value for key, value in record.items() if key not in self._store.record}
             if append and new:
                 self._store.update_record(new)

@@ -82,12 +82,17 @@ def refuse_foreign_topology(trajectory: Path) -> None:
         )
 
 
-def refuse_other_topology(trajectory: Path, scene: Scene, *, overwrite: bool) -> None:
-    """Raise TrajectoryError where `NAME.pdb` is another program's, or that of other atoms and still needed: beside
-    another trajectory of that name, or without `overwrite`."""
+def topology_bytes(scene: Scene) -> bytes:
+    """Return what `NAME.pdb` holds; nothing of a scene with more atoms than the format."""
+    return pdb_text(scene).encode() if scene.n_atoms <= MOST_ATOMS else b""
+
+
+def refuse_other_topology(trajectory: Path, topology: bytes, *, overwrite: bool) -> None:
+    """Raise TrajectoryError where `NAME.pdb` is another program's, or not `topology` and still needed: beside another
+    trajectory of that name, or without `overwrite`."""
     refuse_foreign_topology(trajectory)
     pdb = topology_path(trajectory)
-    if not pdb.exists() or scene.n_atoms > MOST_ATOMS or _atoms(pdb.read_bytes()) == _atoms(pdb_text(scene).encode()):
+    if not pdb.exists() or not topology or _atoms(pdb.read_bytes()) == _atoms(topology):
         return
     others = [trajectory.with_suffix(s) for s in _TRAJECTORIES if s != trajectory.suffix.lower()]
     beside = next((other for other in others if other.exists()), None)
@@ -97,13 +102,10 @@ def refuse_other_topology(trajectory: Path, scene: Scene, *, overwrite: bool) ->
         raise TrajectoryError(f"{pdb} exists already, of other atoms; overwrite it, or choose another name.")
 
 
-def write_topology(trajectory: Path, scene: Scene) -> Path:
-    """Write `NAME.pdb` and return its path; nothing of scenes with more atoms than the format holds. Raises
-    StorageError."""
-    pdb = topology_path(trajectory)
-    if scene.n_atoms <= MOST_ATOMS:
-        create_whole(pdb, pdb_text(scene).encode())
-    return pdb
+def write_topology(trajectory: Path, topology: bytes) -> None:
+    """Write `NAME.pdb`, where there is a topology. Raises StorageError."""
+    if topology:
+        create_whole(topology_path(trajectory), topology)
 
 
 def _atoms(pdb: bytes) -> list[bytes]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from systems.errors import InputError, PreparationError
-from systems.files.outside import content
+from systems.prepare.read.file_text import read_text, suffix_of
 from systems.prepare.read.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
 from systems.prepare.read.salts import main_molecule
 from systems.prepare.read.smiles import drop_isotopes, embed, require, sanitise
@@ -21,7 +21,7 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
     """Return the first molecule of the file. Raises InputError or PreparationError; `notes` says what was changed."""
     from rdkit import Chem, rdBase
 
-    text = read_text(path)
+    text = read_text(path, "a molecule with coordinates")
     with rdBase.BlockLogs():
         if suffix_of(path) == ".mol2":
             return _read_mol2(text, path, notes)
@@ -142,29 +142,6 @@ def _reperceived(molecule: Any, notes: list[str]) -> Any | None:
         total = sum(atom.GetFormalCharge() for atom in out.GetAtoms())
         notes.append(f"its valences are impossible as written: orders and charges perceived, total {total:+d}")
     return out
-
-
-def suffix_of(path: Path) -> str:
-    """Suffix in lower case, that of the packed file where it ends in .gz."""
-    suffixes = [s.lower() for s in path.suffixes]
-    if suffixes and suffixes[-1] == ".gz":
-        suffixes.pop()
-    return suffixes[-1] if suffixes else ""
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file, gzipped or not. Raises InputError where it cannot be read or is empty."""
-    if not path.exists():
-        raise InputError(f"{path} does not exist; check the path.")
-    if path.is_dir():
-        raise InputError(f"{path} is a directory; give a structure file.")
-    try:
-        data = content(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read ({error}); check the file.") from error
-    if not data.strip():
-        raise InputError(f"{path} is empty; give a molecule with coordinates.")
-    return data.decode("utf-8", errors="replace").replace("\r\n", "\n")
 
 
 def _first_mol_block(text: str, notes: list[str]) -> str:

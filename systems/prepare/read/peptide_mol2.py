@@ -6,15 +6,15 @@ from pathlib import Path
 
 from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError
+from systems.prepare.read.file_text import read_text
 from systems.prepare.read.mol2_file import Mol2, read_mol2
-from systems.prepare.read.mol_file import read_text
 from systems.prepare.read.records import AtomRecord, StructureFile
 
 
 def is_peptide_mol2(path: Path) -> bool:
     """Whether the first molecule of a MOL2 file has two or more standard residues, by their names and atoms."""
     try:
-        found = read_mol2(read_text(path), path, [])
+        found = read_mol2(read_text(path, "a molecule with coordinates"), path, [])
     except InputError:
         return False  # to be refused where it is read
     standard: set[tuple[str, str]] = set()
@@ -31,7 +31,7 @@ def is_peptide_mol2(path: Path) -> bool:
 def read_peptide_mol2(path: Path) -> StructureFile:
     """Return the atoms of a peptide's MOL2 file, in its order, and its bonds. Raises InputError; see `read_mol2`."""
     notes: list[str] = []
-    found: Mol2 = read_mol2(read_text(path), path, notes)
+    found: Mol2 = read_mol2(read_text(path, "a molecule with coordinates"), path, notes)
     atoms = [
         AtomRecord(
             serial=str(k + 1),

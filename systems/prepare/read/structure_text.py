@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from systems.errors import InputError
-from systems.files.outside import content
+from systems.prepare.read.file_text import read_text, suffix_of
 from systems.prepare.read.mmcif_file import read_mmcif
 from systems.prepare.read.pdb_columns import read_pdb
 from systems.prepare.read.record_sorting import settle
@@ -23,7 +23,7 @@ def read_structure(path: Path) -> StructureFile:
     Raises InputError (one line: the file, what is wrong, what to do) for a missing file, a directory, a suffix that is
     neither, bytes that are no text, a record that cannot be read, no atoms, or positions that are not finite.
     """
-    text = read_text(path)
+    text = structure_text(path)
     if is_mmcif(path):
         found = read_mmcif(text, path)
     else:
@@ -48,31 +48,12 @@ def read_structure(path: Path) -> StructureFile:
 
 def is_mmcif(path: Path) -> bool:
     """Whether the suffix is one of mmCIF's."""
-    return _suffix(path) in _CIF_SUFFIXES
+    return suffix_of(path) in _CIF_SUFFIXES
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a structure file. Raises InputError for what is none."""
+def structure_text(path: Path) -> str:
+    """Return the text of a PDB or mmCIF file. Raises InputError for what is none."""
     known = ", ".join((*_PDB_SUFFIXES, *_CIF_SUFFIXES))
-    if path.is_dir():
-        raise InputError(f"{path} is a directory; give a structure file ({known}).")
-    if not path.exists():
-        raise InputError(f"{path} does not exist; check the path, or name a library system (`surromd systems`).")
-    if _suffix(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
+    if path.is_file() and suffix_of(path) not in (*_PDB_SUFFIXES, *_CIF_SUFFIXES):
         raise InputError(f"{path} has suffix {path.suffix!r}; structures are read from {known}, also gzipped.")
-    try:
-        data = content(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read ({error}); check the file and its permissions.") from error
-    if not data.strip():
-        raise InputError(f"{path} is empty; give a PDB or mmCIF file with coordinates.")
-    if b"\0" in data:
-        raise InputError(f"{path} is a binary file, not PDB or mmCIF text; give the structure as text.")
-    return data.decode("utf-8-sig", errors="replace")
-
-
-def _suffix(path: Path) -> str:
-    suffixes = [s.lower() for s in path.suffixes]
-    if suffixes and suffixes[-1] == ".gz":
-        suffixes.pop()
-    return suffixes[-1] if suffixes else ""
+    return read_text(path, f"a structure with coordinates ({known})")
