@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from inspect import get_annotations
 from operator import attrgetter
@@ -67,6 +67,17 @@ def option(
     words = None if words is None or section else tuple(words)
     said = Declaration(help, tuple(choices), within, read, unset, words, section)
     return field(default=default, metadata={_KEY: said})
+
+
+def from_field(kind: type, name: str, default: Any = ..., *, unset: str = "") -> Any:
+    """Return a dataclass field that is the option `name` of the dataclass `kind`.
+
+    With another `default`, None say, what the option comes to is what it is there, or `unset`.
+    """
+    found = options_of(kind)[name]
+    if default is ...:
+        return field(default=found.default, metadata={_KEY: found.said})
+    return field(default=default, metadata={_KEY: replace(found.said, unset=unset or found.shown_default)})
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from systems.errors import InputError, PreparationError, UnknownNameError, nearest
+from systems.options import option
+from systems.units import parse_mass_da
 
 PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
 QUANTUM = "gfn2-xtb"
@@ -16,6 +18,11 @@ FORCE_FIELDS = (*PROTEIN_FORCE_FIELDS, "gaff2", *_WITH_LIGANDS, QUANTUM, MODEL, 
 IMPLICIT_SOLVENTS = ("obc2", "gbn2", "amber99-obc")
 EXPLICIT_SOLVENTS = ("tip3p", "opc")
 SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
+
+
+def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
+    """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
+    return None if text in ("natural", "none") else parse_mass_da(text, what)
 
 
 @dataclass(frozen=True)
@@ -32,9 +39,9 @@ class ForceFieldSpec:
     for scenes with a periodic cell: `solvation.solvate`), 'vacuum', or 'auto'.
     """
 
-    force_field: str = "ff14SB"
-    solvent: str = "obc2"
-    hydrogen_mass_da: float | None = 3.0
+    force_field: str = option("ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")
+    solvent: str = option("obc2, gbn2, tip3p, opc, vacuum, amber99-obc.", "obc2")
+    hydrogen_mass_da: float | None = option("Repartitioned mass, or 'natural'.", 3.0, read=parse_hydrogen_mass_da)
     constrain_hydrogens: bool = True
 
     def __post_init__(self) -> None:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.integrators import check_ensemble
 from systems.errors import InputError
 from systems.files.outside import check_disk
-from systems.scene import Scene
+from systems.options import option
 from systems.units import format_time_ps, whole_steps
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -24,24 +27,24 @@ class Conditions:
     """
 
     force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
-    temperature_k: float = 300.0
-    friction_per_ps: float = 1.0
-    timestep_ps: float = 0.004
-    ensemble: str = "nvt"
-    pressure_bar: float = 1.0
+    temperature_k: float = option("Of the bath.", 300.0)
+    friction_per_ps: float = option("Of the Langevin bath.", 1.0)
+    timestep_ps: float = option("Integration step.", 0.004)
+    ensemble: str = option("nvt, nve or npt.", "nvt")
+    pressure_bar: float = option("Of the barostat (npt).", 1.0)
     seed: int = 0
-    platform: str = "auto"
+    platform: str = option("OpenMM platform; auto: the fastest, timed on the scene.", "auto")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MDConfig(Conditions):
     """One run under these conditions. Times in ps; 'nve' starts from an equilibration in NVT."""
 
-    time_ps: float
-    save_every_ps: float = 1.0
-    equilibrate_ps: float = 100.0
-    save_velocities: bool = False
-    save_forces: bool = False
+    time_ps: float = option("Simulated time, such as 10ns.")
+    save_every_ps: float = option("Interval between saved frames.", 1.0)
+    equilibrate_ps: float = option("So long before frames are written.", 100.0)
+    save_velocities: bool = option("Keep them with each frame (.h5).", False)
+    save_forces: bool = option("Keep them with each frame (.h5).", False)
 
     @property
     def steps_per_frame(self) -> int:

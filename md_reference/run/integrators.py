@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from systems.errors import InputError, UnknownNameError, nearest
-from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
 
 ENSEMBLES = ("nvt", "nve", "npt")
 _STEPS_BETWEEN_VOLUME_MOVES = 25

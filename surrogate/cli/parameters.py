@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import is_dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -86,7 +86,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             kinds[parameter.name] = cast(Any, hint)
             known = options_of(cast(type, hint)).values()
             shown += [_parameter(each) for each in known if each.flags]
-            shown.append(_keyword("config", Path | None, None, _CONFIG))
+            shown.append(_keyword("config", Path | None, None, _config_option(known)))
         else:
             shown.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
 
@@ -103,7 +103,11 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-_CONFIG = typer.Option("--config", help="TOML of these options and others, which those given here come before.")
+def _config_option(known: Iterable[Option]) -> Any:
+    """Return `--config`, whose help names the tables of the file."""
+    tables = dict.fromkeys(found.section or found.name for found in known if found.section or found.kind is dict)
+    told = "".join(f", [{table}]" for table in tables)
+    return typer.Option("--config", help=literal(f"TOML of these options{told}; what is given here comes first."))
 
 
 def _settled(kind: type, given: dict[str, Any]) -> Any:

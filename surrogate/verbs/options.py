@@ -7,18 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import MDConfig
 from surrogate.sampling.config import RolloutConfig
-from systems.options import OptionRow, option, option_rows
-from systems.units import Quantity, parse_mass_da, parse_time_ps
+from systems.options import OptionRow, from_field, option, option_rows
+from systems.units import Quantity, parse_time_ps
 
 PathLike = str | Path
 # A file, a folder, a glob, a comma-separated list, or a sequence of these: replicas of each other.
 Trajectories = PathLike | Sequence[PathLike]
-
-
-def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
-    """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
-    return None if text in ("natural", "none") else parse_mass_da(text, what)
 
 
 def _one_or_none(text: str, what: str) -> str | None:
@@ -89,26 +86,24 @@ class Preparation:
 class MDSettings:
     """What the MD is and how it is run: fields of MDConfig and ForceFieldSpec, and what makes the box.
 
-    What is left open (None) is settled for the scene: by the protocol that is asked for, else by what `unset` says.
+    What is left open (None) is settled for the scene: by the protocol that is asked for, else by its default there.
     """
 
     protocol: str | None = option("A paper's settings, unless given: md17, md22, mdgen, fast-folders.", None)
-    force_field: str | None = option("ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", None, unset="auto")
-    solvent: str | None = option("obc2, gbn2, tip3p, opc, vacuum, amber99-obc.", None, unset="auto")
+    force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")
+    solvent: str | None = from_field(ForceFieldSpec, "solvent", None, unset="auto")
     level: str | None = option("mm or gfn2-xtb, quantum mechanics for molecules.", None, unset="mm")
     padding_nm: float | None = option("From the solute to the walls, in explicit water.", None, unset="1nm")
     ionic_strength_molar: float | None = option("Of NaCl in explicit water, beside counter-ions.", None, unset="0M")
-    temperature_k: float | None = option("Of the bath.", None, unset="300K")
-    friction_per_ps: float | None = option("Of the Langevin bath.", None, unset="1/ps")
-    timestep_ps: float | None = option("Integration step.", None, unset="4fs")
+    temperature_k: float | None = from_field(MDConfig, "temperature_k", None)
+    friction_per_ps: float | None = from_field(MDConfig, "friction_per_ps", None)
+    timestep_ps: float | None = from_field(MDConfig, "timestep_ps", None)
     # None is a mass of its own here: the natural one.
-    hydrogen_mass_da: Quantity | None = option(
-        "Repartitioned mass, or 'natural'.", "default", read=parse_hydrogen_mass_da, unset="3Da"
-    )
-    equilibrate_ps: float | None = option("So long before frames are written.", None, unset="100ps")
-    ensemble: str | None = option("nvt, nve or npt.", None, unset="nvt")
-    pressure_bar: float | None = option("Of the barostat (npt).", None, unset="1bar")
-    platform: str = option("OpenMM platform; auto: the fastest, timed on the scene.", "auto")
+    hydrogen_mass_da: Quantity | None = from_field(ForceFieldSpec, "hydrogen_mass_da", "default")
+    equilibrate_ps: float | None = from_field(MDConfig, "equilibrate_ps", None)
+    ensemble: str | None = from_field(MDConfig, "ensemble", None)
+    pressure_bar: float | None = from_field(MDConfig, "pressure_bar", None)
+    platform: str = from_field(MDConfig, "platform")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,10 +117,10 @@ class PlanOptions(MDSettings, Replicated, Preparation):
 class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """What `reference` can be told."""
 
-    time_ps: float = option("Simulated time, such as 10ns.")
-    save_every_ps: float | None = option("Interval between saved frames.", None, unset="1ps")
-    save_velocities: bool = option("Keep them with each frame (.h5).", False)
-    save_forces: bool = option("Keep them with each frame (.h5).", False)
+    time_ps: float = from_field(MDConfig, "time_ps")
+    save_every_ps: float | None = from_field(MDConfig, "save_every_ps", None)
+    save_velocities: bool = from_field(MDConfig, "save_velocities")
+    save_forces: bool = from_field(MDConfig, "save_forces")
 
 
 @dataclass(frozen=True, kw_only=True)
