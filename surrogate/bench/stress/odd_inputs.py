@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from surrogate.bench.stress.frame_statistics import measure_validity
 from surrogate.bench.stress.other_arithmetic import openmm_of
@@ -34,8 +35,7 @@ _HOT_K = 50.0
 def moved_scenes(scene: Scene, seed: int) -> Iterator[tuple[str, Scene, FloatArray, FloatArray]]:
     """Yield names, scenes and the rotation `(3, 3)` and shift `(3,)` nm that made them of a scene."""
     rng = np.random.default_rng(seed)
-    quaternion = rng.normal(size=4)
-    rotation = _rotation(quaternion / np.linalg.norm(quaternion))
+    rotation = Rotation.from_quat(np.roll(rng.normal(size=4), -1)).as_matrix()
     still, none = np.eye(3), np.zeros(3)
     direction = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
     yield "rotated", scene.with_positions(scene.positions_nm @ rotation.T), rotation, none
@@ -163,15 +163,3 @@ def _hot_frame(weights: Weights, seed: int) -> FloatArray | None:
             return engine.positions()
     except (KeyError, SurromdError):
         return None
-
-
-def _rotation(q: FloatArray) -> FloatArray:
-    """The rotation matrix of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = q.tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
