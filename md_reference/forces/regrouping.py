@@ -15,6 +15,7 @@ from md_reference.forces.mixture import moved_site
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
 from systems.scene import Scene
+from systems.selection import reordered
 
 IntArray = npt.NDArray[np.int64]
 
@@ -59,20 +60,13 @@ def regroup(scene: Scene, *, uncut: Iterable[tuple[int, int]] = ()) -> tuple[Sce
         chains += [str(len(set(chains)) + 1)] * len(members)
         ranked += members
     order = np.array([atom for k in ranked for atom in residues[k]], dtype=np.int64)
-    where = np.argsort(order)
     first = [int(scene.residue_of_atom[residues[k][0]]) for k in ranked]
     regrouped = replace(
-        scene,
-        atom_names=tuple(scene.atom_names[i] for i in order),
-        elements=tuple(scene.elements[i] for i in order),
+        reordered(scene, order),
         residue_of_atom=np.repeat(np.arange(len(ranked)), [len(residues[k]) for k in ranked]),
         residue_names=tuple(scene.residue_names[r] for r in first),
         residue_ids=tuple(str(k + 1) for k in range(len(ranked))),
         chain_of_residue=tuple(chains),
-        bonds=np.sort(where[scene.bonds], axis=1).reshape(-1, 2),
-        formal_charges=scene.formal_charges[order],
-        masses_da=scene.masses_da[order],
-        positions_nm=scene.positions_nm[order],
     )
     return regrouped, order
 

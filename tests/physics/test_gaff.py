@@ -22,6 +22,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
+from systems.selection import reordered
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184
@@ -46,20 +47,6 @@ def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def distorted(scene: Scene, seed: int = 0) -> FloatArray:
     """Positions 0.05 Å off the minimum, so that no term is zero."""
     return scene.positions_nm + 0.005 * np.random.default_rng(seed).normal(size=scene.positions_nm.shape)
-
-
-def shuffled(scene: Scene, order: np.ndarray) -> Scene:
-    """The same molecule with its atom `order[k]` in place k."""
-    where = np.argsort(order)
-    return replace(
-        scene,
-        atom_names=tuple(scene.atom_names[i] for i in order),
-        elements=tuple(scene.elements[i] for i in order),
-        bonds=np.sort(where[scene.bonds], axis=1),
-        formal_charges=scene.formal_charges[order],
-        masses_da=scene.masses_da[order],
-        positions_nm=scene.positions_nm[order],
-    )
 
 
 def sander(prmtop: str, positions_nm: FloatArray, folder: Path, *, igb: int = 6) -> dict[str, float]:
@@ -166,7 +153,7 @@ def test_shuffled_atoms_have_the_same_energy_through_the_cache(name: str, cache_
     here = energy_terms(build_system(scene, spec), x)
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(scene.n_atoms)
-        other = shuffled(scene, order)
+        other = reordered(scene, order)
         there = energy_terms(build_system(other, spec), x[order])
         for force, energy in here.items():
             assert there[force] == pytest.approx(energy, abs=1e-9)

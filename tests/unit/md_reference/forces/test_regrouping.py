@@ -16,6 +16,7 @@ from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
+from systems.selection import reordered
 from systems.source import prepare
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.topology_file import pdb_text
@@ -30,23 +31,16 @@ SPECS = {
 
 def shuffled(scene: Scene, order: IntArray) -> Scene:
     """Atom k of the result is atom order[k]; as in files, each run of atoms of one residue becomes a residue."""
-    where = np.argsort(order)
     old = scene.residue_of_atom[order]
     starts = np.concatenate([[True], old[1:] != old[:-1]])
     runs = old[starts]
     return replace(
-        scene,
+        reordered(scene, order),
         name="shuffled",
-        atom_names=tuple(scene.atom_names[i] for i in order),
-        elements=tuple(scene.elements[i] for i in order),
         residue_of_atom=np.cumsum(starts) - 1,
         residue_names=tuple(scene.residue_names[r] for r in runs),
         residue_ids=tuple(scene.residue_ids[r] for r in runs),
         chain_of_residue=tuple(scene.chain_of_residue[r] for r in runs),
-        bonds=np.sort(where[scene.bonds], axis=1),
-        formal_charges=scene.formal_charges[order],
-        masses_da=scene.masses_da[order],
-        positions_nm=scene.positions_nm[order],
     )
 
 
