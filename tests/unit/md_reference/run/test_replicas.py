@@ -115,7 +115,7 @@ def test_replicas_end_with_their_parent_and_can_be_resumed(
         subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as parent,
         ended(parent),
     ):
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 300
         while not all(being_written(out, alanine_dipeptide) for out in outs):  # also shows that the question can be yes
             assert parent.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)
