@@ -140,7 +140,7 @@ def test_model_systems_have_settings_of_their_own_and_take_no_protocol() -> None
     settings, said = settle(scene, {})
     assert (settings["ensemble"], settings["timestep_ps"]) == ("nve", 0.001)
     assert "ensemble nve" in said and "GeoTDM" in said
-    with pytest.raises(InputError, match="leave `protocol out"):
+    with pytest.raises(InputError, match="leave `protocol` out"):
         settle(scene, {}, "md17")
 
 
