@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces import born
+from md_reference.forces import implicit_solvent
 from md_reference.forces.mixture import is_water, merge, molecules_of
 from md_reference.forces.model_forces import build_model_system
 from md_reference.forces.nonstandard import build_chain, find_chain
@@ -143,9 +143,11 @@ def _build_mixed(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         topology = scene.to_openmm_topology()
         if spec.solvent == "gbn2":
             molecule_idx = np.sort(np.concatenate(small)) if small else np.empty(0, dtype=np.int64)
-            system.addForce(born.gbn2(scene, topology, system, molecule_idx=molecule_idx))
+            system.addForce(implicit_solvent.gbn2(scene, topology, system, molecule_idx=molecule_idx))
         else:
-            system.addForce((born.native_obc2 if native_gb else born.custom_obc2)(topology, system))
+            system.addForce(
+                (implicit_solvent.native_obc2 if native_gb else implicit_solvent.custom_obc2)(topology, system)
+            )
     return system
 
 

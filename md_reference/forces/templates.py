@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces import born
+from md_reference.forces import implicit_solvent
 from md_reference.forces.glycans import GLYCAM_FILE, covered_by_glycam, glycan_templates
 from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.regrouping import permuted, regroup
@@ -121,9 +121,9 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
             raise Unmatched(_describe(scene, int(absent[1]))) from error
         raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
     if spec.solvent == "obc2" and native_gb:
-        system.addForce(born.native_obc2(topology, system))
+        system.addForce(implicit_solvent.native_obc2(topology, system))
     elif spec.solvent == "gbn2":
-        system.addForce(born.gbn2(scene, topology, system))
+        system.addForce(implicit_solvent.gbn2(scene, topology, system))
     if len(real) != system.getNumParticles():
         virtual = sorted(set(range(system.getNumParticles())) - set(real))
         order = np.empty(system.getNumParticles(), dtype=np.int64)

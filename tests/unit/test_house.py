@@ -30,7 +30,7 @@ MANY_PARAMETERS = {
     "surrogate/judge/rows/rows.py:observable_row": "the fields of a row, by name",
     "surrogate/judge/rows/shape/contact_rows.py:_mean_row": "the fields of a row, by name",
     "surrogate/judge/rows/shape/wasserstein_rows.py:_row": "the fields of a row, by name",
-    "surrogate/models/lam_slide/objectives.py:flow_loss": "the loss' tensors, by name",
+    "surrogate/models/lam_slide/losses.py:flow_loss": "the loss' tensors, by name",
     "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
     "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",

@@ -35,8 +35,8 @@ from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.config import ApproximatorConfig
+from surrogate.models.lam_slide.losses import draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import draw_flow_times, flow_loss
 from surrogate.models.lam_slide.transformer import Approximator
 from surrogate.sampling.chunks import with_bf16_weights
 

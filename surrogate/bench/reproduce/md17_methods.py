@@ -117,7 +117,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
     """LaM-SLidE: ten given frames, one model for all molecules, told of elements."""
     import torch
 
-    from surrogate.models.lam_slide.objectives import random_rotations
+    from surrogate.models.lam_slide.losses import random_rotations
     from surrogate.models.particles.trainer import encode_windows, train_lam_slide_on_windows
 
     views = {

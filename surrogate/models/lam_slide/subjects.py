@@ -14,8 +14,8 @@ from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
 from surrogate.models.interface import Molecule
 from surrogate.models.lam_slide.codes.atom_tags import Atoms
+from surrogate.models.lam_slide.losses import random_rotations
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import random_rotations
 
 _HELD_FRAMES = 2048
 _BLOCK = 8192

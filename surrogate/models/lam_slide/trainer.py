@@ -22,8 +22,8 @@ from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.heavy_trainer import on_heavy_atoms
+from surrogate.models.lam_slide.losses import autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.subjects import Subject, normalise_latents, pick
 from surrogate.models.precision import bf16_pays
 from surrogate.models.stiff import StiffTerms

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from surrogate.data.particle_sets import ParticleSet
+from surrogate.models.lam_slide.losses import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import autoencoder_loss, draw_flow_times, flow_loss, random_rotations
 from surrogate.models.particles.model import EgnnJump, PairForces
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 

@@ -16,7 +16,7 @@ from surrogate.data.features.peptide_chains import chain_features, chain_layout,
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import save_weights
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.objectives import TAU_MAX
+from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide

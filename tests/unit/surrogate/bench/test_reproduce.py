@@ -19,7 +19,7 @@ from surrogate.bench.reproduce.n_body_methods import METHODS, WindowView, best_p
 from surrogate.bench.reproduce.published import PUBLISHED
 from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
-from surrogate.models.lam_slide.objectives import random_rotations
+from surrogate.models.lam_slide.losses import random_rotations
 from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
 from systems.errors import InputError, UnknownNameError
 

@@ -20,8 +20,8 @@ from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoenco
 from surrogate.models.lam_slide.codes.residue_code import RESIDUE_TYPES
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.heavy_atoms import HeavyLamSlide
+from surrogate.models.lam_slide.losses import autoencoder_loss, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import autoencoder_loss, flow_loss
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError

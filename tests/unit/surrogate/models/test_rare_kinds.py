@@ -16,8 +16,8 @@ from surrogate.data.weights import Weights, load_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
 from surrogate.models.lam_slide.kinds import Kind, kinds_of_windows
+from surrogate.models.lam_slide.losses import flow_loss
 from surrogate.models.lam_slide.model import MAX_REDRAWS, LamSlide
-from surrogate.models.lam_slide.objectives import flow_loss
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.lam_slide.transformer import Approximator
 from systems.elements import ATOMIC_NUMBERS

@@ -24,7 +24,7 @@ from surrogate.models.lam_slide.codes.residue_code import (
     torsion_vectors,
 )
 from surrogate.models.lam_slide.config import AutoencoderConfig
-from surrogate.models.lam_slide.objectives import random_rotations
+from surrogate.models.lam_slide.losses import random_rotations
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError
 from systems.files.schema import built

@@ -14,8 +14,8 @@ from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, lo
 from surrogate.data.weights import Weights, load_weights, read_header, save_weights
 from surrogate.models.lam_slide.codes.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.lam_slide.losses import flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.objectives import flow_loss
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
