@@ -90,5 +90,5 @@ def test_what_an_architecture_cannot_use_is_refused(tmp_path: Path, moving: Path
     assert "--budget 30min" in refusal("train", str(moving), "--arch", "painet", *out)
     still = str(tmp_path / "still.h5")
     done("windows", str(moving), "-o", still)
-    assert "surromd windows --velocities" in refusal("train", still, "--arch", "painet", "--steps", "4", *out)
+    assert "--velocities of `windows`" in refusal("train", still, "--arch", "painet", "--steps", "4", *out)
     assert not Path(out[1]).exists()

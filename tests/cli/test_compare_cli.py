@@ -75,7 +75,7 @@ def test_each_file_has_its_topology_and_time(
 
 
 def test_what_cannot_be_read_says_what_is_missing(files: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"run1.xtc holds no topology; give one with --top"):
+    with pytest.raises(InputError, match=r"run1.xtc holds no topology; give one with .top="):
         compare(files[0], [files[1]], lag_ps=1.0)
     ase = tmp_path / "run.traj"
     ase.write_bytes(b"- of Ulm")
