@@ -18,9 +18,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Platforms by size: nothing is timed, nothing in the user's cache is read or written. Tests of the timing switch it on.
 os.environ["SURROMD_TIMING"] = "off"
 
-# A shell starts background jobs with Ctrl-C ignored, and what tests start would inherit that.
+# A shell starts background jobs with Ctrl-C ignored, nohup with hang-ups, and what tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
