@@ -39,14 +39,17 @@ class _Deviation(TypedDict):
     reason: str
 
 
-class _Interventions(TypedDict):
+class _Guarded(TypedDict):
     guard: str
     chunks: Count
     chunks_caught: Count
-    reasons: dict[str, int]
     frames: dict[str, int]
-    seconds: dict[str, Number]
     bias: list[str]
+
+
+class _Interventions(_Guarded, total=False):
+    reasons: dict[str, int]
+    seconds: dict[str, Number]
 
 
 class Record(TypedDict, total=False):

@@ -96,13 +96,14 @@ def intervention_lines(record: dict[str, Any]) -> list[str]:
     helped, chunks = account["chunks_caught"], account["chunks"]
     line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
     if helped:
-        reasons = sorted(account["reasons"].items(), key=lambda r: -r[1])
+        reasons = sorted(account.get("reasons", {}).items(), key=lambda r: -r[1])
         line += f" ({_percent(helped / max(chunks, 1))}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
     lines = [line]
     if account["frames"]:
         done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
-        extra = {name: value for name, value in account["seconds"].items() if name != "draw"}
-        drawn_s = account["seconds"].get("draw") or math.inf
+        seconds = account.get("seconds", {})
+        extra = {name: value for name, value in seconds.items() if name != "draw"}
+        drawn_s = seconds.get("draw") or math.inf
         shares = ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in extra.items())
         lines += [
             f"frames that are not the surrogate's first draw: {done}",
