@@ -27,7 +27,7 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
 
     Force field: ff14SB where it covers every residue, gaff2 where it covers no molecule but water and ions,
     ff14SB+gaff2 where it covers some. Solvent: TIP3P where the scene has a cell, vacuum for gaff2 alone, else obc2.
-    Quantum and model scenes have natural masses and no constraints. Raises PreparationError for what contradicts.
+    Model scenes have natural masses and no constraints. Raises PreparationError for what contradicts.
     """
     name = spec.force_field
     if (name == MODEL) != (scene.interactions is not None) and name != "auto":
@@ -47,7 +47,7 @@ def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
         else:
             solvent = "vacuum" if name == "gaff2" else "obc2"
     changes: dict[str, Any] = {"force_field": name, "solvent": solvent}
-    if name in (QUANTUM, MODEL):
+    if name == MODEL:
         changes |= {"hydrogen_mass_da": None, "constrain_hydrogens": False}
     return replace(spec, **changes)
 
@@ -76,7 +76,9 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
         return build_model_system(scene)
     _check_cell(scene, spec)
     if spec.force_field == QUANTUM:
-        return build_quantum_system(scene)
+        return build_quantum_system(
+            scene, hydrogen_mass_da=spec.hydrogen_mass_da, constrain_hydrogens=spec.constrain_hydrogens
+        )
     if spec.force_field in PROTEIN_FORCE_FIELDS:
         system = build_templated(scene, spec, native_gb=native_gb)
     else:

@@ -20,11 +20,17 @@ _HEAVIEST = 86
 _UPHILL_KJ_MOL = 1e9
 # A force costs some hundred ms at 50 atoms and grows with the third power.
 LARGEST = 200
+# Bonds to hydrogen are at rest long before torsions are.
+_MINIMISER_STEPS = 60
 
 
-def build_quantum_system(scene: Scene) -> Any:
-    """Return an `openmm.System` whose one force is GFN2-xTB: natural masses, no constraints, no cell.
+def build_quantum_system(
+    scene: Scene, *, hydrogen_mass_da: float | None = None, constrain_hydrogens: bool = False
+) -> Any:
+    """Return an `openmm.System` whose one force is GFN2-xTB, without a cell.
 
+    `hydrogen_mass_da`: taken from the atom a hydrogen is bonded to; None leaves natural masses. With
+    `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid.
     Every force is an SCF from scratch, so that it depends on positions alone and a resumed run repeats an undisturbed
     one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon and for scenes too
     large.
@@ -40,7 +46,7 @@ def build_quantum_system(scene: Scene) -> Any:
     potential = Potential(scene)
     potential(scene.positions_nm)  # what the method refuses is known before anything runs
     system = openmm.System()
-    for mass_da in scene.masses_da.tolist():
+    for mass_da in _masses_da(scene, hydrogen_mass_da).tolist():
         system.addParticle(mass_da)
 
     def compute(state: Any) -> tuple[float, FloatArray]:
@@ -56,7 +62,45 @@ def build_quantum_system(scene: Scene) -> Any:
     force = openmm.PythonForce(compute)
     force.setName("GFN2-xTB")
     system.addForce(force)
+    if constrain_hydrogens and (bonds := _hydrogen_bonds(scene)):
+        rest_nm = _minimum_nm(scene, system)
+        for hydrogen, other in bonds:
+            system.addConstraint(hydrogen, other, float(np.linalg.norm(rest_nm[hydrogen] - rest_nm[other])))
     return system
+
+
+def _hydrogen_bonds(scene: Scene) -> list[tuple[int, int]]:
+    """Return the bonds to hydrogen, the hydrogen first."""
+    is_h = [element == "H" for element in scene.elements]
+    return [(i, j) if is_h[i] else (j, i) for i, j in scene.bonds.tolist() if is_h[i] or is_h[j]]
+
+
+def _masses_da(scene: Scene, hydrogen_mass_da: float | None) -> FloatArray:
+    """Return masses `(n_atoms,)`, hydrogens as heavy as asked for at the cost of what they are bonded to."""
+    masses = np.array(scene.masses_da, dtype=np.float64)
+    if hydrogen_mass_da is None:
+        return masses
+    is_h = np.array([element == "H" for element in scene.elements])
+    for hydrogen, other in _hydrogen_bonds(scene):
+        if not is_h[other]:
+            masses[other] -= hydrogen_mass_da - scene.masses_da[hydrogen]
+            masses[hydrogen] = hydrogen_mass_da
+    if masses.min() <= 0.0:
+        raise PreparationError(
+            f"`hydrogen_mass_da={hydrogen_mass_da:g}` leaves a heavy atom of scene {scene.name!r} no mass; use less."
+        )
+    return masses
+
+
+def _minimum_nm(scene: Scene, system: Any) -> FloatArray:
+    """Return positions `(n_atoms, 3)` nm of the minimum that a free `system` goes to from those of its scene."""
+    import openmm
+
+    platform = openmm.Platform.getPlatform("Reference")
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), platform)
+    context.setPositions(scene.positions_nm)
+    openmm.LocalEnergyMinimizer.minimize(context, maxIterations=_MINIMISER_STEPS)
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
 
 
 class Potential:

@@ -31,7 +31,7 @@ class ForceFieldSpec:
     when `constrain_hydrogens` (needed above 1 fs).
 
     `force_field`: a protein force field; 'gaff2' (GAFF2 with AM1-BCC charges) for any other molecule; 'ff14SB+gaff2'
-    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite, no constraints); 'model' for scenes with
+    for scenes with both; 'gfn2-xtb' (quantum mechanics by tblite); 'model' for scenes with
     `interactions`; 'auto', which `resolve` settles for a scene.
 
     `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen

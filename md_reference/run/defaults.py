@@ -20,7 +20,15 @@ from systems.units import format_time_ps
 # Bonds to hydrogen of natural mass swing in 9 fs; a longer step than this needs them rigid.
 LONGEST_FLEXIBLE_STEP_PS = 0.001
 # A quantum-mechanical force takes a thousand times as long as a classical one.
-QUANTUM_DEFAULTS = {"timestep_ps": 0.0005, "equilibrate_ps": 1.0, "hydrogen_mass_da": None}
+QUANTUM_DEFAULTS = {
+    "timestep_ps": 0.0005,
+    "equilibrate_ps": 1.0,
+    "hydrogen_mass_da": None,
+    "constrain_hydrogens": False,
+}
+# With rigid bonds to hydrogen, and hydrogens as heavy as this.
+LONGEST_QUANTUM_STEP_PS = 0.004
+_RIGID_HYDROGEN_MASS_DA = 3.0
 _WORDS = {
     "force_field": "force field",
     "temperature_k": "temperature",
@@ -44,8 +52,8 @@ def settle(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) 
 
     `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names one of
     `systems.library.protocols`. Its solvent goes with its force field and is left out when the user names another one;
-    its flexible bonds are left out above a time step of 1 fs. Raises UnknownNameError, and InputError for a model
-    system, whose settings are its own.
+    its flexible bonds are left out above a time step of 1 fs; quantum forces then get hydrogens of 3 Da, too.
+    Raises UnknownNameError, and InputError for a model system, whose settings are its own.
     """
     name = scene.provenance.get("library_name")
     return settle_by_name(name if isinstance(name, str) else "", given, protocol)
@@ -58,12 +66,12 @@ def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = N
         decisive.pop("solvent", None)
     own = defaults()
     if given.get("force_field") == QUANTUM:
-        if given.get("timestep_ps", 0.0) > LONGEST_FLEXIBLE_STEP_PS:
-            raise InputError(
-                f"{QUANTUM} leaves bonds to hydrogen free, for which {format_time_ps(given['timestep_ps'])} is too "
-                "long; use `timestep_ps='1fs'` or less."
-            )
+        step_ps = given.get("timestep_ps", 0.0)
+        if step_ps > LONGEST_QUANTUM_STEP_PS:
+            raise InputError(f"{format_time_ps(step_ps)} is too long for {QUANTUM}; use `timestep_ps='4fs'` or less.")
         own |= QUANTUM_DEFAULTS
+        if step_ps > LONGEST_FLEXIBLE_STEP_PS:
+            own["hydrogen_mass_da"] = _RIGID_HYDROGEN_MASS_DA
         decisive.pop("equilibrate_ps", None)
     settings = own | decisive | dict(given)
     if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:

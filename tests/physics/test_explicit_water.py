@@ -253,4 +253,4 @@ def test_auto_settles_by_what_templates_cover() -> None:
     assert resolve(load("aspirin"), auto) == ForceFieldSpec("gaff2", "vacuum")
     assert resolve(peptide_box(), auto).solvent == "tip3p"
     quantum = resolve(load("aspirin"), ForceFieldSpec("gfn2-xtb", "auto"))
-    assert quantum == ForceFieldSpec("gfn2-xtb", "vacuum", None, False)
+    assert quantum == ForceFieldSpec("gfn2-xtb", "vacuum")

@@ -16,7 +16,7 @@ from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
 
 pytest.importorskip("tblite")
-SPEC = ForceFieldSpec("gfn2-xtb", "vacuum")
+SPEC = ForceFieldSpec("gfn2-xtb", "vacuum", None, constrain_hydrogens=False)
 
 
 def test_energy_is_tblites_own_in_kj_mol_and_its_forces_are_minus_the_gradient() -> None:
@@ -67,14 +67,50 @@ def test_charge_and_unpaired_electrons_are_used() -> None:
     assert abs(energies[0] - energies[1]) > 10.0
 
 
-def test_there_are_no_constraints_and_masses_are_natural() -> None:
+def test_masses_and_constraints_are_what_was_asked_for() -> None:
     scene = load("ethanol")
-    system = build_quantum_system(scene)
-    assert system.getNumConstraints() == 0
-    assert [system.getParticleMass(i)._value for i in range(scene.n_atoms)] == scene.masses_da.tolist()
-    assert resolve(scene, ForceFieldSpec("gfn2-xtb", "auto", 3.0, True)) == ForceFieldSpec(
-        "gfn2-xtb", "vacuum", None, False
-    )
+    free = build_quantum_system(scene)
+    assert free.getNumConstraints() == 0
+    assert [free.getParticleMass(i)._value for i in range(scene.n_atoms)] == scene.masses_da.tolist()
+    spec = resolve(scene, ForceFieldSpec("gfn2-xtb", "auto", 3.0, True))
+    assert spec == ForceFieldSpec("gfn2-xtb", "vacuum", 3.0, True)
+    rigid = build_quantum_system(scene, hydrogen_mass_da=3.0, constrain_hydrogens=True)
+    masses = np.array([rigid.getParticleMass(i)._value for i in range(scene.n_atoms)])
+    assert masses.sum() == pytest.approx(scene.masses_da.sum())
+    assert all(masses[[e == "H" for e in scene.elements]] == 3.0)
+    assert masses.min() >= 3.0
+    lengths = {}
+    for k in range(rigid.getNumConstraints()):
+        hydrogen, other, length = rigid.getConstraintParameters(k)
+        assert scene.elements[hydrogen] == "H"
+        lengths.setdefault(scene.elements[other], []).append(length._value)
+    # GFN2-xTB's own rest lengths: O-H 0.096, C-H 0.109 nm.
+    assert [len(lengths["O"]), len(lengths["C"])] == [1, 5]
+    np.testing.assert_allclose(lengths["O"], 0.096, atol=0.001)
+    np.testing.assert_allclose(lengths["C"], 0.1095, atol=0.0015)
+    with pytest.raises(PreparationError, match="mass"):
+        build_quantum_system(scene, hydrogen_mass_da=8.0)
+
+
+def test_rigid_bonds_to_hydrogen_stay_as_they_are_at_four_fs() -> None:
+    scene = scene_from_smiles("CO")
+    settings, _ = settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.004})
+    assert (settings["hydrogen_mass_da"], settings["constrain_hydrogens"]) == (3.0, True)
+    spec = ForceFieldSpec("gfn2-xtb", "vacuum", 3.0, constrain_hydrogens=True)
+    with Engine(scene, Conditions(force=spec, platform="Reference", timestep_ps=0.004)) as engine:
+        engine.thermalise()
+        bonds = [(i, j) for i, j in scene.bonds.tolist() if "H" in (scene.elements[i], scene.elements[j])]
+        heavy = [(i, j) for i, j in scene.bonds.tolist() if (i, j) not in bonds]
+        lengths = {True: [], False: []}
+        for _ in range(6):
+            engine.step(5)
+            x = engine.positions()
+            for rigid, pairs in ((True, bonds), (False, heavy)):
+                lengths[rigid].append([np.linalg.norm(x[i] - x[j]) for i, j in pairs])
+        assert engine.state().temperature_k < 2000.0
+    assert np.ptp(lengths[True], axis=0).max() < 1e-5
+    # Negative control: the bond between heavy atoms swings.
+    assert np.ptp(lengths[False], axis=0).max() > 1e-4
 
 
 def test_a_short_run_keeps_its_energy() -> None:
@@ -105,8 +141,9 @@ def test_level_and_settings_go_together() -> None:
     scene = scene_from_smiles("CO")
     settings, _ = settle(scene, {"force_field": "gfn2-xtb"})
     assert settings["timestep_ps"] == 0.0005
-    with pytest.raises(InputError, match="1fs"):
-        settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.004})
+    assert (settings["hydrogen_mass_da"], settings["constrain_hydrogens"]) == (None, False)
+    with pytest.raises(InputError, match="4fs"):
+        settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.005})
 
 
 def test_impossible_electrons_are_refused() -> None:
