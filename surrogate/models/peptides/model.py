@@ -45,7 +45,7 @@ class PeptideConfig:
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
     beside a stiff one. Flow times are logit-normal, as elsewhere."""
 
-    width: int = 256
+    width: int = 128
     n_layers: int = 6
     n_heads: int = 4
     chunk_frames: int = 16
