@@ -10,73 +10,31 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from surrogate.api import (
-        bursts,
-        campaign,
-        compare,
-        demo,
-        explain_training,
-        info,
-        plan,
-        reference,
-        rollout,
-        systems,
-        train,
-        windows,
-    )
-    from surrogate.sampling.openmm.simulation import Simulation
-    from systems.trajectory.converted import to_mdanalysis, to_mdtraj
+    from surrogate.api import *  # noqa: F403
+    from surrogate.sampling.openmm.simulation import Simulation as Simulation
+    from systems.trajectory.converted import to_mdanalysis as to_mdanalysis
+    from systems.trajectory.converted import to_mdtraj as to_mdtraj
 
 __version__ = "0.1.0"
 
-_VERBS = (
-    "bursts",
-    "campaign",
-    "compare",
-    "demo",
-    "explain_training",
-    "info",
-    "plan",
-    "reference",
-    "rollout",
-    "systems",
-    "train",
-    "windows",
-)
 _ELSEWHERE = {
     "Simulation": "surrogate.sampling.openmm.simulation",
     "to_mdanalysis": "systems.trajectory.converted",
     "to_mdtraj": "systems.trajectory.converted",
 }
 
-__all__ = [
-    "Simulation",
-    "bursts",
-    "campaign",
-    "compare",
-    "demo",
-    "explain_training",
-    "info",
-    "plan",
-    "reference",
-    "rollout",
-    "systems",
-    "to_mdanalysis",
-    "to_mdtraj",
-    "train",
-    "windows",
-]
-
 
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 
-    if name in _VERBS:
-        return getattr(import_module("surrogate.api"), name)
     if name in _ELSEWHERE:
         return getattr(import_module(_ELSEWHERE[name]), name)
+    if name == "__all__":
+        return sorted([*import_module("surrogate.api").__all__, *_ELSEWHERE])
+    if not name.startswith("_") and name in (api := import_module("surrogate.api")).__all__:
+        return getattr(api, name)
     raise AttributeError(f"module 'surrogate' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *__getattr__("__all__")})

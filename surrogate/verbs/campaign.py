@@ -1,4 +1,4 @@
-"""The verb `campaign` and what it leaves behind: started on Dask with one progress bar, described for people."""
+"""The verb `campaign`: runs on Dask with one progress bar, and an account of what its folder holds."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
 from surrogate.progress import progress_bar
+from surrogate.verbs.options import CampaignOptions, PathLike
+from surrogate.verbs.takes import takes
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.campaign.campaign_file import Campaign
@@ -20,35 +23,51 @@ if TYPE_CHECKING:
 _SPEED_OVER_S = 30.0
 
 
-def run_campaign(campaign: Campaign, *, workers: int | None, scheduler: str | None, quiet: bool) -> dict[str, Any]:
+@takes(CampaignOptions)
+def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOptions) -> dict[str, Any]:
+    """Simulate many scenes, temperatures and replicas as a TOML file says, on Dask, and return `info` of the folder.
+
+    Runs on `workers` processes of this machine (one per core), on a Dask `scheduler` (tcp://host:port), or on the jobs
+    of the file's [cluster]. What is finished is not done again; what fails stands in the result's `failed`. `dry_run`:
+    return what would be run, and start nothing. `out` replaces the folder that the file names.
+    Raises InputError for a file that cannot be meant, and for the folder of another campaign.
+    """
+    from md_reference.campaign.campaign_file import read_campaign
+
+    asked = read_campaign(file, folder=out)
+    if options.dry_run:
+        return _list_runs(asked)
+    return _run(asked, options)
+
+
+def _run(campaign: Campaign, options: CampaignOptions) -> dict[str, Any]:
     """Run what a campaign lacks, on local workers, a scheduler or a cluster, and return `describe_campaign`.
 
     What fails is said on stderr when it happens. Raises what `md_reference.campaign.scheduler.run_campaign` raises.
     """
     from md_reference.campaign.cluster import open_client
-    from md_reference.campaign.scheduler import open_campaign
-    from md_reference.campaign.scheduler import run_campaign as run
+    from md_reference.campaign.scheduler import open_campaign, run_campaign
 
     manifest = open_campaign(campaign)  # another campaign's folder is refused before any worker starts
     if manifest.counts().get(COMPLETE, 0) == len(manifest.runs):
         return describe_campaign(campaign.folder)
 
     def failed(name: str, reason: str) -> None:
-        if not quiet:
+        if not options.quiet:
             sys.stderr.write(f"{name}: {reason}\n")
 
     try:
         with (
             open_client(
-                workers=workers,
-                scheduler=scheduler,
+                workers=options.workers,
+                scheduler=options.scheduler,
                 cluster=campaign.cluster,
                 retries=campaign.retries,
                 folder=campaign.folder,
             ) as client,
-            progress_bar(f"campaign {campaign.name}", quiet=quiet) as advance,
+            progress_bar(f"campaign {campaign.name}", quiet=options.quiet) as advance,
         ):
-            run(campaign, client, progress=None if advance is None else _Meter(advance), failed=failed)
+            run_campaign(campaign, client, progress=None if advance is None else _Meter(advance), failed=failed)
     except KeyboardInterrupt as stop:
         if stop.args:
             raise
@@ -77,10 +96,8 @@ class _Meter:
         self._advance(progress.frames_done, max(progress.frames_total, 1), f"{note}{speed:.3g} frames/s")
 
 
-def list_runs(campaign: Campaign) -> dict[str, Any]:
+def _list_runs(campaign: Campaign) -> dict[str, Any]:
     """Return what a campaign will run, before anything is started (JSON-able)."""
-    from systems.units import format_time_ps
-
     lengths = {run.name: format_time_ps(run.config.time_ps) for run in campaign.runs}
     return {
         "file": str(campaign.folder),
@@ -103,8 +120,6 @@ def describe_campaign(folder: Path) -> dict[str, Any]:
     simulated_ps = sum(run.simulated_ps for run in complete)
     counts = manifest.counts()
     temperatures = sorted({run.temperature_k for run in runs})
-    from systems.units import format_time_ps
-
     done = f", {format_time_ps(simulated_ps)} simulated" if complete else ""
     others = "".join(f", {n} {state}" for state, n in counts.items() if state != COMPLETE)
     return {

@@ -1,4 +1,4 @@
-"""What a file is and where it came from: trajectories, windows and weights, told apart by what they hold."""
+"""The verb `info`: what a file is and where it came from. Files are told apart by what they hold."""
 
 from __future__ import annotations
 
@@ -6,10 +6,26 @@ import math
 from pathlib import Path
 from typing import Any
 
+from surrogate.data.shipped import shipped_weights
+from surrogate.verbs.campaign import describe_campaign
+from surrogate.verbs.options import PathLike
 from systems.errors import InputError
 from systems.units import format_time_ps
 
 UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
+
+
+def info(path: PathLike) -> dict[str, Any]:
+    """Return what a trajectory, a windows or weights file or a campaign's folder is and where it came from (JSON-able).
+    Shipped weights may be given by name.
+
+    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
+    """
+    if not Path(path).exists():
+        return describe_file(shipped_weights().get(str(path), Path(path)))
+    if Path(path).is_dir():
+        return describe_campaign(Path(path))
+    return describe_file(Path(path))
 
 
 def describe_file(path: Path) -> dict[str, Any]:
