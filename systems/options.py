@@ -25,11 +25,11 @@ _SCALARS = (bool, int, float, str, Path)
 
 
 class MissingOptionError(InputError):
-    """An option that has no default is given nowhere. `option` is the first of these."""
+    """An option that has no default is given nowhere. `needs` says which one, after the name of what needs it."""
 
-    def __init__(self, option: Option, naming: Callable[[Option], str]) -> None:
-        super().__init__(f"{naming(option)} is missing: {option.help}")
-        self.option = option
+    def __init__(self, option: Option, name: str) -> None:
+        super().__init__(f"{name} must be given: {option.help}")
+        self.needs = f"needs {name}: {option.help}"
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def gather(
         values[name] = known[name].value(value, naming(known[name]))
     for name, found in known.items():
         if found.required and name not in values:
-            raise MissingOptionError(found, naming)
+            raise MissingOptionError(found, naming(found))
     return kind(**values)
 
 

@@ -6,26 +6,20 @@ from pathlib import Path
 
 from systems.errors import InputError
 from systems.library import named_scenes
+from systems.preparation import Preparation
 from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mol_file import SUFFIXES
 from systems.prepare.read.peptide_mol2 import is_peptide_mol2
 from systems.prepare.structure_file import prepare_file
 from systems.scene import Scene
+from systems.takes import takes
 
 _FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
 _OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
 
 
-def prepare(
-    spec: str,
-    *,
-    ph: float = 7.0,
-    keep_ligand: bool = False,
-    drop_ligand: bool = False,
-    drop_water: bool = False,
-    keep_water: bool = False,
-    cap_breaks: bool = False,
-) -> Scene:
+@takes(Preparation)
+def prepare(spec: str, options: Preparation) -> Scene:
     """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
     `sequence:ACE-ALA-NME`.
 
@@ -37,18 +31,13 @@ def prepare(
     with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
-    if not 0.0 <= ph <= 14.0:
-        raise InputError(f"pH {ph:g} lies outside 0 to 14.")
-    if keep_ligand and drop_ligand:
-        raise InputError("`keep_ligand` and `drop_ligand` exclude each other; choose one.")
-    if keep_water and drop_water:
-        raise InputError("`keep_water` and `drop_water` exclude each other; choose one.")
+    options.refuse_contradictions()
     text = str(spec).strip()
     kind, _, rest = text.partition(":")
     if kind.lower() == "sequence":
         from systems.prepare.peptide import build_peptide
 
-        return build_peptide(rest, ph=ph)
+        return build_peptide(rest, ph=options.ph)
     if kind.lower() == "smiles":
         from systems.prepare.molecule import scene_from_smiles
 
@@ -64,12 +53,5 @@ def prepare(
     if suffix in _OTHER_SUFFIXES:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
-        return prepare_file(
-            path,
-            ph=ph,
-            keep_ligand=keep_ligand,
-            drop_ligand=drop_ligand,
-            keep_water=keep_water,
-            cap_breaks=cap_breaks,
-        )
+        return prepare_file(path, options)
     return named_scenes.load(text)

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.campaign.run_options import Settings, read_settings, to_config
+from md_reference.forces.spec import WaterBox
 from md_reference.run.config import MDConfig
 from md_reference.run.defaults import settle_by_name
 from systems.errors import InputError, SurromdError
 from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
 from systems.library.protocols import find_protocol
+from systems.options import options_of
+from systems.preparation import Preparation
 from systems.units import parse_temperature_k, parse_wall_s
 
 T = TypeVar("T")
@@ -176,25 +177,16 @@ def _campaign(table: dict[str, Any], path: Path, text: str, folder: Path | None)
 
 def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings]:
     """Return what a table says of itself and of its runs: axes, preparation and settings, unknown keys refused."""
-    from md_reference.forces.solvation import solvate
-    from systems.source import prepare
-
     own = {f.name for f in fields(cast(Any, kind))}
     settings = read_settings(
         {key: value for key, value in table.items() if key not in own},
         axes=_AXES,
         # A campaign takes what the command line takes.
-        preparation=switches_of(prepare) | switches_of(solvate),
+        preparation=options_of(Preparation) | options_of(WaterBox),
         others=own,
         where=where,
     )
     return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
-
-
-def switches_of(function: Callable[..., Any]) -> dict[str, Any]:
-    """Return the annotations of a function's parameters that have defaults, but its seed."""
-    parameters, hints = inspect.signature(function).parameters.values(), get_type_hints(function)
-    return {p.name: hints[p.name] for p in parameters if p.default is not p.empty and p.name != "seed"}
 
 
 def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:

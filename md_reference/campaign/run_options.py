@@ -10,6 +10,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig, settings_of
 from systems.errors import InputError, nearest
 from systems.files.schema import fitted
+from systems.options import Option
 from systems.units import parser_of
 
 # Settings whose names end so are written without it, as texts with a unit.
@@ -42,11 +43,12 @@ def read_settings(
     table: dict[str, Any],
     *,
     axes: Mapping[str, Any],
-    preparation: Mapping[str, Any],
+    preparation: Mapping[str, Option],
     others: Iterable[str],
     where: str,
 ) -> Settings:
-    """Return a table's settings, in our units. `axes`, `preparation`: the annotations of what else it may say of runs.
+    """Return a table's settings, in our units. `axes`: the annotations of what else it may say of runs; `preparation`:
+    the options of how a scene is made.
 
     Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read),
     ValueError for values of the wrong kind.
@@ -58,7 +60,7 @@ def read_settings(
         if key in axes:
             found.axes[key] = fitted(value, axes[key], f"{where}{key}")
         elif key in preparation:
-            found.preparation[key] = fitted(value, preparation[key], f"{where}{key}")
+            found.preparation[key] = preparation[key].value(value, f"{where}{key}")
         elif key in by_key:
             name = by_key[key]
             found.values[name] = _value(name, hints[name], value, f"{where}{key}")

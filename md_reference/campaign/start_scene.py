@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from md_reference.campaign.campaign_file import SceneSpec, switches_of
+from md_reference.campaign.campaign_file import SceneSpec
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
+from systems.options import options_of
+from systems.preparation import Preparation
 from systems.scene import Scene
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -53,14 +57,12 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     from systems.files.whole_file import create_whole
     from systems.source import prepare
 
-    switches = switches_of(prepare)
-    scene = prepare(spec.source, **{key: value for key, value in spec.preparation.items() if key in switches})
+    scene = prepare(spec.source, options=_chosen(Preparation, spec))
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
         require_molecules(force)
     if force.is_explicit and scene.cell_nm is None:
-        of_water = {key: value for key, value in spec.preparation.items() if key not in switches}
-        scene = solvate(scene, force, seed=seed, **of_water)
+        scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed)
     system = build_system(scene, force)
     platform = measured_platform(scene, replace(config, force=force), system=lambda: system)
     prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
@@ -69,6 +71,11 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     path.parent.mkdir(parents=True, exist_ok=True)
     create_whole(path, json.dumps(record))
     return prepared
+
+
+def _chosen(kind: type[T], spec: SceneSpec) -> T:
+    """Return what a scene's table says of the options of `kind`, the defaults for the rest."""
+    return kind(**{name: value for name, value in spec.preparation.items() if name in options_of(kind)})
 
 
 def load_prepared(path: Path) -> PreparedScene:

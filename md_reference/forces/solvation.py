@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.forces.template_files import cutoff_nm
 from systems.chemistry.element_data import atomic_weight_da, covalent_radius_nm
 from systems.errors import InputError, PreparationError
@@ -31,38 +31,28 @@ _LARGEST = 200_000
 _ATTEMPTS = 30
 
 
-def solvate(
-    scene: Scene,
-    spec: ForceFieldSpec,
-    padding_nm: float = 1.0,
-    ionic_strength_molar: float = 0.0,
-    seed: int = 0,
-) -> Scene:
+def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0) -> Scene:
     """Return the scene in a periodic cell of water (`spec.solvent` 'tip3p' or 'opc'), neutral, with Na+ and Cl-.
 
-    Wherever the solute turns, it stays `padding_nm` from the walls: periodic images are at least twice that apart. The
-    scene's atoms come first, in their order, moved to the middle of the cell; then waters, then ions. Which waters
+    Wherever the solute turns, it stays `box.padding_nm` from the walls: periodic images are at least twice that apart.
+    The scene's atoms come first, in their order, moved to the middle of the cell; then waters, then ions. Which waters
     become ions is drawn with `seed`, from those 0.5 nm from the solute and from each other where there are enough.
-    Raises PreparationError for a scene that has a cell, another solvent, or values that make no cell.
+    Raises PreparationError for a scene that has a cell, another solvent, or a cell of too many atoms.
     """
     if not spec.is_explicit:
         raise PreparationError(f"solvent {spec.solvent!r} has no molecules to add; give `solvent='tip3p'` or opc.")
     if scene.cell_nm is not None:
         raise PreparationError(f"scene {scene.name!r} has a periodic cell already; leave `padding_nm` out.")
-    if not 0.3 <= padding_nm <= 10.0:
-        raise PreparationError(f"padding of {padding_nm:g} nm: give between 0.3 and 10 nm.")
-    if not 0.0 <= ionic_strength_molar <= 5.0:
-        raise PreparationError(f"ionic strength of {ionic_strength_molar:g} mol/l: give between 0 and 5.")
     low, high = scene.positions_nm.min(axis=0), scene.positions_nm.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(scene.positions_nm - centre, axis=1).max())
     # Direct interactions must end before the next image, also after a barostat has shrunk the cell.
     least_nm = 2.1 * cutoff_nm(spec.protein)[0] / float(_DODECAHEDRON[2, 2])
-    cell = max(2 * (radius + padding_nm), least_nm) * _DODECAHEDRON
+    cell = max(2 * (radius + box.padding_nm), least_nm) * _DODECAHEDRON
     volume_nm3 = float(np.linalg.det(cell))
     if volume_nm3 * 100 > _LARGEST:
         raise PreparationError(
-            f"a cell for scene {scene.name!r} with {padding_nm:g} nm of padding holds some {volume_nm3 * 100:,.0f} "
+            f"a cell for scene {scene.name!r} with {box.padding_nm:g} nm of padding holds some {volume_nm3 * 100:,.0f} "
             f"atoms (up to {_LARGEST:,}); use less padding or a compact structure."
         )
     solute = scene.positions_nm - centre + cell.sum(axis=0) / 2
@@ -70,7 +60,7 @@ def solvate(
     wanted = round((volume_nm3 - float(scene.masses_da.sum()) * _NM3_PER_DA) * _WATERS_PER_NM3)
     water = _fill(cell, solute, scene.elements, wanted, rng)
     charge = int(scene.formal_charges.sum())
-    pairs = round(len(water) * ionic_strength_molar / _MOLAR_OF_WATER)
+    pairs = round(len(water) * box.ionic_strength_molar / _MOLAR_OF_WATER)
     kinds = ["Na"] * (pairs + max(0, -charge)) + ["Cl"] * (pairs + max(0, charge))
     chosen = _ion_sites(water[:, 0], solute, cell, len(kinds), rng)
     ions = water[chosen, 0]
@@ -95,21 +85,17 @@ def solvate_if_asked(
 ) -> Scene:
     """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is.
 
-    None is the default of `solvate`. Raises InputError for a padding or an ionic strength that nothing would use.
+    None is the default of `WaterBox`. Raises InputError for a padding or an ionic strength that nothing would use.
     """
-    given = [
-        option
-        for option, value in (("`padding_nm`", padding_nm), ("`ionic_strength_molar`", ionic_strength_molar))
-        if value is not None
-    ]
+    asked = {"padding_nm": padding_nm, "ionic_strength_molar": ionic_strength_molar}
+    given = {name: value for name, value in asked.items() if value is not None}
     if spec.is_explicit and scene.cell_nm is None:
-        return solvate(scene, spec, 1.0 if padding_nm is None else padding_nm, ionic_strength_molar or 0.0, seed=seed)
+        return solvate(scene, spec, WaterBox(**given), seed=seed)
+    named = " and ".join(f"`{name}`" for name in given)
     if given and not spec.is_explicit:
-        raise InputError(
-            f"nothing would use {' and '.join(given)} without water around the scene; give `solvent='tip3p'` or opc."
-        )
+        raise InputError(f"nothing would use {named} without water around the scene; give `solvent='tip3p'` or opc.")
     if given:
-        raise InputError(f"scene {scene.name!r} has a periodic cell already; leave {' and '.join(given)} out.")
+        raise InputError(f"scene {scene.name!r} has a periodic cell already; leave {named} out.")
     return scene
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from systems.errors import InputError, PreparationError, UnknownNameError, nearest
-from systems.options import option
+from systems.options import check_options, option
 from systems.units import parse_mass_da
 
 PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
@@ -23,6 +23,17 @@ SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
 def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
     """Return the hydrogen mass in dalton, or None where natural masses are asked for. Raises UnitError."""
     return None if text in ("natural", "none") else parse_mass_da(text, what)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterBox:
+    """The periodic cell of water that a scene is put into where the solvent is explicit. Raises InputError."""
+
+    padding_nm: float = option("From the solute to the walls, in explicit water.", 1.0, within=(0.3, 10.0))
+    ionic_strength_molar: float = option("Of NaCl in explicit water, beside counter-ions.", 0.0, within=(0.0, 5.0))
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 @dataclass(frozen=True)

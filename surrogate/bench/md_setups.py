@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.forces.template_files import PROTEIN_FILES, cutoff_nm, water_file
 from md_reference.run.config import Conditions
 from md_reference.run.machine import platform_properties
@@ -36,7 +36,7 @@ class Case:
             return scene
         from md_reference.forces.solvation import solvate
 
-        return solvate(scene, self.spec(), padding_nm=self.padding_nm, seed=0)
+        return solvate(scene, self.spec(), WaterBox(padding_nm=self.padding_nm))
 
     def spec(self, *, repartitioned: bool = False) -> ForceFieldSpec:
         """Return the force field; hydrogens keep their natural mass unless `repartitioned`."""

@@ -19,6 +19,7 @@ from surrogate.cli.parameters import (
     OutOpt,
     SceneArg,
     WeightsOpt,
+    usage_error,
     with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
@@ -60,8 +61,8 @@ class _Group(TyperGroup):
             _fail(f"error: {_os_error(error)}", 1)
         except MemoryError:
             _fail("error: out of memory; ask for fewer frames or replicas at once", 1)
-        except _usage_errors():
-            raise
+        except _usage_errors() as error:
+            raise (_needed(error) or error) from None
         except Exception as error:  # a fault of ours: one line for the user, the rest on demand
             if "null byte" in str(error):
                 _fail("error: a path holds a NUL character, which no file's name can have", 1)
@@ -72,6 +73,14 @@ def _usage_errors() -> tuple[type[BaseException], ...]:
     """Click's own exceptions, which end in its own messages and exit codes (typer 0.26 and newer vendor click)."""
     usage = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
     return (usage, typer.Exit, typer.Abort)
+
+
+def _needed(error: Any) -> Exception | None:
+    """Return the error that says what is missing, as of options that stand in a dataclass; None of any other error."""
+    if type(error).__name__ != "MissingParameter" or error.param is None:
+        return None
+    name = error.param.opts[0] if error.param.param_type_name == "option" else error.param.metavar
+    return usage_error(f"{error.ctx.info_name} needs {name}: {error.param.help}", error.ctx)
 
 
 def _fail(message: str, code: int) -> None:
@@ -234,7 +243,7 @@ def train(
         typer.echo(api.explain_training(references, options=options), nl=False)
         return
     if out is None:
-        raise typer.BadParameter("name the weights to write: -o w.safetensors", param_hint="--out")
+        raise usage_error("train needs --out: Weights to write, .safetensors.")
     written = api.train(references, out, options=options)
     from surrogate.training.devices import is_first_process
 
@@ -268,7 +277,7 @@ class CompareShown(CompareOptions, Quiet):
 def compare(
     reference: Annotated[str, typer.Argument(metavar="REF", help="The truth: a file, folder, 'glob' or a,b,c.")],
     candidates: Annotated[
-        list[str], typer.Argument(metavar="TRAJ...", help="Each argument one candidate, written alike.")
+        list[str], typer.Argument(metavar="TRAJ...", help="Candidates, each argument one, written as REF.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; .json, .md go beside it.")] = Path(
         "report.html"

@@ -61,6 +61,14 @@ ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlie
 OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
 
 
+def usage_error(message: str, context: Any = None) -> Exception:
+    """Return click's error that ends a command with its usage, a message and exit code 2."""
+    # Newer versions of typer bring a click of their own, under another name.
+    kind: Any = next(each for each in typer.BadParameter.__mro__ if each.__name__ == "UsageError")
+    made: Exception = kind(message, context)
+    return made
+
+
 def _hush(quiet: bool) -> bool:
     """Keep the lines of loggers, such as those about charges, from stderr."""
     logging.getLogger("surromd").setLevel(logging.ERROR if quiet else logging.NOTSET)
@@ -93,7 +101,10 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(**given: Any) -> None:
         for name, kind in kinds.items():
-            settled = _settled(kind, given)
+            try:
+                settled = _settled(kind, given)
+            except MissingOptionError as error:
+                raise usage_error(f"{command.__name__} {error.needs}") from None
             _hush(getattr(settled, "quiet", False))
             given[name] = settled
         command(**given)
@@ -111,13 +122,10 @@ def _config_option(known: Iterable[Option]) -> Any:
 
 
 def _settled(kind: type, given: dict[str, Any]) -> Any:
-    """Take a dataclass's options out of what the command line gives, and return it."""
+    """Take a dataclass's options out of what the command line gives, and return it. Raises what `gather` does."""
     typed = {name: given.pop(name) for name, found in options_of(kind).items() if found.flags}
     said = {name: _plain(value) for name, value in typed.items() if value is not None and value != []}
-    try:
-        return gather(kind, said, file=given.pop("config"), naming=lambda found: found.flags[0])
-    except MissingOptionError as error:
-        raise typer.BadParameter(str(error)) from None
+    return gather(kind, said, file=given.pop("config"), naming=lambda found: found.flags[0])
 
 
 def _plain(value: Any) -> Any:

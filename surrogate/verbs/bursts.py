@@ -11,8 +11,8 @@ import numpy as np
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import BurstOptions, Trajectories
 from surrogate.verbs.outputs import find_trajectories
-from surrogate.verbs.takes import takes
 from systems.errors import InputError
+from systems.takes import takes
 
 if TYPE_CHECKING:
     from surrogate.judge.burst_check import BurstCheck

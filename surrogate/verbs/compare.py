@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.verbs.options import CompareOptions, PathLike, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.takes import takes
 from systems.errors import InputError
+from systems.takes import takes
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,8 +10,8 @@ from surrogate.verbs.compare import compare
 from surrogate.verbs.options import DemoOptions, PathLike
 from surrogate.verbs.reference import reference
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.takes import takes
 from systems.errors import InputError
+from systems.takes import takes
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from surrogate.sampling.config import RolloutConfig
 from systems.options import OptionRow, from_field, option, option_rows
+from systems.preparation import Preparation
 from systems.units import Quantity, parse_time_ps
 
 PathLike = str | Path
@@ -71,20 +72,8 @@ class Validated:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preparation:
-    """How a Scene is made of what a user names: switches of `systems.source.prepare`."""
-
-    ph: float = option("Where a peptide's hydrogens are added.", 7.0, within=(0.0, 14.0))
-    keep_ligand: bool = option("Simulate ligands and ions beside a peptide, too.", False)
-    drop_ligand: bool = option("Leave ligands and ions beside a peptide out.", False)
-    drop_water: bool = option("Leave the file's waters out, as is usual.", False)
-    keep_water: bool = option("Keep the file's waters, in explicit solvent.", False)
-    cap_breaks: bool = option("Close a chain that breaks with ACE and NME.", False)
-
-
-@dataclass(frozen=True, kw_only=True)
 class MDSettings:
-    """What the MD is and how it is run: fields of MDConfig and ForceFieldSpec, and what makes the box.
+    """What the MD is and how it is run: fields of MDConfig, ForceFieldSpec and WaterBox.
 
     What is left open (None) is settled for the scene: by the protocol that is asked for, else by its default there.
     """
@@ -93,8 +82,8 @@ class MDSettings:
     force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")
     solvent: str | None = from_field(ForceFieldSpec, "solvent", None, unset="auto")
     level: str | None = option("mm or gfn2-xtb, quantum mechanics for molecules.", None, unset="mm")
-    padding_nm: float | None = option("From the solute to the walls, in explicit water.", None, unset="1nm")
-    ionic_strength_molar: float | None = option("Of NaCl in explicit water, beside counter-ions.", None, unset="0M")
+    padding_nm: float | None = from_field(WaterBox, "padding_nm", None)
+    ionic_strength_molar: float | None = from_field(WaterBox, "ionic_strength_molar", None)
     temperature_k: float | None = from_field(MDConfig, "temperature_k", None)
     friction_per_ps: float | None = from_field(MDConfig, "friction_per_ps", None)
     timestep_ps: float | None = from_field(MDConfig, "timestep_ps", None)

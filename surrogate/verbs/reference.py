@@ -10,8 +10,8 @@ from surrogate.progress import progress_bar
 from surrogate.verbs.options import PlanOptions, ReferenceOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.verbs.scene_listing import prepare_scene
-from surrogate.verbs.takes import takes
 from surrogate.verbs.telling import tell
+from systems.takes import takes
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig

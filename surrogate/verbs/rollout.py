@@ -11,9 +11,9 @@ from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.options import RolloutOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
 from surrogate.verbs.scene_listing import prepare_scene
-from surrogate.verbs.takes import takes
 from surrogate.verbs.telling import tell
 from systems.options import part_of
+from systems.takes import takes
 
 if TYPE_CHECKING:
     from systems.scene import Scene

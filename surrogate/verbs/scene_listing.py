@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.options import Preparation
 from surrogate.verbs.telling import tell
 from systems.chemistry.graph import molecule_key
+from systems.options import part_of
+from systems.preparation import Preparation
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -76,8 +76,7 @@ def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: boo
     scene = str(scene)
     from systems.source import prepare
 
-    switches = {f.name: getattr(options, f.name) for f in fields(Preparation)}
-    prepared = prepare(scene, **switches)
+    prepared = prepare(scene, options=part_of(options, Preparation))
     if not quiet:
         for line in prepared.provenance.get("repairs", []):
             tell(scene, line)

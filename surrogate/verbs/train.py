@@ -13,9 +13,9 @@ from surrogate.models.registry import architecture, names
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.takes import takes
 from surrogate.verbs.telling import tell
 from systems.errors import InputError
+from systems.takes import takes
 from systems.trajectory.claim import Claim
 
 if TYPE_CHECKING:

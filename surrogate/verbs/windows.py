@@ -6,8 +6,8 @@ from pathlib import Path
 
 from surrogate.verbs.options import PathLike, Trajectories, WindowsOptions
 from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.takes import takes
 from systems.errors import InputError
+from systems.takes import takes
 
 
 @takes(WindowsOptions)

@@ -11,6 +11,7 @@ import numpy as np
 
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError
+from systems.preparation import Preparation
 from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.bonding import find_bonds
 from systems.prepare.clashes import check_contacts
@@ -30,41 +31,35 @@ from systems.scene import Scene
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
-def prepare_file(
-    path: Path,
-    *,
-    ph: float = 7.0,
-    keep_ligand: bool = False,
-    drop_ligand: bool = False,
-    keep_water: bool = False,
-    cap_breaks: bool = False,
-) -> Scene:
+def prepare_file(path: Path, options: Preparation) -> Scene:
     """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `systems.source.prepare`."""
     if is_mmcif(path) and is_component(text := structure_text(path)):
         from systems.prepare.component_file import scene_from_component
 
         return scene_from_component(text, path)
     try:
-        return _prepare_file(path, ph, keep_ligand, drop_ligand, keep_water, cap_breaks)
+        return _prepare_file(path, options)
     except PreparationError as error:
         if str(path) in str(error):
             raise
         raise PreparationError(f"{path}: {error}") from error
 
 
-def _prepare_file(
-    path: Path, ph: float, keep_ligand: bool, drop_ligand: bool, keep_water: bool, cap_breaks: bool
-) -> Scene:
+def _prepare_file(path: Path, options: Preparation) -> Scene:
     found = read_peptide_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
     repairs = list(found.notes)
     kept = _choose_alternates(found.atoms, repairs)
-    kept, wet = settle_solvent(found.atoms, kept, keep_water=keep_water, keep_ions=keep_ligand, notes=repairs)
+    kept, wet = settle_solvent(
+        found.atoms, kept, keep_water=options.keep_water, keep_ions=options.keep_ligand, notes=repairs
+    )
     part = standardise([found.atoms[i] for i in kept], repairs)
     structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
     bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
     ligands = ligand_atoms(structure.atoms, bonding)
     if ligands:
-        stays = settle_ligands(structure.atoms, ligands, keep=keep_ligand, drop=drop_ligand, notes=repairs)
+        stays = settle_ligands(
+            structure.atoms, ligands, keep=options.keep_ligand, drop=options.drop_ligand, notes=repairs
+        )
         rest = structure.without(ligands)
         if stays:
             refuse_bare_ligands(structure.atoms, ligands)
@@ -72,11 +67,11 @@ def _prepare_file(
             others_bonding = find_bonds(others.atoms, others.conect)
         structure, bonding = rest, find_bonds(rest.atoms, rest.conect, rest.chain_ends)
     gaps = find_gaps(bonding, structure.chain_ends)
-    if gaps and cap_breaks:
+    if gaps and options.cap_breaks:
         caps = caps_of(gaps, structure.atoms, repairs)
         structure = _Structure([*structure.atoms, *caps], structure.conect, structure.chain_ends)
         bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
-    refuse_gaps([] if cap_breaks else gaps, structure.atoms)
+    refuse_gaps([] if options.cap_breaks else gaps, structure.atoms)
     repairs += bonding.notes
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
@@ -86,7 +81,7 @@ def _prepare_file(
         _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
 
-        atoms, bonds, account = complete(atoms, bonding, ph=ph)
+        atoms, bonds, account = complete(atoms, bonding, ph=options.ph)
         repairs += account
         after = heavy_of_records(atoms)
         names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
@@ -110,7 +105,7 @@ def _prepare_file(
             "source": "file",
             "file": path.name,
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-            "ph": ph,
+            "ph": options.ph,
             "repairs": repairs,
         },
     )

@@ -40,3 +40,22 @@ def completed(words: str) -> list[str]:
 )
 def test_a_shell_completes(words: str, said: list[str]) -> None:
     assert completed(words) == said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("rollout", "rollout needs SCENE: Library name"),
+        ("rollout ethanol", "rollout needs --out: Trajectory to write"),
+        ("rollout ethanol -o x.h5", "rollout needs --time: Simulated time"),
+        ("reference ethanol -o x.h5", "reference needs --time: Simulated time"),
+        ("train ref.h5", "train needs --out: Weights to write"),
+        ("windows ref.h5", "windows needs --out: File to write"),
+        ("compare ref.h5", "compare needs TRAJ...: Candidates"),
+        ("bench cost-error", "cost-error needs REFERENCE: Held-out run"),
+    ],
+)
+def test_what_is_missing_is_named(words: str, said: str) -> None:
+    done = run(*words.split())
+    assert done.exit_code == 2
+    assert said in " ".join(done.stderr.replace("│", " ").split())

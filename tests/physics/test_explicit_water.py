@@ -12,7 +12,7 @@ import pytest
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.solvation import solvate, solvate_if_asked
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError
@@ -27,7 +27,7 @@ AVOGADRO_NM3 = 602.214  # dalton per nm³ in one g/cm³
 
 @cache
 def peptide_box() -> Scene:
-    return solvate(load("alanine-dipeptide"), TIP3P, 0.7, 0.2, seed=3)
+    return solvate(load("alanine-dipeptide"), TIP3P, WaterBox(padding_nm=0.7, ionic_strength_molar=0.2), seed=3)
 
 
 def nonbonded(system: Any) -> Any:
@@ -73,8 +73,8 @@ def test_no_water_touches_the_solute_or_another_water_through_any_wall() -> None
 
 def test_the_seed_decides_alone() -> None:
     scene = load("alanine-dipeptide")
-    again = solvate(scene, TIP3P, 0.7, 0.2, seed=3)
-    other = solvate(scene, TIP3P, 0.7, 0.2, seed=4)
+    again = solvate(scene, TIP3P, WaterBox(padding_nm=0.7, ionic_strength_molar=0.2), seed=3)
+    other = solvate(scene, TIP3P, WaterBox(padding_nm=0.7, ionic_strength_molar=0.2), seed=4)
     np.testing.assert_array_equal(again.positions_nm, peptide_box().positions_nm)
     assert again.topology_hash == peptide_box().topology_hash
     assert not np.array_equal(other.positions_nm, again.positions_nm)
@@ -82,7 +82,7 @@ def test_the_seed_decides_alone() -> None:
 
 def test_a_charged_molecule_gets_its_counter_ion() -> None:
     scene = scene_from_smiles("CC(=O)[O-]")
-    wet = solvate(scene, replace(TIP3P, force_field="gaff2"), 0.7)
+    wet = solvate(scene, replace(TIP3P, force_field="gaff2"), WaterBox(padding_nm=0.7))
     assert (wet.elements.count("Na"), wet.elements.count("Cl")) == (1, 0)
     assert wet.formal_charges.sum() == 0
 
@@ -140,7 +140,7 @@ def energy(system: Any, scene: Scene) -> float:
 
 def test_opc_sites_follow_the_atoms_and_the_engine_hides_them() -> None:
     spec = ForceFieldSpec("ff19SB", "opc")
-    wet = solvate(load("alanine-dipeptide"), spec, 0.5)
+    wet = solvate(load("alanine-dipeptide"), spec, WaterBox(padding_nm=0.5))
     n_water = wet.residue_names.count("HOH")
     system = build_system(wet, spec)
     assert system.getNumParticles() == wet.n_atoms + n_water

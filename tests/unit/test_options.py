@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import with_options
-from surrogate.verbs.takes import takes
 from systems.errors import InputError, UnitError, UnknownNameError
 from systems.options import MissingOptionError, check_options, gather, option, option_rows, options_of
+from systems.takes import takes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ def test_what_a_file_may_not_say(tmp_path: Path, text: str, said: str) -> None:
 def test_what_python_may_not_say() -> None:
     with pytest.raises(TypeError, match=r"verb\(\) .*'tiem_ps'.* Did you mean 'time_ps'"):
         verb("x", tiem_ps=1.0)
-    with pytest.raises(TypeError, match=r"verb\(\) time_ps is missing: Simulated time"):
+    with pytest.raises(TypeError, match=r"verb\(\) needs time_ps: Simulated time"):
         verb("x")
     with pytest.raises(TypeError, match=r"verb\(\) .*'scene'"):
         verb(time_ps=1.0)
@@ -130,7 +130,7 @@ def test_what_python_may_not_say() -> None:
 
 def test_what_the_command_line_may_not_say() -> None:
     assert typed("x").exit_code == 2
-    assert "--time is missing" in " ".join(typed("x").output.split())
+    assert "needs --time: Simulated time" in " ".join(typed("x").output.split())
     for words in (["--guard", "repare"], ["--replicas", "9"], ["--labels", "a"], ["--solver-steps", "3"]):
         assert typed("x", "--time", "1ps", *words).exit_code == 2
     refused = typed("x", "--time", "10")

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run import simulate as module
 from md_reference.run.config import Conditions
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, Engine
@@ -107,7 +107,7 @@ def test_constant_pressure_moves_the_walls(tmp_path: Path) -> None:
     from systems.library.named_scenes import load
 
     spec = ForceFieldSpec(solvent="tip3p", hydrogen_mass_da=None)
-    scene = solvate(load("alanine-dipeptide"), spec, seed=1)
+    scene = solvate(load("alanine-dipeptide"), spec, WaterBox(), seed=1)
     config = MDConfig(time_ps=0.8, save_every_ps=0.1, timestep_ps=0.002, equilibrate_ps=1.0, platform="CPU",
                       ensemble="npt", force=spec)  # fmt: skip
     with open_trajectory(simulate(scene, config, tmp_path / "a.h5")) as reader:

@@ -13,8 +13,9 @@ from md_reference.campaign.run_options import key_of, read_settings
 from md_reference.run.defaults import defaults
 from surrogate import api
 from surrogate.cli import main
-from surrogate.verbs.options import PlanOptions, Preparation, ReferenceOptions, RolloutOptions
+from surrogate.verbs.options import PlanOptions, ReferenceOptions, RolloutOptions
 from systems.options import options_of
+from systems.preparation import Preparation
 from systems.source import prepare
 
 FLAGS = {name: each for name, each in options_of(PlanOptions).items() if name != "time_ps"}

@@ -1,4 +1,4 @@
-"""Verbs as Python calls: inputs and output in their places, options by keyword, as a dataclass or from a file."""
+"""Functions that take options: inputs in their places, options by keyword, as a dataclass or from a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 
 def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Let a verb whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
+    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
 
     Its signature lists them one by one, as an editor or `help` shows it, and its documentation says what each does.
     `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. A quantity is a
@@ -26,19 +26,19 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """
     known = options_of(kind)
 
-    def decorate(verb: Callable[..., R]) -> Callable[..., R]:
-        plain = inspect.signature(verb)
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        plain = inspect.signature(function)
         own = [parameter for name, parameter in plain.parameters.items() if name != "options"]
         inputs = inspect.Signature(own)
         whole = plain.replace(parameters=[*own, *_keywords(kind, known)])
 
-        @functools.wraps(verb)
+        @functools.wraps(function)
         def call(*args: Any, options: Any = None, config: str | Path | None = None, **keywords: Any) -> R:
             given = {name: keywords.pop(name) for name in known if name in keywords}
             for name in keywords:
                 if name not in inputs.parameters:
                     meant = nearest(name, [*known, *inputs.parameters, "options", "config"])
-                    raise TypeError(f"{verb.__name__}() got an unexpected keyword argument {name!r}.{meant}")
+                    raise TypeError(f"{function.__name__}() got an unexpected keyword argument {name!r}.{meant}")
             try:
                 bound = inputs.bind(*args, **keywords)
                 if options is not None:
@@ -46,12 +46,14 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
                         raise TypeError(f"options must be a {kind.__name__}, not {type(options).__name__}")
                     given = {name: getattr(options, name) for name in known} | given
                 settled: Any = gather(kind, given, file=config)
-            except (TypeError, MissingOptionError) as error:
-                raise TypeError(f"{verb.__name__}() {error}") from None
-            return verb(*bound.args, **bound.kwargs, options=settled)
+            except MissingOptionError as error:
+                raise TypeError(f"{function.__name__}() {error.needs}") from None
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}() {error}") from None
+            return function(*bound.args, **bound.kwargs, options=settled)
 
         call.__signature__ = whole  # type: ignore[attr-defined]
-        call.__doc__ = f"{inspect.cleandoc(verb.__doc__ or '')}\n\n{_documented(known)}\n"
+        call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\n{_documented(known)}\n"
         return call
 
     return decorate
