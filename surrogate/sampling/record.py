@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk
 from surrogate.sampling.rollout_account import Tally
@@ -20,6 +22,9 @@ from surrogate.sampling.rollout_plan import Plan
 from systems.imposed import KEY
 from systems.trajectory.base import TrajectoryWriter
 from systems.units import format_time_ps
+
+# Options that stand in a part of the record, by its name.
+_ACCOUNTS = {"interventions": ("guard", "energy_every", "md_between_ps"), "selection": ("atoms", "select")}
 
 
 def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int) -> dict[str, Any]:
@@ -33,15 +38,13 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         "program": {"torch": torch.__version__},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,
-        "seed": config.seed,
         "replica": replica,
+        **_asked(config),
         "save_every_ps": plan.save_every_ps,
         "lag_ps": weights.domain.lag_ps,
         "precision": sampler.precision.name,
         "precision_reason": sampler.precision.reason,
-        "compiled": config.compile,
         "solver": sampler.solver,
-        "solver_steps": config.solver_steps,
         "chunk_frames": sampler.n_new,
         **weights.domain.conditions,
         "interventions": _interventions(plan, Tally(), {}, checks),
@@ -53,18 +56,22 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
     if plan.match.deviations:
         record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
     if len(plan.kept_atoms) < plan.scene.n_atoms:
-        record["selection"] = {"atoms": config.atoms, "select": config.select, "of_atoms": plan.scene.n_atoms}
+        record["selection"] = {**_asked(config, "selection"), "of_atoms": plan.scene.n_atoms}
     if plan.shift_nm.any() != plan.scene.positions_nm.mean(axis=0).any():
         record["moved_nm"] = (-plan.scene.positions_nm.mean(axis=0)).tolist()
     return record
 
 
+def _asked(config: RolloutConfig, account: str = "") -> dict[str, Any]:
+    """Return the options of one account of the record, else all that stand in none. How long it is, its frames say."""
+    options = asdict(config)
+    apart = {"time_ps", *chain(*_ACCOUNTS.values())}
+    return {name: options[name] for name in _ACCOUNTS.get(account) or (name for name in options if name not in apart)}
+
+
 def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: Guard) -> dict[str, Any]:
-    config = plan.config
     return {
-        "guard": config.guard,
-        "energy_every": config.energy_every,
-        "md_between_ps": config.md_between_ps,
+        **_asked(plan.config, "interventions"),
         **tally.to_record(),
         "seconds": {key: round(value, 3) for key, value in seconds.items()},
         "unchecked": list(checks.unchecked),

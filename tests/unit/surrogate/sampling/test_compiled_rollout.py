@@ -79,7 +79,7 @@ def test_resume_asks_for_the_same(
     assert rows_compiled
     assert np.array_equal(frames_of(out), frames_of(whole))
     with open_trajectory(out) as reader:
-        assert reader.record["compiled"] is True
+        assert reader.record["compile"] is True
 
 
 def test_without_a_compiler_one_line_says_so(small_weights: Weights, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.validity import INVALID, NOT_FINITE
 from systems.errors import InputError, OutOfDomainError, SimulationError, UnitError
+from systems.options import options_of
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 
@@ -43,6 +44,10 @@ def test_file_says_what_it_is(tmp_path: Path, small_weights: Weights, alanine_di
     assert record["weights_hash"] == small_weights.hash
     assert record["cost"]["network_evaluations"] == -(-40 // chunk) * CONFIG.solver_steps
     assert not (tmp_path / "a.h5.checkpoint").exists()
+    said = record | record["interventions"] | {"time_ps": 40.0, "atoms": "all", "select": None}
+    assert said.keys() >= options_of(RolloutConfig).keys()
+    assert (said["guard"], said["seed"], said["solver_steps"], said["compile"]) == ("off", 0, 2, False)
+    assert not {"guard", "atoms", "select", "time_ps"} & record.keys()
 
 
 def test_a_replica_does_not_depend_on_its_batch(
