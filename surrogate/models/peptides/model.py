@@ -68,6 +68,11 @@ class PeptideConfig:
         return build(PeptideConfig, record)
 
     @property
+    def forgotten_ps(self) -> float:
+        """A time that stands for one at which nothing is left of the given frame."""
+        return 10.0 * self.longest_ps
+
+    @property
     def lags_ps(self) -> Tensor:
         """The times at which correlations are kept."""
         decades = math.log10(self.longest_ps / self.shortest_ps)
@@ -245,7 +250,8 @@ class PeptideSlide(Surrogate):
         return torch.from_numpy(laid).float().reshape(frames.shape).to(frames.device)
 
     def correlation_at(self, times_ps: Tensor, types: Tensor) -> Tensor:
-        """Return the correlations `(b, t, r, slots)` with the given frame, linear in log t between the lags kept."""
+        """Return the correlations `(b, t, r, slots)` with the given frame, linear in log t between the lags kept; none
+        at `forgotten_ps`."""
         if not self.config.innovation:
             return self.correlation.new_zeros(*times_ps.shape, len(types), self.correlation.shape[-1])
         lags = self.config.lags_ps.to(times_ps.device).log()
@@ -253,7 +259,8 @@ class PeptideSlide(Surrogate):
         right = torch.searchsorted(lags, at).clamp(1, len(lags) - 1)
         share = ((at - lags[right - 1]) / (lags[right] - lags[right - 1]))[..., None, None]
         table = self.correlation[types].transpose(0, 1)  # (lags, r, slots)
-        return (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
+        found = (table[right - 1] * (1 - share) + table[right] * share).clamp(0.0, _MOST_CORRELATED)
+        return torch.where((times_ps >= self.config.forgotten_ps)[..., None, None], 0.0, found)
 
     def innovations(self, later: Tensor, known: Tensor, times_ps: Tensor, types: Tensor) -> Tensor:
         """Numbers `(b, t, r, slots)` at `times_ps` (b, t) after `known` (b, r, slots) -> innovations."""

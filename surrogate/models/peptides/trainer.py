@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from surrogate.data.equilibrium import equilibrium_weights
 from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import save_weights
@@ -32,13 +34,22 @@ _HELD_WINDOWS = 128
 _HELD_SEED = 0
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
 _EVEN_SHARE = 0.5
+# Share of windows whose later frames are drawn from equilibrium, at a time when the given one is forgotten.
+_FORGOTTEN_SHARE = 0.1
+_MARKOV_LAG_PS = 50.0
+_BLOCK = 20_000
+_TRIES = 20
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
 
 @dataclass(frozen=True)
 class PeptideTraining:
-    """Optimisation (AdamW, EMA 0.999), in seconds of training or steps."""
+    """Optimisation (AdamW, EMA 0.999), in seconds of training or steps.
+
+    `time_reversal`: MD in equilibrium looks alike backwards. Windows are read backwards, too, and frames drawn from
+    equilibrium stand for endless times, both weighted by a Markov model of each molecule (`data.equilibrium`).
+    """
 
     budget_s: float | None = None
     steps: int | None = None
@@ -53,19 +64,44 @@ class PeptideTraining:
 
 @dataclass(eq=False)
 class PeptideSubject:
-    """One sequence's frames, its input features, and the stretches that windows may be taken from."""
+    """One sequence's frames, its input features, and the stretches that windows may be taken from.
+
+    `weights` (n_frames,): of frames in equilibrium; zero in what is held out. Without them no window is read backwards.
+    """
 
     frames: TrainingFrames
     chain: ChainFeatures
+    weights: npt.NDArray[np.float64] | None = None
+
+    def in_equilibrium(self) -> PeptideSubject:
+        """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
+        ranges = self.frames.split.ranges(self.frames.starts, validation=False)
+        found = equilibrium_weights(
+            [self._torsions(low, high) for low, high in ranges], max(1, round(_MARKOV_LAG_PS / self.frames.lag_ps))
+        )
+        if found is None:
+            return self
+        weights = np.zeros(self.frames.n_frames)
+        weights[np.concatenate([np.arange(low, high) for low, high in ranges])] = found
+        return replace(self, weights=weights)
+
+    def _torsions(self, low: int, high: int) -> npt.NDArray[np.float64]:
+        """Return cosines and sines `(n, 2 n_torsions)` of frames."""
+        at = self.chain.code.turning_at
+        found = []
+        for start in range(low, high, _BLOCK):
+            frames = self.frames.positions_nm(np.arange(start, min(start + _BLOCK, high)))
+            found.append(self.chain.code.encode(torch.from_numpy(frames)).flatten(-2)[:, torch.cat([at, at + 1])])
+        return torch.cat(found).double().numpy()
 
     def windows(
-        self, n: int, config: PeptideConfig, generator: torch.Generator, *, validation: bool = False,
-        time_reversal: bool = False,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        self, n: int, config: PeptideConfig, generator: torch.Generator, *, validation: bool = False
+    ) -> tuple[Tensor, Tensor]:
         """Draw windows: frames `(n, 1 + chunk_frames)` and the times `(n, chunk_frames)` ps after the first.
 
         Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
-        longer than the configuration's, and all frames of a window are of one stretch.
+        longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
+        read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first.
         """
         lag = self.frames.lag_ps
         ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
@@ -81,18 +117,55 @@ class PeptideSubject:
         drawn = torch.exp(torch.rand(n, t, generator=generator) * float(np.log(longest))).round().long()
         drawn = torch.stack([_distinct(row, longest) for row in drawn.sort(dim=1).values])
         ahead = torch.where(even, (stride * torch.arange(1, t + 1)).long(), drawn)
-        first = torch.empty(n, dtype=torch.int64)
-        place = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
-        for k, span in enumerate(ahead[:, -1].tolist()):
-            rooms = np.maximum(ranges[:, 1] - ranges[:, 0] - span, 0)
+        span = ahead[:, -1].numpy()
+        first = self._starts(span, ranges, generator)
+        idx = torch.cat([first[:, None], first[:, None] + ahead], dim=1)
+        times = ahead.float() * lag
+        if self.weights is None or validation:
+            return idx, times
+        starts, found = self._likely_starts(span, ranges, generator)
+        backwards = found & (torch.rand(n, generator=generator) < 0.5)
+        turned = starts[:, None] + ahead[:, -1:] - torch.cat([torch.zeros_like(ahead[:, :1]), ahead], dim=1)
+        idx = torch.where(backwards[:, None], turned, idx)
+        forgotten = torch.rand(n, 1, generator=generator) < _FORGOTTEN_SHARE
+        anywhere = self._likely(n * t, generator).reshape(n, t)
+        idx[:, 1:] = torch.where(forgotten, anywhere, idx[:, 1:])
+        return idx, torch.where(forgotten, config.forgotten_ps, times)
+
+    def _starts(self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator) -> Tensor:
+        """Draw first frames `(n,)` of windows that reach `span` (n,) frames further, each as likely as any other."""
+        first = torch.empty(len(span), dtype=torch.int64)
+        place = torch.rand(len(span), generator=generator, dtype=torch.float64).numpy()
+        for k, reach in enumerate(span.tolist()):
+            rooms = np.maximum(ranges[:, 1] - ranges[:, 0] - reach, 0)
             at = int(place[k] * rooms.sum())
             which = int(np.searchsorted(np.cumsum(rooms), at, side="right"))
             first[k] = int(ranges[which, 0]) + at - int(rooms[:which].sum())
-        idx = torch.cat([first[:, None], first[:, None] + ahead], dim=1)
-        if time_reversal:
-            backwards = torch.rand(n, 1, generator=generator) < 0.5
-            idx = torch.where(backwards, 2 * first[:, None] + ahead[:, -1:] - idx, idx)
-        return idx, ahead.float() * lag
+        return first
+
+    def _likely_starts(
+        self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Draw first frames `(n,)` by their weights; False `(n,)` where none was met that lies so far from an end."""
+        first = np.zeros(len(span), dtype=np.int64)
+        found = np.zeros(len(span), dtype=bool)
+        for _ in range(_TRIES):
+            drawn = self._likely(len(span), generator).numpy()
+            end = ranges[np.searchsorted(ranges[:, 0], drawn, side="right") - 1, 1]
+            fits = ~found & (drawn + span < end)
+            first[fits] = drawn[fits]
+            found |= fits
+        return torch.from_numpy(first), torch.from_numpy(found)
+
+    def _likely(self, n: int, generator: torch.Generator) -> Tensor:
+        """Draw frames `(n,)` by their weights."""
+        place = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
+        return torch.from_numpy(np.searchsorted(self._cumulative, place * self._cumulative[-1], side="right"))
+
+    @cached_property
+    def _cumulative(self) -> npt.NDArray[np.float64]:
+        assert self.weights is not None
+        return np.cumsum(self.weights)
 
     def numbers(self, model: PeptideSlide, idx: Tensor) -> Tensor:
         """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames."""
@@ -136,6 +209,8 @@ def train_peptides(
         [PeptideSubject(f, chain_features(f.scene, config).to(device)) for f in some] for some in (sets, unseen)
     )
     normalise(model, subjects, training.seed)
+    if training.time_reversal:
+        subjects = [subject.in_equilibrium() for subject in subjects]
     stage = StageConfig(
         "flow", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
         bf16=training.bf16, validate_every_s=training.validate_every_s,
@@ -148,7 +223,7 @@ def train_peptides(
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
-        idx, times = subject.windows(training.batch, config, generator, time_reversal=training.time_reversal)
+        idx, times = subject.windows(training.batch, config, generator)
         return peptide_loss(model, subject.chain, subject.numbers(model, idx), times.to(device), generator)
 
     @torch.no_grad()

@@ -42,25 +42,39 @@ def config(frames: TrainingFrames) -> PeptideConfig:
 
 
 @pytest.mark.parametrize("validation", [False, True])
-@pytest.mark.parametrize("time_reversal", [False, True])
 def test_windows_stay_within_a_run_and_its_part(
-    frames: TrainingFrames, config: PeptideConfig, validation: bool, time_reversal: bool
+    frames: TrainingFrames, config: PeptideConfig, validation: bool
 ) -> None:
     subject = PeptideSubject(frames, chain_features(frames.scene, config))
-    idx, times = subject.windows(
-        500, config, torch.Generator().manual_seed(1), validation=validation, time_reversal=time_reversal
-    )
+    idx, times = subject.windows(500, config, torch.Generator().manual_seed(1), validation=validation)
     assert idx.shape == (500, 5) and times.shape == (500, 4)
     assert (idx // 200 == idx[:, :1] // 200).all(), "all of one run"
     part = idx % 200
     assert ((part >= 160) == validation).all(), "and of one side of the split"
-    apart = (idx[:, 1:] - idx[:, :1]).abs()
-    assert (apart.float() == times).all() or time_reversal
+    assert ((idx[:, 1:] - idx[:, :1]).float() == times).all()
     assert (times.diff(dim=1) > 0).all() and times.min() >= 1 and times.max() <= 40
     lags = times[(times[:, 1:2] == 2 * times[:, :1]).ravel() & (times[:, 3:] == 4 * times[:, :1]).ravel(), 0]
     assert len(lags) > 150 and len(lags.unique()) > 4, "half of them evenly spaced, at several lags"
-    if time_reversal:
-        assert 150 < int((idx[:, 1] < idx[:, 0]).sum()) < 350
+
+
+def test_windows_read_backwards_came_from_where_equilibrium_is(frames: TrainingFrames, config: PeptideConfig) -> None:
+    """Frames of the first two runs alone have weight: backward windows end there, and endless times show no others."""
+    weights = np.zeros(800)
+    weights[:160], weights[200:360] = 1.0, 3.0
+    subject = PeptideSubject(frames, chain_features(frames.scene, config), weights)
+    idx, times = subject.windows(4000, config, torch.Generator().manual_seed(1))
+    endless = times[:, 0] == config.forgotten_ps
+    assert 300 < int(endless.sum()) < 500
+    assert (times[endless] == config.forgotten_ps).all() and (idx[endless, 1:] < 400).all()
+    idx, times = idx[~endless], times[~endless]
+    assert (idx // 200 == idx[:, :1] // 200).all() and (idx % 200 < 160).all()
+    assert ((idx[:, 1:] - idx[:, :1]).abs().float() == times).all()
+    backwards = idx[:, 1] < idx[:, 0]
+    assert 1600 < int(backwards.sum()) < 2000
+    of_run = np.bincount(idx[backwards, -1] // 200, minlength=4)
+    assert of_run[2] == of_run[3] == 0
+    assert of_run[1] / of_run[0] == pytest.approx(3.0, rel=0.2)
+    assert len((idx[~backwards, 0] // 200).unique()) == 4, "forwards they start anywhere"
 
 
 def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: PeptideConfig) -> None:
