@@ -35,6 +35,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.viewcode",
     "command_reference",
+    "kernel_sockets",
     "result_tables",
     "tables_of_code",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 from pathlib import Path
@@ -11,6 +12,9 @@ import pytest
 pytest.importorskip("sphinx", reason="the manual's libraries are not installed: pip install '.[docs]'")
 
 import from_bench
+import kernel_sockets
+import nbclient
+import nbformat
 from command_reference import all_commands, command_markdown
 from result_tables import TABLES, read_table, table_markdown
 
@@ -104,6 +108,24 @@ def test_tutorials_are_in_the_manual_and_stripped(repository: Path) -> None:
     for path in notebooks:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells), f"strip {path.name}"
+
+
+def test_kernels_of_tutorials_take_no_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ports that are free when a kernel is asked for may be taken when it opens them."""
+    code = "from ipykernel.connect import get_connection_info\nprint(get_connection_info())"
+
+    def connection() -> dict:
+        notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(code)])
+        nbclient.execute(notebook)
+        return json.loads(notebook.cells[0].outputs[0]["text"])
+
+    monkeypatch.setattr(nbclient.client, "NotebookClient", kernel_sockets.SocketClient)
+    found = connection()
+    assert found["transport"] == "ipc"
+    gc.collect()
+    assert not Path(found["ip"]).parent.exists(), "its folder goes with the kernel"
+    monkeypatch.undo()
+    assert connection()["transport"] == "tcp"
 
 
 def test_every_public_name_is_in_the_python_reference(repository: Path) -> None:
