@@ -15,6 +15,7 @@ import torch
 from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
+from surrogate.models.lean import with_lean_parts
 from surrogate.models.precision import choose_precision
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
@@ -69,8 +70,9 @@ class ChunkSampler:
         self.batch: int | None = None
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
-        self._model = with_bf16_weights(model) if self.precision.bf16 else model
-        self._compiled = with_compiled_parts(self._model) if compile else None
+        plain = with_bf16_weights(model) if self.precision.bf16 else model
+        self._model = with_lean_parts(plain)
+        self._compiled = with_compiled_parts(plain) if compile else None
         self._compiled_rows: int | None = None
         self._molecule = describe(model, template)
         self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)

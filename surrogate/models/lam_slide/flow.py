@@ -15,7 +15,7 @@ from torch import Tensor
 FITTED_BELOW = 0.8
 # Where adaptive steps end.
 ADAPTIVE_END = 0.999
-# (o_tau (b, ...), tau (b,)) -> prediction of the data o_1 (b, ...)
+# (o_tau (b, ...), tau (b,), or (1,) of all rows) -> prediction of the data o_1 (b, ...)
 DataPrediction = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -61,7 +61,7 @@ def euler(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str
     o = noise
     grid = torch.linspace(0.0, 1.0, n_steps + 1).tolist()
     for start, end in pairwise(grid):
-        tau = torch.full((o.shape[0],), start, device=o.device, dtype=torch.float32)
+        tau = torch.full((1,), start, device=o.device, dtype=torch.float32)
         prediction = predict(o, tau)
         if end == 1.0:
             return prediction
@@ -83,7 +83,7 @@ def multistep(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant:
     grid = [1.0 - level for level in _noise_levels(n_steps)]
     before: tuple[float, Tensor] | None = None
     for start, end in pairwise(grid):
-        prediction = predict(o, torch.full((o.shape[0],), start, device=o.device, dtype=torch.float32))
+        prediction = predict(o, torch.full((1,), start, device=o.device, dtype=torch.float32))
         left, right = 1.0 - start, 1.0 - end
         step = prediction + (right / left) * (o - prediction)
         if before is not None:
@@ -108,7 +108,7 @@ def fitted(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: st
     levels = _noise_levels(n_steps)
     before: Tensor | None = None
     for k, (left, right) in enumerate(pairwise(levels)):
-        prediction = predict(o, torch.full((o.shape[0],), 1.0 - left, device=o.device, dtype=torch.float32))
+        prediction = predict(o, torch.full((1,), 1.0 - left, device=o.device, dtype=torch.float32))
         ahead = prediction
         if before is not None:
             width = (1.0 - FITTED_BELOW / n_steps) * left / (1.0 - left)

@@ -1,0 +1,83 @@
+"""The networks that rollouts evaluate are the trained ones, but for rounding."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from surrogate.data.shipped import weights_path
+from surrogate.data.weights import load_weights
+from surrogate.models.layers import ParallelBlock, rotary_angles
+from surrogate.models.lean import LeanBlock, PackedLinear, with_lean_parts
+from surrogate.sampling.chunks import ChunkSampler, with_bf16_weights
+
+WIDTH, HEADS, LENGTH = 32, 2, 5
+
+
+def block(seed: int = 0) -> ParallelBlock:
+    torch.manual_seed(seed)
+    found = ParallelBlock(WIDTH, HEADS)
+    for parameter in found.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    return found.eval()
+
+
+def rope() -> tuple[torch.Tensor, torch.Tensor]:
+    angles = rotary_angles(LENGTH, WIDTH // HEADS)
+    return angles.cos(), angles.sin()
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("places", ["turned", "biased", "after others"])
+@torch.inference_mode()
+def test_a_lean_block_is_the_block(shared: bool, places: str) -> None:
+    plain = block()
+    lean = LeanBlock(plain)
+    x, modulation = torch.randn(3, 2, LENGTH, WIDTH), torch.randn(1 if shared else 3, 3, WIDTH)
+    if places == "biased":
+        bias = torch.randn(HEADS, LENGTH, LENGTH)
+        wanted, found = (one(x, modulation, None, bias=bias)[0] for one in (plain, lean))
+    elif places == "turned":
+        wanted, found = (one(x, modulation, rope())[0] for one in (plain, lean))
+    else:
+        wanted, found = (one(x, modulation, rope(), one(x.flip(0), modulation, rope())[1])[0] for one in (plain, lean))
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
+    # Halves of the heads that do not stand beside each other: another network.
+    lean.proj_in.weight.copy_(plain.proj_in.weight)
+    assert places == "biased" or not torch.allclose(lean(x, modulation, rope())[0], plain(x, modulation, rope())[0])
+
+
+@torch.inference_mode()
+def test_bf16_layers_are_packed_and_float32_ones_left() -> None:
+    model = nn.ModuleDict({"rounded": nn.Linear(24, 40), "exact": nn.Linear(24, 40)})
+    model["rounded"].bfloat16()
+    lean = with_lean_parts(model)
+    assert isinstance(lean["rounded"], PackedLinear)
+    assert type(lean["exact"]) is nn.Linear
+    x = torch.randn(7, 2, 24)
+    wanted = nn.functional.linear(x.bfloat16(), model["rounded"].weight, model["rounded"].bias)
+    torch.testing.assert_close(lean["rounded"](x), wanted, rtol=1e-2, atol=1e-2)
+    assert with_lean_parts(nn.Sequential(nn.Linear(2, 2))).__class__ is nn.Sequential
+
+
+def test_a_model_without_such_parts_is_taken_as_it_is() -> None:
+    model = nn.Sequential(nn.Linear(4, 4))
+    assert with_lean_parts(model) is model
+
+
+@pytest.mark.parametrize(("precision", "tolerance_nm"), [("fp32", 2e-5), ("bf16", 4e-3)])
+def test_rollouts_draw_the_chunks_of_the_plain_networks(precision: str, tolerance_nm: float) -> None:
+    weights = load_weights(weights_path("alanine-dipeptide"))
+    sampler = ChunkSampler(weights, precision=precision, solver="fitted", solver_steps=4, stiff="modelled")
+    plain = copy.copy(sampler)
+    plain._model = with_bf16_weights(weights.model) if precision == "bf16" else weights.model
+    start = weights.domain.scene.positions_nm[None, None].repeat(2, axis=0)
+    found, wanted, other = (
+        one.draw(start, seeds).frames_nm for one, seeds in ((sampler, [1, 2]), (plain, [1, 2]), (sampler, [1, 3]))
+    )
+    errors = [abs(one - wanted).mean(axis=(1, 2, 3)) for one in (found, other)]
+    assert errors[0].max() < tolerance_nm
+    assert errors[1][1] > 5 * tolerance_nm, "another seed draws another chunk"
