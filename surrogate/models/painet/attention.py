@@ -86,18 +86,28 @@ class EnergyAttention(nn.Module):
 
     def forward(self, h: Tensor, types: Tensor, groups: TypeGroups) -> Tensor:
         """Embeddings `(b, n, width)`, types `(n,)` among those present, their atoms `groups` -> embeddings."""
+        return self.carry(h, h[..., :0], types, groups, dense=self.dense)[0]
+
+    def carry(
+        self, h: Tensor, carried: Tensor, types: Tensor, groups: TypeGroups, *, dense: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The same with more values that the attention averages: `carried` (b, n, c) -> embeddings, the means
+        `(b, n_heads, n, c)` of what is carried, and the queries `(b, n_heads, n, head_dim)`, of unit length."""
         q, k, v = _wide(self.qkv(h)).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
         q, k = F.normalize(q, dim=-1), F.normalize(k, dim=-1)
+        n_own = v.shape[-1]
+        v = torch.cat([v, carried[:, None].expand(-1, self.n_heads, -1, -1)], dim=-1)
         phi, psi = self.type_matrices()
         # Sums over all atoms stay in float32: in bf16 the two forms would differ by more than rounding.
         with torch.autocast(h.device.type, enabled=False):
-            if self.dense:
+            if dense:
                 mean = dense_mean(q, k, v, phi[:, types][:, :, types], psi[:, types][:, :, types])
             else:
                 present = torch.stack([types[group[0]] for group in groups])
                 phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
                 mean = linear_mean(q, k, v, phi, psi, groups)
-        return (1.0 - self.step) * h + self.step * self.out(mean.transpose(1, 2).flatten(-2))
+        own, means = mean.split((n_own, carried.shape[-1]), dim=-1)
+        return (1.0 - self.step) * h + self.step * self.out(own.transpose(1, 2).flatten(-2)), means, q
 
 
 def _wide(s: Tensor) -> Tensor:

@@ -1,0 +1,216 @@
+"""The potential energy that PAINET's energy-descent attention gives: a scalar, invariant and smooth.
+
+Embeddings start from types of atoms in their bonded surroundings. Each latent step looks at an atom's neighbourhood
+(sums of functions of distance and direction, and the invariants of these), then takes a step of the paper's descent
+(`EnergyAttention`), in which positions are carried along: the mean of all atoms' positions under positive weights that
+depend on embeddings and types is a vector that knows the whole molecule, at a cost linear in its atoms.
+
+The energy is read from the last embeddings, from a table of pair energies, and from the latent energy that attention
+descends, sum_ij rho_ij(|q_i - q_j|^2) with rho = a s - b s^2 (the paper's equation of E(H), and "Particle-type Adaptive
+Mapping").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from surrogate.models.interface import Molecule
+from surrogate.models.painet.attention import EnergyAttention, TypeGroups
+from surrogate.models.painet.pairs import N_SHELLS
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.edges import (
+    FEW_ATOMS,
+    EdgeGeometry,
+    Edges,
+    bonded_shells,
+    find_edges,
+    measure_edges,
+    products,
+)
+from surrogate.models.painet.surroundings import Surroundings
+
+# Atomic numbers up to radon, as GFN2-xTB has them.
+N_TYPES = 87
+# Beyond what training has seen pairs are held by a wall: so steep, in units of the energy's scale.
+WALL = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fabric:
+    """What of a molecule does not change while it moves: the shells of its bonds, each type's atoms."""
+
+    molecule: Molecule
+    shells: dict[tuple[int, int], int]
+    bonds: Tensor
+    groups: TypeGroups
+    one_hot: Tensor
+
+    @staticmethod
+    def of(molecule: Molecule) -> Fabric:
+        present = torch.unique(molecule.elements)
+        groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
+        bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
+        one_hot = (present[:, None] == molecule.elements).to(torch.get_default_dtype())
+        return Fabric(molecule, bonded_shells(molecule), bonds, groups, one_hot)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Weights that depend on the molecule alone, made once for chunk after chunk: `of_atom` (n_atoms, width), `looks`
+    of each step (n_edges, n_radial, ...), `table` (n_edges, n_radial, n_members), walls (n_edges, 1)."""
+
+    edges: Edges
+    of_atom: Tensor
+    looks: tuple[Tensor, ...]
+    table: Tensor
+    nearest_nm: Tensor
+    farthest_nm: Tensor
+
+
+class Look(nn.Module):
+    """An atom's neighbourhood as invariants: sums over neighbours of scalars, directions and their products."""
+
+    def __init__(self, c: PotentialConfig, n_carried: int, *, first: bool) -> None:
+        super().__init__()
+        self.c, n = c, c.n_scalars + c.n_vectors + c.n_tensors
+        self.of_edge = nn.Linear(c.width, c.n_radial * n)
+        self.send = None if first else nn.Linear(c.width, c.n_scalars + c.n_vectors)
+        n_vectors = c.n_vectors + n_carried
+        n_invariants = c.n_scalars + n_vectors**2 + c.n_tensors * (c.n_tensors + n_vectors)
+        self.update = nn.Sequential(
+            nn.Linear(c.width + n_invariants, c.width), nn.SiLU(), nn.Linear(c.width, c.width), nn.SiLU(),
+            nn.Linear(c.width, c.width),
+        )  # fmt: skip
+
+    def weights(self, of_edge: Tensor) -> Tensor:
+        """Features of edges (n_edges, width) -> weights of their radial functions."""
+        c = self.c
+        return self.of_edge(of_edge).unflatten(-1, (c.n_radial, -1)) * (2.0 / c.n_radial**0.5)
+
+    def forward(self, h: Tensor, carried: Tensor | None, seen: EdgeGeometry, edges: Edges, weights: Tensor) -> Tensor:
+        """`h` (n, rows, width), `carried` vectors (n, rows, 3, n_carried) -> h."""
+        c = self.c
+        found = torch.bmm(seen.radial, weights)
+        n_seen = c.n_scalars + c.n_vectors
+        if self.send is not None:
+            sent = 1.0 + self.send(h)[edges.sender]
+            found = torch.cat([found[..., :n_seen] * sent, found[..., n_seen:]], dim=-1)
+        felt = edges.sum(found[..., : c.n_scalars])
+        shaped = edges.sum_of_products(seen.shapes, found[..., c.n_scalars :])
+        v, t = shaped[..., :3, : c.n_vectors], shaped[..., 3:, c.n_vectors :]
+        if carried is not None:
+            v = torch.cat([v, carried], dim=-1)
+        squares = products(v.transpose(-1, -2)).transpose(-1, -2)
+        invariants = (_gram(v, v), _gram(t, torch.cat([t, squares], dim=-1)))
+        return h + self.update(torch.cat([h, felt, *(i.flatten(-2) for i in invariants)], dim=-1))
+
+
+def _gram(a: Tensor, b: Tensor) -> Tensor:
+    """`a` (..., k, m), `b` (..., k, n) -> sums over k of products (..., m, n)."""
+    return a.transpose(-1, -2) @ b
+
+
+class EnergyNetwork(nn.Module):
+    """Positions -> the members' energies, in units of a scale that training measures."""
+
+    def __init__(self, config: PotentialConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        self.embed_type = nn.Embedding(N_TYPES, c.width)
+        self.surroundings = Surroundings(c.width)
+        self.of_shell = nn.Embedding(N_SHELLS, c.width)
+        self.of_pair = nn.Sequential(nn.Linear(2 * c.width, c.width), nn.SiLU(), nn.Linear(c.width, c.width), nn.SiLU())
+        self.looks = nn.ModuleList(Look(c, 0 if k == 0 else c.n_heads, first=k == 0) for k in range(c.n_steps))
+        self.steps = nn.ModuleList(
+            EnergyAttention(
+                c.width,
+                c.n_heads,
+                c.head_dim,
+                N_TYPES,
+                step=c.step,
+                psi_limit=c.psi_limit,
+                dense=c.attention == "dense",
+            )
+            for _ in range(c.n_steps)
+        )
+        self.site = nn.Sequential(nn.Linear(c.width, c.width), nn.SiLU(), nn.Linear(c.width, c.n_members))
+        self.table = nn.Linear(c.width, c.n_radial * c.n_members)
+        self.latent = nn.Parameter(torch.zeros(c.n_heads, c.n_members))
+        nn.init.zeros_(self.table.weight)
+        nn.init.zeros_(self.table.bias)
+        # The shortest and the longest distance of training, by shell and types: beyond them stands a wall.
+        self.register_buffer("nearest_nm", torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
+        self.register_buffer("farthest_nm", torch.full((N_SHELLS, N_TYPES, N_TYPES), 1e3))
+        self.nearest_nm: Tensor
+        self.farthest_nm: Tensor
+
+    def prepare(self, fabric: Fabric, positions_nm: Tensor) -> Prepared:
+        """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
+        edges = find_edges(fabric.shells, positions_nm, self.config.cutoff_nm)
+        elements = fabric.molecule.elements
+        z = self.surroundings(self.embed_type(elements), fabric.bonds)
+        of_edge = self.of_pair(torch.cat([z[edges.receiver] + self.of_shell(edges.shell), z[edges.sender]], dim=-1))
+        types = edges.shell, elements[edges.receiver], elements[edges.sender]
+        return Prepared(
+            edges,
+            z,
+            tuple(look.weights(of_edge) for look in cast(Iterable[Look], self.looks)),
+            self.table(of_edge).unflatten(-1, (self.config.n_radial, -1)),
+            self.nearest_nm[types][:, None],
+            self.farthest_nm[types][:, None],
+        )
+
+    def forward(self, positions_nm: Tensor, fabric: Fabric, made: Prepared) -> Tensor:
+        """Frames `(rows, n_atoms, 3)` nm -> energies `(rows, n_members)`."""
+        c, kind = self.config, made.of_atom.dtype
+        x = positions_nm.transpose(0, 1)
+        seen = measure_edges(x, made.edges, c.n_radial, c.cutoff_nm, kind)
+        # Vectors in units of 0.1 nm, about the mean, before they lose digits.
+        x = ((x - x.mean(0)) * 10.0).to(kind).transpose(0, 1)
+        h = made.of_atom[:, None].expand(-1, len(positions_nm), -1)
+        carried = latent = None
+        dense = c.attention == "dense" or (c.attention == "auto" and x.shape[1] <= FEW_ATOMS)
+        steps = cast(Iterable[EnergyAttention], self.steps)
+        for look, step, weights in zip(self.looks, steps, made.looks, strict=True):
+            h = look(h, carried, seen, made.edges, weights)
+            new, means, q = step.carry(h.transpose(0, 1), x, fabric.molecule.elements, fabric.groups, dense=dense)
+            h = new.transpose(0, 1)
+            # (rows, n_heads, n, 3) -> (n, rows, 3, n_heads)
+            carried = (means - x[:, None]).permute(2, 0, 3, 1)
+            phi, psi = step.type_matrices()
+            latent = latent_energy(q, phi, psi, fabric)
+        energy = self.site(h).sum(0) + 0.5 * torch.bmm(seen.radial, made.table).sum(0)
+        if latent is not None:
+            energy = energy + latent @ self.latent
+        return energy + self._walls(seen.distance_nm, made)[:, None]
+
+    def _walls(self, distance_nm: Tensor, made: Prepared) -> Tensor:
+        """Energy `(rows,)` of pairs nearer or farther than any that training saw; zero inside, with two derivatives."""
+        near = torch.relu(1.0 - distance_nm / made.nearest_nm.clamp(min=1e-3))
+        far = torch.relu(distance_nm / made.farthest_nm - 1.0)
+        return WALL * 10.0 * (near.pow(3) + far.pow(3)).sum(0)
+
+
+def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor:
+    """Return sum_ij rho_ij(|q_i - q_j|^2) / n^2 by head, `(rows, n_heads)`, in time linear in atoms.
+
+    `q` (rows, n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads,
+    n_types, n_types). Sums over pairs of types need sums of q and of q q^T over each type alone.
+    """
+    present = torch.stack([fabric.molecule.elements[group[0]] for group in fabric.groups])
+    phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
+    b = 0.25 * psi
+    a = phi + psi
+    z = fabric.one_hot.to(q.dtype)
+    sums = torch.einsum("tn,rhnd->rhtd", z, q)
+    squares = torch.einsum("tn,rhnd,rhne->rhtde", z, q, q).flatten(-2)
+    first = sums @ sums.transpose(-1, -2)
+    second = squares @ squares.transpose(-1, -2)
+    count = z.sum(-1)[:, None] * z.sum(-1)
+    rho = a * (2.0 * count - 2.0 * first) - b * (4.0 * count - 8.0 * first + 4.0 * second)
+    return rho.sum((-1, -2)) / z.sum().square()

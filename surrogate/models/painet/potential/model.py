@@ -1,0 +1,166 @@
+"""PAINET as a potential: energies, their exact gradient, and the molecule integrated on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from surrogate.models.interface import Chunk, Molecule, Surrogate
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.edges import FEW_ATOMS
+from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
+from systems.errors import InputError
+from systems.units import whole_steps
+
+GAS_CONSTANT_KJ_MOL_K = 0.00831446261815324
+_HYDROGEN = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """`energy_kj_mol` (rows,) and `forces_kj_mol_nm` (rows, n_atoms, 3), the mean of the members; `members_kj_mol`
+    (rows, n_members)."""
+
+    energy_kj_mol: Tensor
+    forces_kj_mol_nm: Tensor
+    members_kj_mol: Tensor
+
+
+class PainetPotential(Surrogate):
+    """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth; its
+    exact gradient as forces, so that momentum, angular momentum and energy are kept.
+
+    As a surrogate its chunk is MD on this potential: Langevin middle (Zhang 2019) or velocity Verlet, in double
+    precision. Energies are `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training.
+    """
+
+    arch: ClassVar[str] = "painet-potential"
+    carries_velocities: ClassVar[bool] = True
+    bf16_by_default: ClassVar[bool] = False
+    canonical: ClassVar[bool] = False
+    n_conditioning: ClassVar[int] = 1
+    config: PotentialConfig
+    energy_offset_kj_mol: Tensor
+    energy_scale_kj_mol: Tensor
+
+    def __init__(self, config: PotentialConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.network = EnergyNetwork(config)
+        self.register_buffer("energy_offset_kj_mol", torch.zeros(()))
+        self.register_buffer("energy_scale_kj_mol", torch.full((), 100.0))
+        self._known: tuple[Molecule, Fabric, Prepared] | None = None
+
+    @property
+    def n_new(self) -> int:
+        return self.config.n_new
+
+    @property
+    def steps_per_frame(self) -> int:
+        return whole_steps(self.config.lag_ps, self.config.timestep_ps, "frame spacing in time steps")
+
+    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
+        """One vector an atom for the first velocities, then for each step."""
+        return (n_atoms, 1 + self.n_new * self.steps_per_frame, 3)
+
+    def fabric(self, molecule: Molecule) -> Fabric:
+        """Return what `evaluate` needs of a molecule. Raises InputError for elements beyond radon."""
+        heaviest = int(molecule.elements.max())
+        if heaviest >= N_TYPES:
+            raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
+        return Fabric.of(molecule)
+
+    def members(self, positions_nm: Tensor, fabric: Fabric, made: Prepared | None = None) -> Tensor:
+        """Frames `(rows, n_atoms, 3)` nm -> the members' energies `(rows, n_members)` in kJ/mol, in float64."""
+        made = made or self.network.prepare(fabric, positions_nm)
+        energy = self.network(positions_nm, fabric, made)
+        return self.energy_offset_kj_mol.double() + self.energy_scale_kj_mol.double() * energy.double()
+
+    def evaluate(self, positions_nm: Tensor, fabric: Fabric, made: Prepared | None = None) -> Evaluation:
+        """Frames `(rows, n_atoms, 3)` nm, in double precision for forces to the last digit -> energies and forces."""
+        # In bf16 energies would be steps, and their gradient heat.
+        with torch.inference_mode(False), torch.enable_grad(), torch.autocast(positions_nm.device.type, enabled=False):
+            x = positions_nm.detach().clone().requires_grad_(True)
+            members = self.members(x, fabric, made)
+            energy = members.mean(-1)
+            (gradient,) = torch.autograd.grad(energy.sum(), x)
+        return Evaluation(energy.detach(), -gradient, members.detach())
+
+    def member_forces(self, positions_nm: Tensor, fabric: Fabric) -> Tensor:
+        """Frames `(rows, n_atoms, 3)` nm -> each member's forces `(n_members, rows, n_atoms, 3)` kJ/mol/nm."""
+        with torch.inference_mode(False), torch.enable_grad():
+            x = positions_nm.detach().clone().requires_grad_(True)
+            totals = self.members(x, fabric).sum(0)
+            return -torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
+
+    def masses_da(self, molecule: Molecule) -> Tensor:
+        """Masses `(n_atoms,)` that move: hydrogens as heavy as the settings have them, at the cost of their bond's
+        other end."""
+        masses, heavy = molecule.masses_da.double().clone(), self.config.hydrogen_mass_da
+        if heavy is not None:
+            for i, j in [*molecule.bonds.tolist(), *molecule.bonds.flip(1).tolist()]:
+                if molecule.elements[i] == _HYDROGEN != molecule.elements[j]:
+                    masses[j] -= heavy - molecule.masses_da[i]
+                    masses[i] = heavy
+        return masses
+
+    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
+                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
+        """See `Surrogate.next_chunk`: MD on the potential."""
+        with torch.inference_mode(False):
+            x, draws = last_frames_nm[:, -1].clone().double(), noise.clone().double()
+            masses = self.masses_da(molecule)[:, None]
+            thermal = (GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k / masses).sqrt()
+            v = thermal * draws[:, :, 0] if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
+            frames = []
+            move = self._verlet if self.config.ensemble == "nve" else self._langevin
+            for draw in draws[:, :, 1:].split(self.steps_per_frame, dim=2):
+                x, v = move(x, v, molecule, masses, thermal, draw)
+                frames.append(x)
+            dtype = last_frames_nm.dtype
+            found = torch.stack(frames, dim=1).to(dtype)
+            return Chunk(found, v.to(dtype), float(draws.shape[2] - 1))
+
+    def forces(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
+        """Frames `(rows, n_atoms, 3)` nm -> forces, with what depends on the molecule alone kept from call to call."""
+        known = self._known
+        if known is None or known[0] is not molecule or molecule.n_atoms > FEW_ATOMS or self.training:
+            fabric = self.fabric(molecule)
+            with torch.no_grad():
+                known = (molecule, fabric, self.network.prepare(fabric, positions_nm))
+            self._known = known
+        return self.evaluate(positions_nm, known[1], known[2]).forces_kj_mol_nm
+
+    def _langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
+                  ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """One frame's steps of the Langevin middle scheme: kick, half a drift, bath, half a drift."""
+        dt = self.config.timestep_ps
+        kept = math.exp(-self.config.friction_per_ps * dt)
+        lost = math.sqrt(1.0 - kept * kept) * thermal
+        for k in range(draw.shape[2]):
+            v = v + dt * self.forces(x, molecule) / masses
+            x = x + 0.5 * dt * v
+            v = kept * v + lost * draw[:, :, k]
+            x = x + 0.5 * dt * v
+        return x, v
+
+    def _verlet(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
+                ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """One frame's steps of velocity Verlet, a leapfrog that shows velocities at full steps."""
+        dt = self.config.timestep_ps
+        force = self.forces(x, molecule)
+        for _ in range(draw.shape[2]):
+            v = v + 0.5 * dt * force / masses
+            x = x + dt * v
+            force = self.forces(x, molecule)
+            v = v + 0.5 * dt * force / masses
+        return x, v
+
+    def set_scales(self, energies_kj_mol: Tensor, forces_kj_mol_nm: Tensor) -> None:
+        """Take the units of what is learned from samples: mean energy, and the root mean square force over 0.1 nm."""
+        self.energy_offset_kj_mol.fill_(float(energies_kj_mol.mean()))
+        self.energy_scale_kj_mol.fill_(max(0.1 * float(forces_kj_mol_nm.square().mean().sqrt()), 1e-3))

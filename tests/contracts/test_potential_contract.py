@@ -1,0 +1,213 @@
+"""PAINET as a potential: the contract of surrogates, and what a scalar energy with exact forces must keep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from surrogate.models.conformance import SurrogateContract, branched_chain, orthogonal
+from surrogate.models.interface import Molecule, Surrogate
+from surrogate.models.painet.attention import pair_energy
+from surrogate.models.painet.potential import energy as room
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.edges import bonded_shells, find_edges
+from surrogate.models.painet.potential.energy import latent_energy
+from surrogate.models.painet.potential.model import PainetPotential
+from systems.errors import InputError
+
+SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4,
+                        n_members=2, n_new=2, lag_ps=0.002)  # fmt: skip
+
+
+def lively(config: PotentialConfig = SMALL) -> PainetPotential:
+    """A potential whose every path carries signal."""
+    torch.manual_seed(1)
+    model = PainetPotential(config)
+    with torch.no_grad():
+        for name, p in model.named_parameters():
+            if "table" in name or name.endswith(("e_phi", "e_psi", "latent")):
+                p.normal_(std=0.3)
+    return model.eval().requires_grad_(False)
+
+
+def walks(n_atoms: int, rows: int = 2) -> Tensor:
+    """Frames `(rows, n_atoms, 3)` nm of chains whose atoms keep their distance."""
+    generator = torch.Generator().manual_seed(4)
+    along = 0.1 * torch.arange(n_atoms)[:, None] * torch.tensor([1.0, 0.3, 0.0])
+    return (along + 0.05 * torch.randn(rows, n_atoms, 3, generator=generator)).double()
+
+
+class TestPotential(SurrogateContract):
+    equivariant = reflects = permutes = noise_is_vectors = True
+    sizes = (1, 2, 80)
+    # Always in float32, as bf16 would make steps of energies.
+    bf16_error = None
+
+    def make(self, n_atoms: int) -> Surrogate:
+        return lively()
+
+    def state(self, n_atoms: int, batch: int, model: Surrogate) -> tuple[Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(7)
+        x = walks(n_atoms, batch).float()[:, None]
+        return x - x.mean(-2, keepdim=True), torch.randn(batch, n_atoms, 3, generator=generator)
+
+
+class TestWithoutABath(TestPotential):
+    # Of the velocities alone, which the test gives.
+    uses_noise = False
+
+    def make(self, n_atoms: int) -> Surrogate:
+        return lively(replace(SMALL, ensemble="nve"))
+
+
+def evaluated(model: PainetPotential, x: Tensor, molecule: Molecule) -> tuple[Tensor, Tensor]:
+    found = model.evaluate(x, model.fabric(molecule))
+    return found.energy_kj_mol, found.forces_kj_mol_nm
+
+
+def test_forces_are_the_exact_gradient_of_the_energy() -> None:
+    molecule, model = branched_chain(9), lively().double()
+    x = walks(9)
+    _, forces = evaluated(model, x, molecule)
+    for atom, axis in ((0, 0), (4, 1), (8, 2)):
+        ends = []
+        for sign in (1, -1):
+            moved = x.clone()
+            moved[:, atom, axis] += sign * 1e-6
+            ends.append(evaluated(model, moved, molecule)[0])
+        torch.testing.assert_close(forces[:, atom, axis], -(ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3)
+    assert forces.abs().mean() > 10.0
+
+
+def test_energy_is_a_scalar_and_momentum_and_angular_momentum_are_kept() -> None:
+    molecule, model = branched_chain(9), lively().double()
+    x = walks(9)
+    energy, forces = evaluated(model, x, molecule)
+    turn, shift = orthogonal(reflect=True), torch.tensor([1.0, -2.0, 0.5])
+    turned_energy, turned = evaluated(model, x @ turn.T + shift, molecule)
+    torch.testing.assert_close(turned_energy, energy, rtol=1e-10, atol=1e-8)
+    torch.testing.assert_close(turned, forces @ turn.T, rtol=1e-8, atol=1e-7)
+    assert forces.sum(1).abs().max() < 1e-8 * forces.abs().max()
+    assert torch.linalg.cross(x, forces).sum(1).abs().max() < 1e-8 * forces.abs().max()
+    # Negative controls: single forces and torques do not vanish; a squeezed molecule has another energy.
+    assert torch.linalg.cross(x, forces).abs().max() > 1.0
+    assert (evaluated(model, 0.98 * x, molecule)[0] - energy).abs().min() > 1e-3
+
+
+def test_like_atoms_may_be_exchanged() -> None:
+    # Methane: any two hydrogens.
+    bonds = torch.tensor([(0, k) for k in range(1, 5)])
+    molecule = Molecule(torch.tensor([6, 1, 1, 1, 1]), torch.tensor([12.011, *[1.008] * 4]), bonds)
+    model, x = lively().double(), walks(5)
+    energy, _ = evaluated(model, x, molecule)
+    torch.testing.assert_close(evaluated(model, x[:, [0, 2, 1, 3, 4]], molecule)[0], energy)
+    assert (evaluated(model, x[:, [1, 0, 2, 3, 4]], molecule)[0] - energy).abs().min() > 1e-3
+
+
+def test_total_energy_fluctuates_with_the_square_of_the_step() -> None:
+    molecule, n_fs = branched_chain(9), 40
+    wobble = {}
+    for step_ps in (0.0005, 0.001):
+        model = lively(replace(SMALL, ensemble="nve", timestep_ps=step_ps, lag_ps=step_ps,
+                               n_new=round(n_fs * 1e-3 / step_ps))).double()  # fmt: skip
+        masses = model.masses_da(molecule)[:, None]
+        x, v = walks(9)[:1], torch.randn(1, 9, 3, generator=torch.Generator().manual_seed(3)).double() * 0.3
+        totals = []
+        draw = torch.zeros(1, 9, 1, 3)
+        for _ in range(model.n_new):
+            x, v = model._verlet(x, v, molecule, masses, masses, draw)
+            totals.append(float(evaluated(model, x, molecule)[0]) + float((0.5 * masses * v.square()).sum()))
+        wobble[step_ps] = np.std(totals)
+    slope = np.log2(wobble[0.001] / wobble[0.0005])
+    assert 1.7 < slope < 2.3
+    assert wobble[0.0005] > 1e-7
+
+
+def test_energy_is_finite_and_smooth_where_atoms_meet_and_at_the_cutoff() -> None:
+    molecule, model = branched_chain(9), lively().double()
+    x = walks(9, 1)
+    x[:, 5] = x[:, 3]
+    energy, forces = evaluated(model, x, molecule)
+    assert torch.isfinite(energy).all() and torch.isfinite(forces).all()
+    # Two atoms without a bond, apart by the cutoff more or less: forces fade with the square of what is left.
+    pair = Molecule(torch.tensor([8, 6]), torch.tensor([16.0, 12.0]), torch.zeros(0, 2, dtype=torch.int64))
+    cutoff = SMALL.cutoff_nm
+    distances = cutoff + torch.tensor([0.02, 0.0, -0.002, -0.02, -0.2])
+    frames = torch.zeros(5, 2, 3, dtype=torch.float64)
+    frames[:, 1, 0] = distances
+    radial = room.measure_edges(frames.transpose(0, 1), find_edges({}, frames, cutoff), 8, cutoff, torch.float64).radial
+    largest = radial.abs().amax((0, 2))
+    assert (largest[:2] == 0.0).all()
+    assert largest[2] < 2e-3 * largest[3] < largest[4]
+    assert torch.isfinite(evaluated(model, frames, pair)[1]).all()
+
+
+def test_walls_stand_only_beyond_what_training_saw() -> None:
+    molecule, model = branched_chain(9), lively().double()
+    x = walks(9, 1)
+    free, _ = evaluated(model, x, molecule)
+    model.network.nearest_nm.fill_(0.01)
+    model.network.farthest_nm.fill_(5.0)
+    torch.testing.assert_close(evaluated(model, x, molecule)[0], free, rtol=0, atol=0)
+    model.network.nearest_nm.fill_(0.3)
+    assert float(evaluated(model, x, molecule)[0] - free) > 100.0
+
+
+def test_neighbour_lists_and_factored_attention_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    molecule, x = branched_chain(40), walks(40)
+    dense = evaluated(lively(replace(SMALL, attention="dense")).double(), x, molecule)
+    monkeypatch.setattr(room, "find_edges", lambda shells, frames, cutoff: find_edges(shells, frames, cutoff, few=0))
+    factored = evaluated(lively(replace(SMALL, attention="linear")).double(), x, molecule)
+    for a, b in zip(dense, factored, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-7)
+
+
+def test_pairs_grow_with_the_atoms_and_not_with_their_square() -> None:
+    counts = {}
+    for n in (200, 400):
+        molecule = branched_chain(n)
+        counts[n] = len(find_edges(bonded_shells(molecule), walks(n, 1), 0.6).shell) / n
+    assert counts[400] < 1.1 * counts[200]
+
+
+def test_latent_energy_is_that_of_the_paper() -> None:
+    model, molecule = lively().double(), branched_chain(9)
+    fabric, step = model.fabric(molecule), lively().double().network.steps[0]
+    q = torch.nn.functional.normalize(torch.randn(2, 2, 9, 4, dtype=torch.float64), dim=-1)
+    phi, psi = step.type_matrices()
+    found = latent_energy(q, phi, psi, fabric)
+    types = molecule.elements
+    for head in range(2):
+        b = 0.25 * psi[head][types][:, types]
+        a = phi[head][types][:, types] + 4.0 * b
+        paper = pair_energy(q[:, head], q[:, head], a, b, 1.0) / 81
+        torch.testing.assert_close(found[:, head], paper)
+
+
+def test_members_agree_with_the_potential_and_differ_from_each_other() -> None:
+    molecule, model = branched_chain(9), lively().double()
+    x = walks(9)
+    _, forces = evaluated(model, x, molecule)
+    members = model.member_forces(x, model.fabric(molecule))
+    torch.testing.assert_close(members.mean(0), forces)
+    assert (members[0] - members[1]).abs().max() > 1.0
+
+
+def test_impossible_settings_are_refused() -> None:
+    for wrong in ({"ensemble": "npt"}, {"attention": "sparse"}, {"n_members": 0}, {"n_radial": 1}, {"step": 1.0}):
+        with pytest.raises(InputError):
+            PotentialConfig(**wrong)
+    heavy = Molecule(torch.tensor([90]), torch.tensor([232.0]), torch.zeros(0, 2, dtype=torch.int64))
+    with pytest.raises(InputError, match="90"):
+        lively().fabric(heavy)
+
+
+def test_heavy_hydrogens_take_their_mass_from_their_neighbours() -> None:
+    water = Molecule(torch.tensor([1, 8, 1]), torch.tensor([1.008, 15.999, 1.008]), torch.tensor([(0, 1), (1, 2)]))
+    masses = lively(replace(SMALL, hydrogen_mass_da=3.0)).masses_da(water)
+    assert masses.tolist() == pytest.approx([3.0, 18.015 - 6.0, 3.0], abs=1e-5)
+    assert lively().masses_da(water).tolist() == pytest.approx([1.008, 15.999, 1.008], abs=1e-5)
