@@ -5,6 +5,10 @@ is started from frames of `--test`, which it never saw. At each lag: the correla
 joint phi/psi distance, beside MD from the same starts; and Chapman and Kolmogorov's test: ten steps of 10 ps against
 one of 100 ps, beside two halves of MD. `--plain` trains without innovations, the ablation.
 
+`seeds`: another model of the same peptide, trained on short runs from many starts (`--runs`, a folder of
+`peptide_runs`), and the one of `lag` roll as long and as often as `--test` did: joint phi/psi distances, and the free
+energy of phi > 0 of many more and longer rollouts, beside that which a Markov model finds in the short runs alone.
+
 `pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (a folder of `peptide_runs`), the
 model rolls each molecule below `--test` (a campaign's folder) as long and as often as MD did. Distances over MD's own
 scatter, beside the library of monomers' torsions (`peptide_scores`).
@@ -20,6 +24,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +51,9 @@ STARTS = 5000
 FRAMES_PS = 10.0
 _KELVIN, _BIAS_FACTOR = 300.0, 8.0
 _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
+# Rollouts by which rare states are counted.
+_REPLICAS, _REPLICA_PS, _REPLICA_LAG_PS = 64, 200_000.0, 50.0
+_MARKOV_LAG_PS = 50.0
 
 
 def train(references: Sequence[Path], out: Path, *, steps: int, innovation: bool) -> None:
@@ -120,7 +128,7 @@ def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
     if len(doubles) < n_pairs:
         raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
     sets = [collect_frames(files) for files in singles + doubles]
-    train_peptides(sets, out, PeptideConfig(), PeptideTraining(steps=steps), resume=True)
+    train_peptides(sets, out, PeptideConfig(), PeptideTraining(steps=steps, time_reversal=True), resume=True)
 
 
 def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
@@ -129,39 +137,61 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
     The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
     """
     from surrogate.bench.recipes.peptide_scores import angles, floor, library, score, turns_of
-    from surrogate.sampling.runner import RolloutConfig, rollout
 
     scene, truth, time_ps = _thinned(runs)
     turns = turns_of(scene)
-    outs = [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))]
-    if not all(out.exists() for out in outs):
-        folder.mkdir(parents=True, exist_ok=True)
-        config = RolloutConfig(time_ps=time_ps, lag_ps=FRAMES_PS, seed=1, guard="off")
-        rollout(scene, weights, outs, config, overwrite=True)
-    rolled = [_thinned([out])[1][0] for out in outs]
+    rolled = _rolled(weights, scene, [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))], time_ps, FRAMES_PS)
     truth, rolled = [angles(turns, x) for x in truth], [angles(turns, x) for x in rolled]
     names = [name for name in scene.residue_names if name not in ("ACE", "NME")]
     alone = [_thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
     own = [turns_of(of) for of, _, _ in alone]
-    values = [angles(t, np.concatenate(x)) for t, (_, x, _) in zip(own, alone, strict=True)]
+    values = [[angles(t, run) for run in x] for t, (_, x, _) in zip(own, alone, strict=True)]
+    likely = [_weights(x) for x in values]
     rng = np.random.default_rng(0)
-    drawn = [library(turns, values, own, len(truth[0]), rng) for _ in runs]
+    drawn = [
+        library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
+    ]  # fmt: skip
     return [floor(turns, truth), score(turns, truth, rolled, "model"), score(turns, truth, drawn, "library")]
 
 
-def _thinned(paths: Sequence[Path]) -> tuple[Scene, list[FloatArray], float]:
-    """Return the scene, the frames FRAMES_PS apart of each file, and the time that the first one spans."""
+def _weights(runs: Sequence[FloatArray]) -> FloatArray:
+    """Return how likely each frame of seeded runs, torsions `(n_frames, n)` FRAMES_PS apart, is in equilibrium."""
+    from surrogate.data.equilibrium import equilibrium_weights
+
+    found = equilibrium_weights(
+        [np.concatenate([np.cos(x), np.sin(x)], axis=1) for x in runs], round(_MARKOV_LAG_PS / FRAMES_PS)
+    )
+    n = sum(len(x) for x in runs)
+    return np.full(n, 1.0 / n) if found is None else found / found.sum()
+
+
+def _rolled(
+    weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float
+) -> list[FloatArray]:  # fmt: skip
+    """Return the frames of unguarded rollouts; those that are there are read."""
+    from surrogate.sampling.runner import RolloutConfig, rollout
+
+    if not all(out.exists() for out in outs):
+        outs[0].parent.mkdir(parents=True, exist_ok=True)
+        rollout(
+            scene, weights, outs, RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=1, guard="off"), overwrite=True
+        )
+    return [_thinned([out], lag_ps)[1][0] for out in outs]
+
+
+def _thinned(paths: Sequence[Path], apart_ps: float = FRAMES_PS) -> tuple[Scene, list[FloatArray], float]:
+    """Return the scene, the frames `apart_ps` apart of each file, and the time that the first one spans."""
     from systems.trajectory.codec import open_trajectory
 
     frames = []
     for path in paths:
         with open_trajectory(path) as reader:
-            every = max(1, round(FRAMES_PS / float(reader.time_ps[1] - reader.time_ps[0])))
+            every = max(1, round(apart_ps / float(reader.time_ps[1] - reader.time_ps[0])))
             frames.append(reader.read(every - 1, None, every).astype(np.float64))
             scene = reader.scene
     if scene is None:
         raise InputError(f"{paths[-1]} does not say what molecule it is of.")
-    return scene, frames, len(frames[0]) * FRAMES_PS
+    return scene, frames, len(frames[0]) * apart_ps
 
 
 def lag_gate(a: argparse.Namespace) -> None:
@@ -181,6 +211,42 @@ def lag_gate(a: argparse.Namespace) -> None:
     record: dict[str, Any] = {"provenance": weights.provenance, "rows": [asdict(row) for row in rows], **found}
     (a.folder / f"{name}.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(table(rows) + "\n" + "\n".join(f"{what}: {value:.3f}" for what, value in found.items()) + "\n")
+
+
+def seeds_gate(a: argparse.Namespace) -> None:
+    """Train on seeded runs, roll both models, print and keep distances and free energies."""
+    from surrogate.data.weights import load_weights
+
+    train(sorted(a.runs.glob("run_*.h5")), a.folder / "seeds.safetensors", steps=a.steps, innovation=True)
+    scene, truth, time_ps = _thinned(a.test)
+    angles = [torsions(scene, x) for x in truth]
+    record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)]}}
+    for name in ("lag", "seeds"):
+        weights, folder = load_weights(a.folder / f"{name}.safetensors"), a.folder / f"{name}-rollouts"
+        same = _rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(truth))], time_ps, FRAMES_PS)
+        found = [joint_distance(torsions(scene, x), y) for x in same for y in angles]
+        many = [folder / f"long_{k:02d}.h5" for k in range(_REPLICAS)]
+        long = _rolled(weights, scene, many, _REPLICA_PS, _REPLICA_LAG_PS)
+        shares = [float((torsions(scene, x)[:, 0] > 0).mean()) for x in long]
+        record[name] = {"distance": found, **_free_energy(shares)}
+    _, short, _ = _thinned(sorted(a.runs.glob("run_*.h5")))
+    both = [torsions(scene, x) for x in short]
+    share = float(_weights(both)[np.concatenate(both)[:, 0] > 0].sum())
+    record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None}
+    (a.folder / "seeds.json").write_text(json.dumps(record, indent=1))
+    sys.stdout.write(json.dumps({k: {x: np.round(y, 3).tolist() for x, y in v.items() if y is not None}
+                                 for k, v in record.items()}, indent=1) + "\n")  # fmt: skip
+
+
+def _free_energy(shares: Sequence[float]) -> dict[str, float | None]:
+    """Return the free energy in kT of a state that runs spend `shares` of their time in, and its standard error; None
+    where it was never seen, or nothing else."""
+    p = float(np.mean(shares))
+    if not 0 < p < 1:
+        return {"free_energy_kt": None, "error_kt": None}
+    # of ln((1 - p) / p), by the scatter of p over runs
+    error = float(np.std(shares, ddof=1) / len(shares) ** 0.5 / (p * (1 - p)))
+    return {"free_energy_kt": float(np.log((1 - p) / p)), "error_kt": error}
 
 
 def pairs_gate(a: argparse.Namespace) -> None:
@@ -226,10 +292,7 @@ def free_energy_gate(a: argparse.Namespace) -> None:
             phi = torsions(scene, reader.read(stride=10).astype(np.float64))[:, 0]
             shares.append(float((phi > 0).mean()))
     if shares:
-        p = float(np.mean(shares))
-        record["md"] = float(np.log((1 - p) / p))
-        # of ln((1 - p) / p), by the scatter of p over runs
-        record["md_error"] = float(np.std(shares, ddof=1) / len(shares) ** 0.5 / (p * (1 - p)))
+        record["md"] = _free_energy(shares)
     (a.folder / f"{a.sequence}-free-energy.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(json.dumps(record, indent=1) + "\n")
 
@@ -266,13 +329,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     gates = parser.add_subparsers(dest="gate", required=True)
-    lag, pairs, energy = (gates.add_parser(name) for name in ("lag", "pairs", "free-energy"))
-    for gate in (lag, pairs, energy):
+    lag, seeds, pairs, energy = (gates.add_parser(name) for name in ("lag", "seeds", "pairs", "free-energy"))
+    for gate in (lag, seeds, pairs, energy):
         gate.add_argument("folder", type=Path)
-    for gate in (lag, pairs):
+    for gate in (lag, seeds, pairs):
         gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
     lag.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
-    lag.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
+    for gate in (lag, seeds):
+        gate.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
+    seeds.add_argument("--runs", type=Path, required=True, help="folder of short runs of the same peptide")
     lag.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
     lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
     pairs.add_argument("--train", type=Path, required=True, help="folder of `peptide_runs`")
@@ -283,7 +348,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     energy.add_argument("--md", type=Path, nargs="*", default=(), help="long runs of the same molecule")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
-    {"lag": lag_gate, "pairs": pairs_gate, "free-energy": free_energy_gate}[a.gate](a)
+    {"lag": lag_gate, "seeds": seeds_gate, "pairs": pairs_gate, "free-energy": free_energy_gate}[a.gate](a)
 
 
 if __name__ == "__main__":

@@ -71,16 +71,20 @@ def angles(turns: Sequence[Turn], frames_nm: npt.NDArray[np.floating]) -> FloatA
     return np.asarray((folded + np.pi) % (2 * np.pi) - np.pi)
 
 
-def library(turns: Sequence[Turn], monomers: Sequence[FloatArray], monomer_turns: Sequence[Sequence[Turn]], n: int,
-            rng: np.random.Generator) -> FloatArray:  # fmt: skip
+def library(
+    turns: Sequence[Turn], monomers: Sequence[FloatArray], likely: Sequence[FloatArray],
+    monomer_turns: Sequence[Sequence[Turn]], n: int, rng: np.random.Generator,
+) -> FloatArray:  # fmt: skip
     """Return `n` draws `(n, n_turns)`: of residue k together from `monomers[k]` (n_frames, its turns), blind to others.
+
+    `likely[k]` (n_frames,): the probability of each of its frames in equilibrium.
 
     Raises KeyError for a torsion that the residue's monomer does not have.
     """
     out = np.empty((n, len(turns)))
-    for k, (values, own) in enumerate(zip(monomers, monomer_turns, strict=True)):
+    for k, (values, p, own) in enumerate(zip(monomers, likely, monomer_turns, strict=True)):
         column = {t.kind: j for j, t in enumerate(own)}
-        rows = values[rng.integers(len(values), size=n)]
+        rows = values[rng.choice(len(values), size=n, p=p)]
         for j, t in enumerate(turns):
             if t.residue == k:
                 out[:, j] = rows[:, column[t.kind]]

@@ -57,6 +57,31 @@ def test_the_lag_gate_trains_measures_and_keeps_its_table(
     assert (tmp_path / "lag.safetensors").read_bytes() == before
 
 
+def test_the_seeds_gate_sets_both_models_beside_md(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, value in (("_REPLICAS", 2), ("_REPLICA_PS", 500.0)):
+        monkeypatch.setattr(peptide_gates, name, value)
+    peptide_gates.train([reference], tmp_path / "lag.safetensors", steps=2, innovation=True)
+    runs = tmp_path / "ALA"
+    runs.mkdir()
+    (runs / "run_000.h5").symlink_to(reference)
+    arguments = ["seeds", str(tmp_path), "--runs", str(runs), "--test", str(reference), str(reference), "--steps", "2"]
+    peptide_gates.main(arguments)
+    record = json.loads((tmp_path / "seeds.json").read_text())
+    assert record["MD"]["distance"] == [0.0], "the same run twice"
+    assert len(record["seeds"]["distance"]) == len(record["lag"]["distance"]) == 4
+    assert all(0 < d < 0.84 for name in ("lag", "seeds") for d in record[name]["distance"])
+    assert '"seeds"' in capsys.readouterr().out
+
+
+def test_a_free_energy_is_that_of_the_mean_share() -> None:
+    found = peptide_gates._free_energy([0.1, 0.2, 0.3])
+    assert found["free_energy_kt"] == pytest.approx(np.log(4))
+    assert found["error_kt"] == pytest.approx(0.1 / 3**0.5 / 0.16)
+    assert peptide_gates._free_energy([0.0, 0.0]) == {"free_energy_kt": None, "error_kt": None}
+
+
 def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -56,9 +56,14 @@ def test_a_perfect_source_is_as_far_as_md_and_the_library_fails_on_joint_maps_al
     own = [[t for t in turns if t.residue == k] for k in (0, 1)]
     monomers = [np.concatenate(truth)[:, [turns.index(t) for t in some]] for some in own]
     rng = np.random.default_rng(1)
-    blind = [library(turns, monomers, own, 4000, rng) for _ in range(3)]
+    even = [np.full(len(values), 1 / len(values)) for values in monomers]
+    blind = [library(turns, monomers, even, own, 4000, rng) for _ in range(3)]
     rival = score(turns, truth, blind, "library")
     assert rival.single < 1.25 * least.single
     assert rival.joint > 2.0 * least.joint
+    # Frames of seeded runs count by how likely they are: here those of the second basin alone.
+    likely = [np.where(monomers[0][:, 1] > 0, 1.0, 0.0), even[1]]
+    one_sided = library(turns, monomers, [likely[0] / likely[0].sum(), even[1]], own, 500, rng)
+    assert (one_sided[:, 1] > 0).all()
     shifted = score(turns, truth, [x + 0.3 for x in source], "shifted")
     assert shifted.single > 3.0 * least.single
