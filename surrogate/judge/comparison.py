@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -220,9 +220,10 @@ def compare(
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     accounts = [account_of(e) for e in everyone]
     floor = None if replicate is None else thinned[-1]
+    setting = _Setting(stage, torsions, geometry, truth, other, chosen, float(temperature), accounts[0])
     judgements = tuple(
         _with_forecast(
-            _judge(stage, torsions, geometry, truth, features, other, chosen, float(temperature), accounts[0], account),
+            _judge(setting, features, account),
             *forecast_charts(thinned[0], rolled, floor),
         )
         for features, account, rolled in zip(measured[1:], accounts[1:], thinned[1 : 1 + len(candidates)], strict=False)
@@ -247,20 +248,23 @@ def compare(
     )
 
 
-def _judge(
-    scene: Scene,
-    torsions: Backbone,
-    geometry: Geometry,
-    reference: Features,
-    candidate: Features,
-    replicate: Features,
-    options: Options,
-    temperature_k: float,
-    reference_account: Account,
-    account: Account,
-) -> Judgement:
-    trio, correlation, own = _equal_terms(scene, torsions, geometry, reference, candidate, replicate, options)
-    trio = replace(trio, temperature_k=temperature_k)
+class _Setting(NamedTuple):
+    """What all candidates of a comparison have in common."""
+
+    scene: Scene
+    torsions: Backbone
+    geometry: Geometry
+    reference: Features
+    replicate: Features
+    options: Options
+    temperature_k: float
+    account: Account
+
+
+def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgement:
+    """Judge one candidate; `account`: what its file says of it."""
+    trio, correlation, own = _equal_terms(setting, candidate)
+    reference, replicate, options = setting.reference, setting.replicate, setting.options
     rows = metrics.validity_rows(trio)
     lengths, bonds = bond_rows(trio)
     rows += lengths + metrics.population_rows(trio) + metrics.torsion_rows(trio)
@@ -278,11 +282,11 @@ def _judge(
     truth = trio.reference
     doubts = remarks.doubts(trio, max(correlation, own))
     kind = verdict.status(judged, doubts)
-    worth = worths(reference, candidate, replicate, torsions, options)
+    worth = worths(reference, candidate, replicate, setting.torsions, options)
     words = ""
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
     if kind != "broken" and not (doubts.apart or doubts.copied) and known >= remarks.LEAST_FOR_WORTH:
-        words = _worth_words(worth, account, reference_account)
+        words = _worth_words(worth, account, setting.account)
     return Judgement(
         account=account,
         status=kind,
@@ -297,11 +301,11 @@ def _judge(
         n_blocks=truth.blocks.n_blocks,
         correlation_ps=correlation * truth.features.lag_ps,
         effective_samples=samples,
-        speed_ratio=speed_ratio(account, reference_account),
+        speed_ratio=speed_ratio(account, setting.account),
         faults=(
-            faults_of(trio.reference, geometry),
-            faults_of(trio.candidate, geometry),
-            faults_of(trio.replicate, geometry),
+            faults_of(trio.reference, setting.geometry),
+            faults_of(trio.candidate, setting.geometry),
+            faults_of(trio.replicate, setting.geometry),
         ),
         skipped=(
             *remarks.skipped(trio),
@@ -329,20 +333,13 @@ def _judge(
     )
 
 
-def _equal_terms(
-    scene: Scene,
-    torsions: Backbone,
-    geometry: Geometry,
-    reference: Features,
-    candidate: Features,
-    replicate: Features,
-    options: Options,
-) -> tuple[Trio, float, float]:
+def _equal_terms(setting: _Setting, candidate: Features) -> tuple[Trio, float, float]:
     """Divide all three into blocks of one length, of which the first of each are as long as the shortest of the three;
     return them, and in frames the slowest time of the truth and that of the candidate.
 
     All of a longer reference takes part in the tests, up to `_MOST_TIMES_AS_LONG` times the candidate's length.
     """
+    reference, replicate, torsions = setting.reference, setting.replicate, setting.torsions
     n = min(reference.n_frames, candidate.n_frames, replicate.n_frames)
     if n < _MIN_FRAMES:
         raise InputError(
@@ -355,11 +352,14 @@ def _equal_terms(
     own = longest_correlation(cut[1])
     each = block_length(n, max(slowest, own))
     n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * metrics.FEW_RESIDUES)
-    options = replace(options, n_permutations=max(options.n_permutations, 50 * n_rows))
+    options = replace(setting.options, n_permutations=max(setting.options.n_permutations, 50 * n_rows))
     truth, rolled, other = (
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
     )
-    return Trio(scene, torsions, geometry, truth, rolled, other, options), slowest, own
+    trio = Trio(
+        setting.scene, torsions, setting.geometry, truth, rolled, other, options, temperature_k=setting.temperature_k
+    )
+    return trio, slowest, own
 
 
 def _worth_words(found: Sequence[Worth], account: Account, reference: Account) -> str:

@@ -25,11 +25,6 @@ WITHOUT_CONTRACT = {
     "surrogate.models.lam_slide": "the same",
 }
 MANY_PARAMETERS = {
-    "surrogate/judge/comparison.py:_judge": "the comparison's conditions, one by one",
-    "surrogate/judge/rows/block_means.py:shift_row": "the fields of a row, by name",
-    "surrogate/judge/rows/rows.py:observable_row": "the fields of a row, by name",
-    "surrogate/judge/rows/shape/contact_rows.py:_mean_row": "the fields of a row, by name",
-    "surrogate/judge/rows/shape/wasserstein_rows.py:_row": "the fields of a row, by name",
     "surrogate/models/lam_slide/losses.py:flow_loss": "the loss' tensors, by name",
     "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
     "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",

@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     from surrogate.judge.read.ensemble import Ensemble
 
 
+STRUCTURES = Path(__file__).resolve().parents[4] / "shared" / "data" / "structures"
 _EQUILIBRATE_PS = 20.0
 
 
 @dataclass(frozen=True)
 class Molecule:
-    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each, a frame every `every_ps`."""
+    """What is simulated: `n_replicas` runs of `scene`, `time_ps` each, a frame every `every_ps`.
+
+    `scene`: as `surromd reference` takes it, or a file of the folder of shared structures.
+    """
 
     name: str
     kind: str
@@ -47,31 +51,39 @@ MOLECULES = (
     Molecule("caffeine", "drug", "smiles:Cn1c(=O)c2c(ncn2C)n(C)c1=O", 2000.0),
     Molecule("ibuprofen", "drug", "smiles:CC(C)Cc1ccc(cc1)C(C)C(=O)O", 10_000.0),
     Molecule("lidocaine", "drug", "smiles:CCN(CC)CC(=O)Nc1c(C)cccc1C", 10_000.0),
-    Molecule("valine", "peptide", "ACE-VAL-NME", 1000.0),
-    Molecule("trialanine", "peptide", "ac-ala3-nhme", 300.0),
-    Molecule("SDFS", "peptide", "SDFS", 200.0),
-    Molecule("chignolin", "protein", "chignolin", 80.0, every_ps=0.2),
-    Molecule("trp-cage", "protein", "sequence:NLYIQWLKDGGPSSGRPPPS", 40.0, every_ps=0.2),
+    Molecule("valine", "peptide", "ACE-VAL-NME", 5000.0, 4),
+    Molecule("two glycines", "peptide", "ACE-GLY-GLY-NME", 5000.0, 4),
+    Molecule("trialanine", "peptide", "ac-ala3-nhme", 1000.0),
+    Molecule("SDFS", "peptide", "SDFS", 1000.0),
+    Molecule("trpzip2", "protein", "rcsb_cif__Amber-MD__1LE1.cif", 100.0, every_ps=0.2),
+    Molecule("trp-cage", "protein", "rcsb_pdb__Amber-MD__1l2y.pdb", 60.0, every_ps=0.2),
+    Molecule("NTL9", "protein", "charmm__PanosAntonia__ntl9_folded.pdb", 5.0, every_ps=0.02),
 )
 
 
 def make_runs(molecule: Molecule, folder: Path, first_seed: int = 0) -> list[Path]:
-    """Simulate what is missing of the replicas of a molecule, seeds from `first_seed` on; return their files."""
+    """Simulate what is missing of the replicas of a molecule, seeds from `first_seed` on; return their files.
+
+    A run that was interrupted goes on from its checkpoint. Raises what `surromd reference` raises.
+    """
     from surrogate import api
 
     seeds = range(first_seed, first_seed + molecule.n_replicas)
-    paths = [folder / f"{molecule.name}_{seed}.h5" for seed in seeds]
+    paths = [folder / f"{molecule.name.replace(' ', '_')}_{seed}.h5" for seed in seeds]
+    scene = STRUCTURES / molecule.scene if molecule.scene.endswith((".pdb", ".cif")) else molecule.scene
     for seed, path in zip(seeds, paths, strict=True):
         if not path.exists():
             part = path.with_name(f"{path.stem}.part.h5")
+            begun = Path(f"{part}.checkpoint").exists()
             api.reference(
-                molecule.scene,
+                scene,
                 part,
                 time_ps=molecule.time_ps,
                 save_every_ps=molecule.every_ps,
                 equilibrate_ps=_EQUILIBRATE_PS,
                 seed=seed,
-                overwrite=True,
+                resume=begun,
+                overwrite=not begun,
                 quiet=True,
             )
             part.rename(path)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure import hydrogen_bonds, puckers
+from surrogate.judge.measure import hydrogen_bonds, puckers, secondary
 from surrogate.judge.measure.equal_atoms import equal_rows
 from surrogate.judge.measure.torsions import Torsion, find_torsions
 from systems.chemistry.frame_columns import bond_angle, column_blocks, squared_distance, torsion_angle
@@ -22,9 +22,9 @@ IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.floating[Any]]
 
 # The columns of each family, `(n_frames, n_columns)`; see `Probes`.
-Family = Literal["torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers"]
+Family = Literal["torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers", "secondary"]
 FAMILIES: tuple[Family, ...] = (
-    "torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers",
+    "torsions", "angles", "shape", "deviation", "contacts", "hydrogen_bonds", "puckers", "secondary",
 )  # fmt: skip
 
 ATOM_CONTACT_NM = 0.45
@@ -44,8 +44,9 @@ class Probes:
     "torsions" `(n, len(torsions))` rad, folded (m times the angle, on [-pi, pi]); "angles" `(n, n_angles)` rad;
     "shape" `(n, 5)`: radius of gyration, RMSD, end-to-end distance (nm), contacts formed, share of the reference's
     contacts kept; "deviation" `(n, n_fit)` squared distance in nm² of each fitted atom from the reference's mean
-    structure; "contacts" and "hydrogen_bonds" `(n, k)` bool; "puckers" `(n, 2 n_rings)`: amplitude nm, angle rad.
-    A frame that is not finite has NaN, and False in the families of bool.
+    structure; "contacts" and "hydrogen_bonds" `(n, k)` bool; "puckers" `(n, 2 n_rings)`: amplitude nm, angle rad;
+    "secondary" `(n, n_residues)` int8, the structure of each residue (`secondary.secondary_structure`). A frame that is
+    not finite has NaN, False in the families of bool, and coil.
 
     `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
     (all, or the `MAX_COLUMNS` that the reference forms most evenly or most often). `native` are the contacts that the
@@ -68,6 +69,7 @@ class Probes:
     hydrogen_bonds: IntArray
     rings: tuple[tuple[int, ...], ...]
     classes: IntArray
+    chains: secondary.Chains = secondary.NO_CHAINS
     left_out: tuple[tuple[str, str], ...] = ()
     whole: bool = True
 
@@ -84,6 +86,7 @@ class Probes:
             "puckers": lambda: [
                 f"{what}, {puckers.ring_label(scene, ring)}" for ring in self.rings for what in ("amplitude", "angle")
             ],
+            "secondary": lambda: list(self.chains.labels),
         }
         return made[family]()
 
@@ -136,6 +139,7 @@ def find_probes(
         hydrogen_bonds=triplets[_foremost(bonded, equal_triplets, "hydrogen bonds", left_out)],
         rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
         classes=classes,
+        chains=secondary.find_chains(whole, place),
         left_out=tuple(left_out),
         whole=kept is None,
     )
@@ -154,6 +158,7 @@ def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Fa
         "contacts": np.zeros((n, len(probes.contacts)), dtype=bool),
         "hydrogen_bonds": np.zeros((n, len(probes.hydrogen_bonds)), dtype=bool),
         "puckers": np.empty((n, 2 * len(probes.rings)), dtype=np.float32),
+        "secondary": secondary.secondary_structure(frames_nm, probes.chains),
     }
     quads = np.array([q for t in probes.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
     of_torsion = np.repeat(np.arange(len(probes.torsions)), [len(t.equal) or 1 for t in probes.torsions])
@@ -185,7 +190,7 @@ def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Fa
     broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
     if broken.any():
         for values in out.values():
-            values[broken] = False if values.dtype == bool else np.nan
+            values[broken] = np.nan if values.dtype.kind == "f" else 0
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.probes import FAMILIES, Family, Probes, find_probes, measure_block
-from surrogate.judge.read.ensemble import Ensemble, Flags
+from surrogate.judge.read.ensemble import Ensemble, Flags, InSegments
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
 
@@ -45,7 +45,7 @@ class Backbone:
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class Features(InSegments):
     """Per-frame measurements of one ensemble, one array per segment.
 
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
@@ -71,14 +71,6 @@ class Features:
     @property
     def segment_lengths(self) -> list[int]:
         return [len(f) for f in self.flags]
-
-    @property
-    def n_frames(self) -> int:
-        return sum(self.segment_lengths)
-
-    @property
-    def total_ps(self) -> float:
-        return self.n_frames * self.lag_ps
 
     def frames(self, start: int, stop: int) -> Features:
         """Return frames `start:stop`, counted through the segments in order; segments keep their bounds."""

@@ -27,8 +27,29 @@ IntArray = npt.NDArray[np.int64]
 IN_MEMORY_BYTES = 128 * 2**20
 
 
+class InSegments:
+    """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
+
+    lag_ps: float
+
+    @property
+    def segment_lengths(self) -> list[int]:
+        """Frames in each segment."""
+        raise NotImplementedError
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of all segments together."""
+        return sum(self.segment_lengths)
+
+    @property
+    def total_ps(self) -> float:
+        """Simulated time of all segments together (frames times lag)."""
+        return self.n_frames * self.lag_ps
+
+
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class Ensemble(InSegments):
     """Frames of one candidate: one or several segments (replicas, or stretches of unbroken time).
 
     `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
@@ -71,17 +92,7 @@ class Ensemble:
 
     @property
     def segment_lengths(self) -> list[int]:
-        """Frames in each segment."""
         return [len(s) for s in self.segments]
-
-    @property
-    def n_frames(self) -> int:
-        return sum(self.segment_lengths)
-
-    @property
-    def total_ps(self) -> float:
-        """Simulated time of all segments together (frames times lag)."""
-        return self.n_frames * self.lag_ps
 
     def strided(self, stride: int) -> Ensemble:
         """Return every `stride`-th frame of each segment, with the lag that follows."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from surrogate.judge.measure.equal_atoms import over_groups
 from surrogate.judge.measure.probes import Family
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, mean_estimate
-from surrogate.judge.rows.rows import Group, Row, Sample, Trio, truth_of
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, observable_row, truth_of
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
@@ -93,23 +93,25 @@ def over_equal(means: Means, groups: Sequence[npt.NDArray[np.intp]]) -> Means:
     return Means(over_groups(means.values, groups), over_groups(means.draws, groups), means.n_blocks)
 
 
+def mean_row(
+    trio: Trio, metric: Metric, means: Sequence[Means], k: int, statement: Callable[[float, float], str]
+) -> Row:
+    """Return the row of the mean of column `k`, from `means` of (reference, candidate, replicate); see
+    `observable_row`."""
+    return observable_row(trio, metric, [float(m.values[k]) for m in means], [m.draws[:, k] for m in means], statement)
+
+
 def shift_row(
     trio: Trio,
+    metric: Metric,
     means: Sequence[Means],
     labels: Sequence[str],
-    *,
-    key: str,
-    group: Group,
-    metric: str,
-    unit: str,
-    tolerance: float,
-    resolution: float,
     statement: Callable[[str, float, float], str],
 ) -> Row:
     """Return the row of the column whose mean is furthest off, from `means` of (reference, candidate, replicate).
 
-    The p-value is the least over all columns times their number (Bonferroni); a shift below `resolution` is none.
-    `statement(label, candidate, reference)` words the deviation.
+    `labels` name the columns, and the worst one's stands in the row's name. The p-value is the least over all columns
+    times their number (Bonferroni). `statement(label, candidate, reference)` words the deviation.
     """
     ref, cand, rep = means
     shift, floor = np.abs(cand.values - ref.values), np.abs(rep.values - ref.values)
@@ -123,13 +125,13 @@ def shift_row(
         r, c, other = (mean_estimate(float(m.values[k]), m.draws[:, k], m.n_blocks) for m in means)
         both = truth_of(r, other)
         for side, (x, y) in enumerate(((c, both), (other, r))):
-            if abs(x.value - y.value) > resolution:
+            if abs(x.value - y.value) > metric.resolution:
                 least[side] = min(least[side], difference_p(x, y) * len(shift))
     return Row(
-        key=key,
-        group=group,
-        metric=f"{metric}: {labels[worst]}",
-        unit=unit,
+        key=metric.key,
+        group=metric.group,
+        metric=f"{metric.name}: {labels[worst]}",
+        unit=metric.unit,
         kind="distance",
         reference=None,
         candidate=replace(found, low=max(found.low, 0.0)),
@@ -137,7 +139,7 @@ def shift_row(
         ratio=None,
         p_value=least[0] if math.isfinite(float(shift[worst])) else math.nan,
         p_replicate=least[1],
-        tolerance=tolerance,
-        tolerance_text=f"≤ {tolerance:g} {unit}".rstrip(),
+        tolerance=metric.tolerance,
+        tolerance_text=metric.tolerance_text or f"≤ {metric.tolerance_words()}",
         statement=statement(labels[worst], float(cand.values[worst]), float(ref.values[worst])),
     )

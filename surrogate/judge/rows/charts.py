@@ -6,11 +6,14 @@ A room computes, the report draws: nothing here knows colours or pixels, and all
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+
+from surrogate.judge.measure.statistics import Estimate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -116,6 +119,31 @@ class BarChart(Curve):
     reference_high: FloatArray | None = None
     candidate_low: FloatArray | None = None
     candidate_high: FloatArray | None = None
+
+
+def bar_chart(
+    section: Section, title: str, caption: str, y_label: str, names: Sequence[str], made: Sequence[Sequence[Estimate]]
+) -> BarChart:
+    """Return the chart of numbers with their 95 % intervals; `made`: of (reference, candidate, replicate), one estimate
+    for each name, in the unit of `y_label`."""
+
+    def pick(which: int, name: str) -> FloatArray:
+        return np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
+
+    return BarChart(
+        section=section,
+        title=title,
+        caption=caption,
+        y_label=y_label,
+        names=tuple(names),
+        reference=pick(0, "value"),
+        candidate=pick(1, "value"),
+        replicate=pick(2, "value"),
+        reference_low=pick(0, "low"),
+        reference_high=pick(0, "high"),
+        candidate_low=pick(1, "low"),
+        candidate_high=pick(1, "high"),
+    )
 
 
 Chart = LineChart | Landscape | BarChart | Histogram

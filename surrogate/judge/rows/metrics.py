@@ -16,7 +16,7 @@ from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, evenly
 from surrogate.judge.measure.statistics import Estimate, estimate, excess_p
 from surrogate.judge.measure.structure import Residue
 from surrogate.judge.rows.block_means import block_means, shift_row
-from surrogate.judge.rows.rows import Group, Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Group, Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
 
@@ -168,15 +168,17 @@ def _largest_population_shift(trio: Trio) -> Row:
     ]
     return shift_row(
         trio,
+        Metric(
+            "population_shift",
+            "populations",
+            "Largest shift of a basin's population",
+            "%",
+            _POPULATION_TOLERANCE,
+            resolution=0.1,
+        ),
         means,
         labels,
-        key="population_shift",
-        group="populations",
-        metric="Largest shift of a basin's population",
-        unit="%",
-        tolerance=_POPULATION_TOLERANCE,
-        resolution=0.1,
-        statement=lambda label, c, r: f"{label}: {c:.3g} % of frames instead of {r:.3g} %",
+        lambda label, c, r: f"{label}: {c:.3g} % of frames instead of {r:.3g} %",
     )
 
 
@@ -203,15 +205,17 @@ def _population_row(
 
     return observable_row(
         trio,
+        Metric(
+            f"population:{name}:{label}",
+            "populations",
+            f"{name}, {label}",
+            "%",
+            100.0 * min(share, 1.0 - share) * (1.0 - 1.0 / ONE_KJ_FACTOR),
+            tolerance_text="± 1 kJ/mol",
+        ),
         values,
         draws,
-        key=f"population:{name}:{label}",
-        group="populations",
-        metric=f"{name}, {label}",
-        unit="%",
-        tolerance=100.0 * min(share, 1.0 - share) * (1.0 - 1.0 / ONE_KJ_FACTOR),
-        tolerance_text="± 1 kJ/mol",
-        statement=statement,
+        statement,
     )
 
 

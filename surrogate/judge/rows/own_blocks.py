@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,9 +19,10 @@ IntArray = npt.NDArray[np.int64]
 # Of (reference, candidate, replicate), `(n,)` per segment.
 ThreeSeries = Sequence[Sequence[FloatArray]]
 
-_N_STATES = 4
+N_STATES = 4
 _STREAM = 40
 _TICA_LAG_PS = 10.0
+_WITHOUT_STRAYS = (0.0005, 0.9995)
 
 
 def with_own_blocks(trio: Trio, series: ThreeSeries) -> Trio:
@@ -77,20 +78,43 @@ def _variance_of_mean(series: ThreeSeries, length: int) -> tuple[float, int]:
 
 def slow_states(trio: Trio) -> list[list[IntArray]]:
     """Return the quarter of the truth's slowest motion (TIC 0) that each frame of each sample lies in, `(n,)` per
-    segment; all 0 where nothing turns or frames are too few for TICA, -1 for frames that are not finite."""
-    lag = max(1, round(_TICA_LAG_PS / trio.reference.features.lag_ps))
+    segment: quarters hold equally many of its frames. All 0 where nothing turns or frames are too few for TICA, -1 for
+    frames that are not finite."""
     features = [tica_features(s.features) for s in trio.samples]
-    truth = [*features[0], *features[2]]
-    model = kinetics.fit_tica(truth, lag) if max(map(len, truth)) > 10 * lag else None
+    return _in_quarters(
+        trio, features, [*features[0], *features[2]], lambda x: np.quantile(x, np.arange(1, N_STATES) / N_STATES)
+    )
+
+
+def states_apart(trio: Trio) -> list[list[IntArray]]:
+    """Return the same of the slowest motion of all three, its quarters equally wide: a state far from all others, which
+    one run may visit once for long and another never, is a quarter of its own."""
+    features = [tica_features(s.features) for s in trio.samples]
+
+    def edges(values: FloatArray) -> FloatArray:
+        low, high = np.quantile(values, _WITHOUT_STRAYS)
+        return np.asarray(np.linspace(low, high, N_STATES + 1)[1:-1])
+
+    return _in_quarters(trio, features, [x for own in features for x in own], edges)
+
+
+def _in_quarters(
+    trio: Trio,
+    features: Sequence[Sequence[FloatArray]],
+    fitted: Sequence[FloatArray],
+    edges: Callable[[FloatArray], FloatArray],
+) -> list[list[IntArray]]:
+    """Fit TICA to `fitted`, and put every frame of `features` between the `edges` of its values there."""
+    lag = max(1, round(_TICA_LAG_PS / trio.reference.features.lag_ps))
+    model = kinetics.fit_tica(fitted, lag) if max(map(len, fitted)) > 10 * lag else None
     if model is None:
         return [[np.zeros(n, dtype=np.int64) for n in s.features.segment_lengths] for s in trio.samples]
-    values = np.concatenate([model.project(x) for x in truth])
-    edges = np.quantile(values[np.isfinite(values)], np.arange(1, _N_STATES) / _N_STATES)
-    out = []
-    for sample in features:
-        projected = [model.project(x) for x in sample]
-        out.append([np.where(np.isfinite(p), np.searchsorted(edges, p), -1).astype(np.int64) for p in projected])
-    return out
+    values = np.concatenate([model.project(x) for x in fitted])
+    between = edges(values[np.isfinite(values)])
+    projected = [[model.project(x) for x in own] for own in features]
+    return [
+        [np.where(np.isfinite(p), np.searchsorted(between, p), -1).astype(np.int64) for p in own] for own in projected
+    ]
 
 
 def residuals(values: ThreeSeries, states: Sequence[Sequence[IntArray]]) -> list[list[FloatArray]]:

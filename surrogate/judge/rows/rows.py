@@ -55,6 +55,30 @@ class Options:
 
 
 @dataclass(frozen=True)
+class Metric:
+    """What one row is about: its key and group, its name and unit for people, and the deviation that is tolerated.
+
+    `tolerance` is in `unit`; of a positive, skewed number, such as a time or a width (`relative`), it is a share of the
+    reference's value, and logarithms are compared. `tolerance_text` says it where that takes other words. A difference
+    below `resolution`, in `unit`, is not a physical one (rounding of files, tolerance of constraint solvers) and never
+    significant.
+    """
+
+    key: str
+    group: Group
+    name: str
+    unit: str
+    tolerance: float
+    tolerance_text: str = ""
+    relative: bool = False
+    resolution: float = 0.0
+
+    def tolerance_words(self) -> str:
+        """Return such as '0.4 Hz', or '20 %' of a relative one."""
+        return f"{100 * self.tolerance:g} %" if self.relative else f"{self.tolerance:g} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
 class Row:
     """One metric of one candidate, between the reference and its replicate.
 
@@ -279,26 +303,17 @@ def _distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estima
 
 def observable_row(
     trio: Trio,
+    metric: Metric,
     values: Sequence[float],
     draws: Sequence[FloatArray],
-    *,
-    key: str,
-    group: Group,
-    metric: str,
-    unit: str,
-    tolerance: float,
-    tolerance_text: str,
     statement: Callable[[float, float], str],
-    log: bool = False,
-    resolution: float = 0.0,
 ) -> Row:
     """Return the row of a number that each trajectory has by itself.
 
-    `values` and bootstrap `draws` are of (reference, candidate, replicate). With `log` it is a positive, skewed number
-    and `tolerance` is relative; else absolute. A difference below `resolution` is not a physical one (rounding of
-    files, tolerance of constraint solvers) and never significant. `statement(candidate, reference)` words the
-    deviation.
+    `values` and bootstrap `draws` `(n_draws,)` are of (reference, candidate, replicate), in the metric's unit.
+    `statement(candidate, reference)` words the deviation.
     """
+    log = metric.relative
     made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, trio.samples, strict=True)]
     ref, cand, rep = made
     both = truth_of(ref, rep, log=log)
@@ -306,19 +321,20 @@ def observable_row(
     if ref.value > 2.0 * ref.error:
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = estimate(cand.value / ref.value, draws[1] / draws[0], min(ref.n_blocks, cand.n_blocks), log=log)
+    near, near_replicate = (abs(e.value - ref.value) < metric.resolution for e in (cand, rep))
     return Row(
-        key=key,
-        group=group,
-        metric=metric,
-        unit=unit,
+        key=metric.key,
+        group=metric.group,
+        metric=metric.name,
+        unit=metric.unit,
         kind="observable",
         reference=ref,
         candidate=cand,
         replicate=rep,
         ratio=ratio,
-        p_value=1.0 if abs(cand.value - ref.value) < resolution else difference_p(cand, both, log=log),
-        p_replicate=1.0 if abs(rep.value - ref.value) < resolution else difference_p(rep, ref, log=log),
-        tolerance=tolerance * ref.value if log else tolerance,
-        tolerance_text=tolerance_text,
-        statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric}: it does not move",
+        p_value=1.0 if near else difference_p(cand, both, log=log),
+        p_replicate=1.0 if near_replicate else difference_p(rep, ref, log=log),
+        tolerance=metric.tolerance * ref.value if log else metric.tolerance,
+        tolerance_text=metric.tolerance_text or f"± {metric.tolerance_words()}",
+        statement=statement(cand.value, ref.value) if math.isfinite(cand.value) else f"{metric.name}: it does not move",
     )

@@ -13,7 +13,7 @@ from surrogate.judge.rows.block_means import column, family_of
 from surrogate.judge.rows.charts import Chart
 from surrogate.judge.rows.motion.relaxation_rows import speed_words
 from surrogate.judge.rows.own_blocks import with_own_blocks
-from surrogate.judge.rows.rows import Row, Trio, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Trio, observable_row
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -55,16 +55,17 @@ def lifetime_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, s
         rows.append(
             observable_row(
                 fine,
+                Metric(
+                    f"hydrogen_bond_lifetime:{labels[k]}",
+                    "kinetics",
+                    f"Lifetime of the hydrogen bond {labels[k]}",
+                    "ps",
+                    0.2,
+                    relative=True,
+                ),
                 values,
                 draws,
-                key=f"hydrogen_bond_lifetime:{labels[k]}",
-                group="kinetics",
-                metric=f"Lifetime of the hydrogen bond {labels[k]}",
-                unit="ps",
-                tolerance=0.2,
-                tolerance_text="± 20 %",
-                statement=lambda c, r, k=k: speed_words(f"the hydrogen bond {labels[k]} breaks", c, r),  # type: ignore[misc]
-                log=True,
+                lambda c, r, k=k: speed_words(f"the hydrogen bond {labels[k]} breaks", c, r),  # type: ignore[misc]
             )
         )
     return rows, [], skipped

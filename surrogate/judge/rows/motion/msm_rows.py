@@ -15,7 +15,7 @@ from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import estimate
 from surrogate.judge.rows.charts import BarChart, Chart, Landscape, Line, LineChart, Role
 from surrogate.judge.rows.motion.relaxation_rows import speed_words
-from surrogate.judge.rows.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -185,16 +185,10 @@ def _timescale_rows(
         rows.append(
             observable_row(
                 trio,
+                Metric(f"msm_timescale:{k + 1}", "kinetics", metric, "ps", 0.2, relative=True),
                 values,
                 draws,
-                key=f"msm_timescale:{k + 1}",
-                group="kinetics",
-                metric=metric,
-                unit="ps",
-                tolerance=0.2,
-                tolerance_text="± 20 %",
-                statement=lambda c, r, k=k: speed_words(f"process {k + 1} of the Markov state model decays", c, r),  # type: ignore[misc]
-                log=True,
+                lambda c, r, k=k: speed_words(f"process {k + 1} of the Markov state model decays", c, r),  # type: ignore[misc]
             )
         )
     return rows, skipped

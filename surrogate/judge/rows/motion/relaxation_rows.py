@@ -14,7 +14,7 @@ from surrogate.judge.measure.slow_motion import SLOW_KINDS, tica_features
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, widening
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.rows import curves
-from surrogate.judge.rows.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -173,15 +173,10 @@ def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, what: str, 
     time = format_time_ps(lag * trio.reference.features.lag_ps)
     return observable_row(
         trio,
+        Metric(f"correlation:{lag}:{label}", "kinetics", f"Autocorrelation of {what} at {time}, {label}", "", 0.05),
         [float(r.curve[lag]) for r in results],
         [r.draws[:, at] for r in results],
-        key=f"correlation:{lag}:{label}",
-        group="kinetics",
-        metric=f"Autocorrelation of {what} at {time}, {label}",
-        unit="",
-        tolerance=0.05,
-        tolerance_text="± 0.05",
-        statement=lambda c, r: f"{what} of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
+        lambda c, r: f"{what} of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
     )
 
 
@@ -189,16 +184,12 @@ def _time_row(trio: Trio, results: Sequence[_Correlated], what: str, label: str)
     lag_ps = trio.reference.features.lag_ps
     return observable_row(
         trio,
+        Metric(
+            f"correlation_time:{label}", "kinetics", f"Relaxation time of {what}, {label}", "ps", 0.2, relative=True
+        ),
         [r.time * lag_ps for r in results],
         [r.draws_time * lag_ps for r in results],
-        key=f"correlation_time:{label}",
-        group="kinetics",
-        metric=f"Relaxation time of {what}, {label}",
-        unit="ps",
-        tolerance=0.2,
-        tolerance_text="± 20 %",
-        statement=lambda c, r: speed_words(f"{what} of {label} relaxes", c, r),
-        log=True,
+        lambda c, r: speed_words(f"{what} of {label} relaxes", c, r),
     )
 
 
@@ -250,16 +241,17 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
         ),
         observable_row(
             trio,
+            Metric(
+                "tic0_timescale",
+                "kinetics",
+                f"Timescale of TIC 0 at a lag of {format_time_ps(lag * lag_ps)}",
+                "ps",
+                0.2,
+                relative=True,
+            ),
             values,
             draws,
-            key="tic0_timescale",
-            group="kinetics",
-            metric=f"Timescale of TIC 0 at a lag of {format_time_ps(lag * lag_ps)}",
-            unit="ps",
-            tolerance=0.2,
-            tolerance_text="± 20 %",
-            statement=lambda c, r: speed_words("the slowest motion (TIC 0) decays", c, r),
-            log=True,
+            lambda c, r: speed_words("the slowest motion (TIC 0) decays", c, r),
         ),
     ]
     noise = kinetics.noise_timescale(features[0][0].shape[1], lag, trio.reference.features.n_frames)

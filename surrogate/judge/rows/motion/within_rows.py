@@ -13,8 +13,8 @@ from surrogate.judge.measure.distributions import TORSION_BINS
 from surrogate.judge.measure.slow_motion import SLOW_KINDS
 from surrogate.judge.rows.charts import Chart
 from surrogate.judge.rows.metrics import are_many
-from surrogate.judge.rows.own_blocks import IntArray, residuals, slow_states, with_own_blocks
-from surrogate.judge.rows.rows import Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.own_blocks import N_STATES, IntArray, residuals, slow_states, states_apart, with_own_blocks
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,6 +24,7 @@ Segments = Sequence[npt.NDArray[np.floating]]
 _LEAST_SHARE = 0.05
 _MOST_TORSIONS = 8
 _STEP_TOLERANCE = 0.05
+_LEAST_IN_STATE = 0.01
 
 
 def within_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
@@ -160,12 +161,23 @@ def _squared_steps(trio: Trio, sample: Sample) -> list[FloatArray]:
 
 def _step_row(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row:
     """The root mean square step, as if every trajectory were in the states of the slowest motion as often as the truth:
-    a wrong time between frames shows here first."""
+    a wrong time between frames shows here first.
+
+    Only states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time.
+    """
     squared = [_squared_steps(trio, s) for s in trio.samples]
+    states = [
+        [np.where((x >= 0) & (y >= 0), N_STATES * x + y, -1) for x, y in zip(own, apart, strict=True)]
+        for own, apart in zip(states, states_apart(trio), strict=True)
+    ]
     fine = with_own_blocks(trio, residuals(squared, states))
-    truth = np.concatenate([*states[0], *states[2]])
-    n_states = int(truth.max(initial=0)) + 1
-    share = np.bincount(truth[truth >= 0], minlength=n_states).astype(np.float64)
+    flat = [np.concatenate(list(own)) for own in states]
+    n_states = max(int(x.max(initial=0)) for x in flat) + 1
+    frames = [np.bincount(x[x >= 0], minlength=n_states) for x in flat]
+    shared = np.all([n >= _LEAST_IN_STATE * max(int(n.sum()), 1) for n in frames], axis=0)
+    share = np.asarray(frames[0] + frames[2], dtype=np.float64)
+    if shared.any():
+        share[~shared] = 0.0
     values, draws = [], []
     for sample, steps, of in zip(fine.samples, squared, states, strict=True):
         total, count = np.zeros((sample.blocks.n_blocks, n_states)), np.zeros((sample.blocks.n_blocks, n_states))
@@ -179,15 +191,17 @@ def _step_row(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row:
     lag = format_time_ps(trio.reference.features.lag_ps)
     return observable_row(
         fine,
+        Metric(
+            "torsion_step",
+            "kinetics",
+            f"Step of all torsions from frame to frame ({lag}), root mean square",
+            "°",
+            _STEP_TOLERANCE,
+            relative=True,
+        ),
         values,
         draws,
-        key="torsion_step",
-        group="kinetics",
-        metric=f"Step of all torsions from frame to frame ({lag}), root mean square",
-        unit="°",
-        tolerance=_STEP_TOLERANCE,
-        tolerance_text=f"± {100 * _STEP_TOLERANCE:g} %",
-        statement=lambda c, r: (
+        lambda c, r: (
             f"torsions step by {c:.3g}° from frame to frame instead of {r:.3g}°"
             + (
                 ": frames are further apart in time, or colder or hotter, than said"
@@ -195,7 +209,6 @@ def _step_row(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row:
                 else ""
             )
         ),
-        log=True,
     )
 
 

@@ -14,7 +14,7 @@ from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, equal_rows, eve
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, mean_estimate
 from surrogate.judge.measure.structure import CONSTRAINED_BELOW_NM, bond_label
 from surrogate.judge.rows.curves import BondLength
-from surrogate.judge.rows.rows import Row, Sample, Trio, distance_row, observable_row, truth_of
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, truth_of
 from systems.chemistry.validity import Geometry
 
 FloatArray = npt.NDArray[np.float64]
@@ -53,16 +53,18 @@ def bond_rows(trio: Trio) -> tuple[list[Row], list[BondLength]]:
         rows.append(
             observable_row(
                 trio,
+                Metric(
+                    f"bond_width:{kind}",
+                    "structure",
+                    name,
+                    "Å",
+                    BOND_WIDTH_TOLERANCE * values[0] if tolerance is None else tolerance,
+                    tolerance_text=words,
+                    resolution=BOND_RESOLUTION_ANGSTROM,
+                ),
                 values,
                 draws,
-                key=f"bond_width:{kind}",
-                group="structure",
-                metric=name,
-                unit="Å",
-                tolerance=BOND_WIDTH_TOLERANCE * values[0] if tolerance is None else tolerance,
-                tolerance_text=words,
-                statement=lambda c, r, kind=kind: f"{kind} vary by {c:.3f} Å instead of {r:.3f} Å",  # type: ignore[misc]
-                resolution=BOND_RESOLUTION_ANGSTROM,
+                lambda c, r, kind=kind: f"{kind} vary by {c:.3f} Å instead of {r:.3f} Å",  # type: ignore[misc]
             )
         )
     flexible = evenly([g for g in groups if not rigid[g].any()], MOST_HISTOGRAMS)

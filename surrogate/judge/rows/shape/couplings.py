@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.structure import Backbone
-from surrogate.judge.rows.block_means import Means, block_means, shift_row
-from surrogate.judge.rows.charts import BarChart, Chart
+from surrogate.judge.rows.block_means import Means, block_means, mean_row, shift_row
+from surrogate.judge.rows.charts import Chart, bar_chart
 from surrogate.judge.rows.metrics import are_many
-from surrogate.judge.rows.rows import Row, Trio, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Trio
 from systems.scene import Scene
 
 Skipped = tuple[str, str]
@@ -94,17 +94,12 @@ def coupling_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     if are_many(trio):
         return [_largest_shift(trio, sites, means)], [], []
     rows = [
-        observable_row(
+        mean_row(
             trio,
-            [float(m.values[k]) for m in means],
-            [m.draws[:, k] for m in means],
-            key=f"coupling:{site.label}",
-            group="populations",
-            metric=f"³J(HN,HA), {site.label}",
-            unit="Hz",
-            tolerance=TOLERANCE_HZ,
-            tolerance_text=f"± {TOLERANCE_HZ:g} Hz",
-            statement=lambda c, r, label=site.label: f"³J(HN,HA) of {label} is {c:.2f} Hz instead of {r:.2f} Hz",  # type: ignore[misc]
+            Metric(f"coupling:{site.label}", "populations", f"³J(HN,HA), {site.label}", "Hz", TOLERANCE_HZ),
+            means,
+            k,
+            lambda c, r, label=site.label: f"³J(HN,HA) of {label} is {c:.2f} Hz instead of {r:.2f} Hz",  # type: ignore[misc]
         )
         for k, site in enumerate(sites)
     ]
@@ -114,36 +109,17 @@ def coupling_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
 def _largest_shift(trio: Trio, sites: list[Site], means: list[Means]) -> Row:
     return shift_row(
         trio,
+        Metric("coupling_shift", "populations", "Largest shift of a ³J(HN,HA)", "Hz", TOLERANCE_HZ, resolution=0.02),
         means,
         [site.label for site in sites],
-        key="coupling_shift",
-        group="populations",
-        metric="Largest shift of a ³J(HN,HA)",
-        unit="Hz",
-        tolerance=TOLERANCE_HZ,
-        resolution=0.02,
-        statement=lambda label, c, r: f"³J(HN,HA) of {label} is {c:.2f} Hz instead of {r:.2f} Hz",
+        lambda label, c, r: f"³J(HN,HA) of {label} is {c:.2f} Hz instead of {r:.2f} Hz",
     )
 
 
 def _chart(sites: list[Site], means: list[Means]) -> Chart:
-    made = [m.estimates() for m in means]
-
-    def pick(which: int, name: str) -> npt.NDArray[np.float64]:
-        return np.array([getattr(e, name) for e in made[which]])
-
-    return BarChart(
-        section="experiment",
-        title="³J(HN,HA)",
-        caption=f"J = {KARPLUS.a:g} cos²(φ - 60°) - {-KARPLUS.b:g} cos(φ - 60°) + {KARPLUS.c:g} Hz, averaged over "
-        f"frames ({KARPLUS.source}); φ + 60° for D residues, both for glycine.",
-        y_label="³J / Hz",
-        names=tuple(site.label for site in sites),
-        reference=pick(0, "value"),
-        candidate=pick(1, "value"),
-        replicate=pick(2, "value"),
-        reference_low=pick(0, "low"),
-        reference_high=pick(0, "high"),
-        candidate_low=pick(1, "low"),
-        candidate_high=pick(1, "high"),
+    caption = (
+        f"J = {KARPLUS.a:g} cos²(φ - 60°) - {-KARPLUS.b:g} cos(φ - 60°) + {KARPLUS.c:g} Hz, averaged over "
+        f"frames ({KARPLUS.source}); φ + 60° for D residues, both for glycine."
     )
+    names = [site.label for site in sites]
+    return bar_chart("experiment", "³J(HN,HA)", caption, "³J / Hz", names, [m.estimates() for m in means])

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from surrogate.judge.measure.movie import pick_frames
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.block_means import block_means, bounds
+from surrogate.judge.rows.block_means import block_means, bounds, mean_row
 from surrogate.judge.rows.charts import Chart, Histogram
-from surrogate.judge.rows.rows import Row, Trio, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Trio
 
 FloatArray = npt.NDArray[np.float64]
 # Positions `(n_atoms, 3)` nm of one frame to kJ/mol; not finite where the frame has none.
@@ -63,29 +63,28 @@ def energy_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str
     shares = [block_means(s, a) for s, a in zip(trio.samples, above, strict=True)]
     thermal_kj = GAS_CONSTANT_KJ * trio.temperature_k
     rows = [
-        observable_row(
+        mean_row(
             trio,
-            [float(m.values[0]) for m in means],
-            [m.draws[:, 0] for m in means],
-            key="energy_mean",
-            group="structure",
-            metric=f"{_NAME}, mean over {len(known[1])} frames",
-            unit="kJ/mol",
-            tolerance=thermal_kj,
-            tolerance_text="± RT",
-            statement=lambda c, r: f"the potential energy is {abs(c - r):.3g} kJ/mol too {'high' if c > r else 'low'}",
+            Metric(
+                "energy_mean",
+                "structure",
+                f"{_NAME}, mean over {len(known[1])} frames",
+                "kJ/mol",
+                thermal_kj,
+                tolerance_text="± RT",
+            ),
+            means,
+            0,
+            lambda c, r: f"the potential energy is {abs(c - r):.3g} kJ/mol too {'high' if c > r else 'low'}",
         ),
-        observable_row(
+        mean_row(
             trio,
-            [float(m.values[0]) for m in shares],
-            [m.draws[:, 0] for m in shares],
-            key="energy_high",
-            group="structure",
-            metric=f"Frames above {limit:.5g} kJ/mol, the reference's 99 % quantile",
-            unit="%",
-            tolerance=2.0,
-            tolerance_text="± 2 %",
-            statement=lambda c, r: f"{c:.2g} % of frames have an energy that {r:.2g} % of the reference reaches",
+            Metric(
+                "energy_high", "structure", f"Frames above {limit:.5g} kJ/mol, the reference's 99 % quantile", "%", 2.0
+            ),
+            shares,
+            0,
+            lambda c, r: f"{c:.2g} % of frames have an energy that {r:.2g} % of the reference reaches",
         ),
     ]
     return rows, [_histogram(known)], []

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.rows.block_means import block_means, family_of
-from surrogate.judge.rows.charts import BarChart, Chart, Line, LineChart, Role
-from surrogate.judge.rows.rows import Row, Trio, observable_row
+from surrogate.judge.measure.secondary import COIL, HELIX, LEAST_RESIDUES, STRAND
+from surrogate.judge.rows.block_means import Means, block_means, family_of, mean_row
+from surrogate.judge.rows.charts import Chart, Line, LineChart, Role, bar_chart
+from surrogate.judge.rows.rows import Metric, Row, Trio
 
 FloatArray = npt.NDArray[np.float64]
 Skipped = tuple[str, str]
@@ -18,13 +19,9 @@ _ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 _MOST_POINTS = 400
 _LEAST_IN_NS_PS = 2000.0
 _MOST_RESIDUES = 2
-_LEAST_RESIDUES = 5
 _TOLERANCE = 5.0
 _RMSD = 1
-# Regions of phi and psi in degrees, psi of the second running past 180.
-_HELIX = ((-100.0, -30.0), (-80.0, -5.0))
-_STRAND = ((-180.0, -45.0), (90.0, 210.0))
-_IN_A_ROW = 3
+_MOST_NAMED = 12
 
 
 def along_time(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
@@ -63,72 +60,41 @@ def _series_chart(trio: Trio, values: Sequence[FloatArray], title: str, y_label:
 
 
 def secondary_structure(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
-    """Return rows of the helical and the extended share of the residues, and a chart of the helix residue by residue.
-
-    By torsions alone: a residue is helical (extended) with its phi and psi in that region and two neighbours beside it
-    that are, three in a row. Peptides of five residues and more.
-    """
-    residues = trio.torsions.residues
-    if len(residues) < _LEAST_RESIDUES:
-        return [], [], [("Secondary structure", f"fewer than {_LEAST_RESIDUES} residues have φ and ψ")]
+    """Return rows of the share of residues in helix and in strand, and charts of helix, strand and coil residue by
+    residue, with 95 % intervals. By DSSP (see `measure.secondary`); peptides of five residues and more."""
+    probes = trio.reference.features.probes
+    if probes is None:
+        return [], [], []
+    if not probes.chains.labels:
+        return [], [], [("Secondary structure", f"fewer than {LEAST_RESIDUES} residues have N, CA, C and O")]
     rows, charts = [], []
-    for key, name, region in (("helix", "helical", _HELIX), ("strand", "extended", _STRAND)):
-        formed = [
-            [in_a_row(_inside(phi, psi, trio, region)) for phi, psi in zip(s.features.phi, s.features.psi, strict=True)]
-            for s in trio.samples
-        ]
-        share = [[100.0 * x.mean(axis=1, keepdims=True) for x in v] for v in formed]
-        means = [block_means(s, v) for s, v in zip(trio.samples, share, strict=True)]
-        rows.append(
-            observable_row(
-                trio,
-                [float(m.values[0]) for m in means],
-                [m.draws[:, 0] for m in means],
-                key=f"secondary:{key}",
-                group="structure",
-                metric=f"Residues that are {name}, by φ and ψ of three in a row",
-                unit="%",
-                tolerance=_TOLERANCE,
-                tolerance_text=f"± {_TOLERANCE:g} %",
-                statement=lambda c, r, name=name: f"{c:.3g} % of residues are {name} instead of {r:.3g} %",  # type: ignore[misc]
-            )
-        )
-        each = [100.0 * np.concatenate(v).mean(axis=0) for v in formed]
-        charts.append(
-            BarChart(
-                section="structure",
-                title=f"Residues that are {name}",
-                caption="Share of frames, by φ and ψ of three residues in a row.",
-                y_label="frames / %",
-                names=tuple(r.label for r in residues),
-                reference=each[0],
-                candidate=each[1],
-                replicate=each[2],
-            )
-        )
-    return rows, [*charts], []
+    for name, code in (("helix", HELIX), ("strand", STRAND), ("coil", COIL)):
+        percent = [[100.0 * (x == code) for x in family_of(s, "secondary")] for s in trio.samples]
+        if code != COIL:
+            share = [[x.mean(axis=1, keepdims=True) for x in v] for v in percent]
+            means = [block_means(s, v) for s, v in zip(trio.samples, share, strict=True)]
+            metric = Metric(f"secondary:{name}", "structure", f"Residues in {name} (DSSP)", "%", _TOLERANCE)
+            rows.append(mean_row(trio, metric, means, 0, _in_words(name)))
+        each = [block_means(s, v) for s, v in zip(trio.samples, percent, strict=True)]
+        charts.append(_residue_chart(f"Residues in {name}", probes.chains.labels, each))
+    return rows, charts, []
 
 
-def _inside(
-    phi: npt.NDArray[np.floating], psi: npt.NDArray[np.floating], trio: Trio, region: tuple[tuple[float, float], ...]
-) -> npt.NDArray[np.bool_]:
-    """Return which residues `(n, n_residues)` lie in a region of phi and psi."""
-    out = []
-    for k, (low, high) in enumerate(region):
-        angles = phi if k == 0 else psi
-        columns = [r.phi if k == 0 else r.psi for r in trio.torsions.residues]
-        turned = (np.degrees(angles[:, columns].astype(np.float64)) - low) % 360.0
-        out.append(turned <= high - low)
-    return np.asarray(out[0] & out[1])
+def _in_words(name: str) -> Callable[[float, float], str]:
+    return lambda c, r: f"{c:.3g} % of residues are in {name} instead of {r:.3g} %"
 
 
-def in_a_row(inside: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return which columns `(n, k)` belong to a run of at least three that are set."""
-    k = inside.shape[1]
-    runs = np.ones((len(inside), k - _IN_A_ROW + 1), dtype=bool)
-    for shift in range(_IN_A_ROW):
-        runs &= inside[:, shift : k - _IN_A_ROW + 1 + shift]
-    out = np.zeros_like(inside)
-    for shift in range(_IN_A_ROW):
-        out[:, shift : k - _IN_A_ROW + 1 + shift] |= runs
-    return out
+def _residue_chart(title: str, labels: Sequence[str], each: Sequence[Means]) -> Chart:
+    """Names beside dots where there is room for them; of longer chains lines with bands over the residues in order."""
+    caption = "Share of frames by DSSP, with 95 % intervals."
+    made = [means.estimates() for means in each]
+    if len(labels) <= _MOST_NAMED:
+        return bar_chart("structure", title, caption, "frames / %", labels, made)
+    place = np.arange(1, len(labels) + 1, dtype=np.float64)
+    lines = []
+    for role, found in zip(_ROLES, made, strict=True):
+        value, low, high = (np.array([getattr(e, x) for e in found]) for x in ("value", "low", "high"))
+        band = (None, None) if role == "replicate" else (np.clip(low, 0, 100), np.clip(high, 0, 100))
+        lines.append(Line(role, role, place, value, *band))
+    ends = f"1 is {labels[0]}, {len(labels)} is {labels[-1]}."
+    return LineChart("structure", title, f"{caption} {ends}", "residue", "frames / %", tuple(lines))

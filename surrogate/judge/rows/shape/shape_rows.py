@@ -17,12 +17,13 @@ from surrogate.judge.rows.block_means import (
     bounds,
     column,
     family_of,
+    mean_row,
     over_equal,
     shift_row,
 )
 from surrogate.judge.rows.charts import BarChart, Chart
 from surrogate.judge.rows.curves import histogram
-from surrogate.judge.rows.rows import Group, Row, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Group, Metric, Row, Trio, distance_row, observable_row
 
 FloatArray = npt.NDArray[np.float64]
 Skipped = tuple[str, str]
@@ -78,19 +79,21 @@ def _length_rows(trio: Trio, k: int, key: str, name: str, tolerance: float | Non
     limits = bounds([x[:, None] for x in series[0]])
     means = [block_means(s, [x[:, None] for x in v], limits) for s, v in zip(trio.samples, series, strict=True)]
     low = name[0].lower() + name[1:]
-    mean_row = observable_row(
+    mean = mean_row(
         trio,
-        [float(m.values[0]) for m in means],
-        [m.draws[:, 0] for m in means],
-        key=f"{key}_mean",
-        group="structure",
-        metric=f"{name}, mean",
-        unit="Å",
-        tolerance=tolerance * float(means[0].values[0]),
-        tolerance_text=f"± {100 * tolerance:g} %",
-        statement=lambda c, r: f"the {low} is {c:.3g} Å on average instead of {r:.3g} Å",
+        Metric(
+            f"{key}_mean",
+            "structure",
+            f"{name}, mean",
+            "Å",
+            tolerance * float(means[0].values[0]),
+            tolerance_text=f"± {100 * tolerance:g} %",
+        ),
+        means,
+        0,
+        lambda c, r: f"the {low} is {c:.3g} Å on average instead of {r:.3g} Å",
     )
-    return [mean_row, *rows]
+    return [mean, *rows]
 
 
 def series_distance(trio: Trio, series: Series, bins: Bins, key: str, name: str, group: Group) -> Row:
@@ -154,16 +157,10 @@ def _fluctuation(trio: Trio) -> tuple[Row, Chart]:
 
     row = observable_row(
         trio,
+        Metric("rmsf", "structure", "RMSF over all fitted atoms", "Å", 0.1, relative=True),
         [float(rms(m.values)) for m in means],
         [rms(m.draws) for m in means],
-        key="rmsf",
-        group="structure",
-        metric="RMSF over all fitted atoms",
-        unit="Å",
-        tolerance=0.1,
-        tolerance_text="± 10 %",
-        statement=lambda c, r: f"atoms fluctuate by {c:.3g} Å instead of {r:.3g} Å (RMSF)",
-        log=True,
+        lambda c, r: f"atoms fluctuate by {c:.3g} Å instead of {r:.3g} Å (RMSF)",
     )
     groups = equal_rows(probes.fit_idx[:, None], probes.classes)
     means = [over_equal(m, groups) for m in means]
@@ -201,15 +198,17 @@ def _angle_rows(trio: Trio) -> list[Row]:
     in_degrees = [Means(np.degrees(m.values), np.degrees(m.draws), m.n_blocks) for m in pooled]
     shift = shift_row(
         trio,
+        Metric(
+            "angle_shift",
+            "structure",
+            "Largest shift of a mean bond angle",
+            "°",
+            _ANGLE_TOLERANCE_DEG,
+            resolution=_ANGLE_RESOLUTION_DEG,
+        ),
         in_degrees,
         group_labels(probes.labels("angles"), groups),
-        key="angle_shift",
-        group="structure",
-        metric="Largest shift of a mean bond angle",
-        unit="°",
-        tolerance=_ANGLE_TOLERANCE_DEG,
-        resolution=_ANGLE_RESOLUTION_DEG,
-        statement=lambda label, c, r: f"the angle {label} is {abs(c - r):.1f}° too {'wide' if c > r else 'narrow'}",
+        lambda label, c, r: f"the angle {label} is {abs(c - r):.1f}° too {'wide' if c > r else 'narrow'}",
     )
     bins = [distributions.normal_bins([x[:, g] for x in angles[0]], _ANGLE_BINS) for g in drawn]
     return [shift, mean_distance(trio, angles, bins, "angle_jsd", "Bond angles", "structure", drawn)]

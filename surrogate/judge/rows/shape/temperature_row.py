@@ -11,7 +11,7 @@ from surrogate.judge.measure.equal_atoms import evenly
 from surrogate.judge.measure.structure import CONSTRAINED_BELOW_NM
 from surrogate.judge.rows.block_means import bounds, family_of
 from surrogate.judge.rows.charts import Chart
-from surrogate.judge.rows.rows import Row, Sample, Trio, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, observable_row
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,15 +40,17 @@ def temperature_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str
     draws = [trio.temperature_k * np.median(d / own, axis=1) for _, d in found]
     row = observable_row(
         trio,
+        Metric(
+            "temperature",
+            "structure",
+            f"{_NAME}: {len(chosen)} bonds and angles, by the reference's widths",
+            "K",
+            _TOLERANCE * trio.temperature_k,
+            tolerance_text=f"± {100 * _TOLERANCE:g} %",
+        ),
         values,
         draws,
-        key="temperature",
-        group="structure",
-        metric=f"{_NAME}: {len(chosen)} bonds and angles, by the reference's widths",
-        unit="K",
-        tolerance=_TOLERANCE * trio.temperature_k,
-        tolerance_text=f"± {100 * _TOLERANCE:g} %",
-        statement=lambda c, r: f"bonds and angles vibrate as at {c:.0f} K instead of {r:.0f} K",
+        lambda c, r: f"bonds and angles vibrate as at {c:.0f} K instead of {r:.0f} K",
     )
     return [row], [], []
 

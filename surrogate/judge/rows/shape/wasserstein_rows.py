@@ -14,12 +14,14 @@ from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, equal_rows, eve
 from surrogate.judge.measure.statistics import Blocks, Estimate, estimate
 from surrogate.judge.rows.block_means import family_of
 from surrogate.judge.rows.charts import Chart
-from surrogate.judge.rows.rows import Row, Trio, drawn_distances, permutation_pair
+from surrogate.judge.rows.rows import Metric, Row, Trio, drawn_distances, permutation_pair
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
 
 _BINS = 100
+_LENGTHS = Metric("bond_wasserstein", "structure", "Bond lengths", "Å", 0.01, resolution=0.001)
+_ANGLES = Metric("angle_wasserstein", "structure", "Bond angles", "°", 1.0, resolution=0.05)
 
 
 def wasserstein_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str]]]:
@@ -32,30 +34,28 @@ def wasserstein_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str
     if len(pairs):
         lengths = [s.features.bonds_nm for s in trio.samples]
         groups = evenly(equal_rows(pairs, probes.classes), MOST_HISTOGRAMS)
-        rows.append(_row(trio, lengths, groups, "bond_wasserstein", "Bond lengths", "Å", 10.0, 0.5, 0.01, 0.001))
+        rows.append(_row(trio, _LENGTHS, lengths, groups, scale=10.0, furthest=0.5))
     if len(probes.angles):
         angles = [family_of(s, "angles") for s in trio.samples]
         groups = evenly(equal_rows(probes.angles, probes.classes), MOST_HISTOGRAMS)
-        rows.append(
-            _row(trio, angles, groups, "angle_wasserstein", "Bond angles", "°", 180.0 / math.pi, 30.0, 1.0, 0.05)
-        )
+        rows.append(_row(trio, _ANGLES, angles, groups, scale=180.0 / math.pi, furthest=30.0))
     return rows, [], []
 
 
 def _row(
     trio: Trio,
+    metric: Metric,
     measured: Sequence[Segments],
     groups: Sequence[npt.NDArray[np.intp]],
-    key: str,
-    name: str,
-    unit: str,
+    *,
     scale: float,
     furthest: float,
-    tolerance: float,
-    resolution: float,
 ) -> Row:
-    """`scale`: from the unit measured in to `unit`, which is that of the rest. Values further than `furthest` from the
-    reference's mean count as that far; a distance below `resolution` is that of rounding."""
+    """Return the row of the mean distance over `groups` of the columns of `measured`, of all three trajectories.
+
+    `scale`: from the unit measured in to the metric's. Values further than `furthest`, in the metric's unit, from the
+    reference's mean count as that far.
+    """
     edges = np.stack([_edges([x[:, g] for x in measured[0]], measured, g, furthest / scale) for g in groups])
     widths = scale * np.diff(edges, axis=1)[:, 0]
     counts = [binned(v, groups, edges, s.blocks) for v, s in zip(measured, trio.samples, strict=True)]
@@ -75,13 +75,13 @@ def _row(
         made.append(replace(found, low=max(found.low, 0.0)))
     candidate, replicate = made
     tested = permutation_pair(trio, flat, distance, 98)
-    p_values = [p if of.value > resolution else 1.0 for p, of in zip(tested, made, strict=True)]
-    low = name[0].lower() + name[1:]
+    p_values = [p if of.value > metric.resolution else 1.0 for p, of in zip(tested, made, strict=True)]
+    low = metric.name[0].lower() + metric.name[1:]
     return Row(
-        key=key,
-        group="structure",
-        metric=f"{name}, mean Wasserstein distance",
-        unit=unit,
+        key=metric.key,
+        group=metric.group,
+        metric=f"{metric.name}, mean Wasserstein distance",
+        unit=metric.unit,
         kind="distance",
         reference=None,
         candidate=candidate,
@@ -89,9 +89,9 @@ def _row(
         ratio=None,
         p_value=p_values[0] if math.isfinite(candidate.value) else math.nan,
         p_replicate=p_values[1],
-        tolerance=tolerance,
-        tolerance_text=f"≤ {tolerance:g} {unit}",
-        statement=f"{low} are {candidate.value:.2g} {unit} off on average (Wasserstein)",
+        tolerance=metric.tolerance,
+        tolerance_text=f"≤ {metric.tolerance_words()}",
+        statement=f"{low} are {candidate.value:.2g} {metric.unit} off on average (Wasserstein)",
     )
 
 

@@ -1,4 +1,4 @@
-"""Secondary structure by three in a row, charts along time, ends of chains, the worth's units."""
+"""Charts along time, ends of chains, the worth's units."""
 
 from __future__ import annotations
 
@@ -13,14 +13,7 @@ from surrogate.judge.measure.probes import _ends
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.charts import LineChart
 from surrogate.judge.rows.rows import Options
-from surrogate.judge.rows.shape.peptide_shape import in_a_row
 from surrogate.judge.worth import Worth
-
-
-def test_three_in_a_row_make_a_helix() -> None:
-    inside = np.array([[1, 1, 1, 0, 1, 1], [1, 1, 0, 1, 1, 1], [1, 1, 1, 1, 1, 1], [1, 0, 1, 0, 1, 0]], dtype=bool)
-    expected = np.array([[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1], [1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0]], dtype=bool)
-    np.testing.assert_array_equal(in_a_row(inside), expected)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from surrogate.judge.measure.slow_motion import longest_correlation, rarely_cros
 from surrogate.judge.measure.statistics import block_length, bootstrap_weights, estimate, make_blocks, permutation_p
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
+from surrogate.judge.rows.account import account_of
 from surrogate.judge.rows.motion import relaxation_rows
 from surrogate.judge.rows.rows import Options
 
@@ -85,8 +86,11 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     from surrogate.judge.rows.motion.within_rows import within_rows
 
     torsions, geometry = structure.backbone(reference.scene), structure.reference_geometry(reference)
-    three = (measured[0], candidate, measured[2])
-    trio = comparison._equal_terms(reference.scene, torsions, geometry, *three, OPTIONS)[0]
+    account = account_of(reference)
+    setting = comparison._Setting(
+        reference.scene, torsions, geometry, measured[0], measured[2], OPTIONS, 300.0, account
+    )
+    trio = comparison._equal_terms(setting, candidate)[0]
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
 
 
