@@ -7,7 +7,8 @@ one of 100 ps, beside two halves of MD. `--plain` trains without innovations, th
 
 `seeds`: another model of the same peptide, trained on short runs from many starts (`--runs`, a folder of
 `peptide_runs`), and the one of `lag` roll as long and as often as `--test` did: joint phi/psi distances, and the free
-energy of phi > 0 of many more and longer rollouts, beside that which a Markov model finds in the short runs alone.
+energy of phi > 0 of many more and longer rollouts, beside that which a Markov model finds in the short runs alone. How
+likely phi > 0 is, `free-energy`'s files in FOLDER tell the training: short runs leave that state and never enter it.
 
 `pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (a folder of `peptide_runs`), the
 model rolls each molecule below `--test` (a campaign's folder) as long and as often as MD did. Distances over MD's own
@@ -56,7 +57,10 @@ _REPLICAS, _REPLICA_PS, _REPLICA_LAG_PS = 64, 200_000.0, 50.0
 _MARKOV_LAG_PS = 50.0
 
 
-def train(references: Sequence[Path], out: Path, *, steps: int, innovation: bool) -> None:
+def train(
+    references: Sequence[Path], out: Path, *, steps: int, innovation: bool,
+    positive_phi_kt: dict[str, float] | None = None,
+) -> None:  # fmt: skip
     """Train on one peptide's references; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.trainer import is_trained
@@ -65,7 +69,7 @@ def train(references: Sequence[Path], out: Path, *, steps: int, innovation: bool
 
     if is_trained(out):
         return
-    training = PeptideTraining(steps=steps, time_reversal=True)
+    training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=positive_phi_kt or {})
     train_peptides([collect_frames(list(references))], out, PeptideConfig(innovation=innovation), training, resume=True)
 
 
@@ -109,10 +113,19 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
     }
 
 
+def known_energies(folder: Path) -> dict[str, float]:
+    """Return the free energies of phi > 0, kT, that `free-energy` left in a folder, by residue type."""
+    found = {}
+    for path in sorted(folder.glob("ACE-*-NME-free-energy.json")):
+        record = json.loads(path.read_text())
+        found[record["sequence"].split("-")[1]] = (record["metadynamics 1"] + record["metadynamics 2"]) / 2
+    return found
+
+
 def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
     """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
 
-    Raises InputError when fewer pairs have runs.
+    Free energies of phi > 0 are those in the folder of `out`. Raises InputError when fewer pairs have runs.
     """
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.trainer import is_trained
@@ -128,7 +141,8 @@ def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
     if len(doubles) < n_pairs:
         raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
     sets = [collect_frames(files) for files in singles + doubles]
-    train_peptides(sets, out, PeptideConfig(), PeptideTraining(steps=steps, time_reversal=True), resume=True)
+    training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=known_energies(out.parent))
+    train_peptides(sets, out, PeptideConfig(), training, resume=True)
 
 
 def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
@@ -217,7 +231,10 @@ def seeds_gate(a: argparse.Namespace) -> None:
     """Train on seeded runs, roll both models, print and keep distances and free energies."""
     from surrogate.data.weights import load_weights
 
-    train(sorted(a.runs.glob("run_*.h5")), a.folder / "seeds.safetensors", steps=a.steps, innovation=True)
+    runs = sorted(a.runs.glob("run_*.h5"))
+    train(
+        runs, a.folder / "seeds.safetensors", steps=a.steps, innovation=True, positive_phi_kt=known_energies(a.folder)
+    )  # fmt: skip
     scene, truth, time_ps = _thinned(a.test)
     angles = [torsions(scene, x) for x in truth]
     record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)]}}
@@ -229,7 +246,7 @@ def seeds_gate(a: argparse.Namespace) -> None:
         long = _rolled(weights, scene, many, _REPLICA_PS, _REPLICA_LAG_PS)
         shares = [float((torsions(scene, x)[:, 0] > 0).mean()) for x in long]
         record[name] = {"distance": found, **_free_energy(shares)}
-    _, short, _ = _thinned(sorted(a.runs.glob("run_*.h5")))
+    _, short, _ = _thinned(runs)
     both = [torsions(scene, x) for x in short]
     share = float(_weights(both)[np.concatenate(both)[:, 0] > 0].sum())
     record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None}

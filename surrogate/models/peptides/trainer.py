@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 
 _MEASURED_FRAMES = 4000
@@ -49,6 +51,8 @@ class PeptideTraining:
 
     `time_reversal`: MD in equilibrium looks alike backwards. Windows are read backwards, too, and frames drawn from
     equilibrium stand for endless times, both weighted by a Markov model of each molecule (`data.equilibrium`).
+    `positive_phi_kt`: of residue types, the free energy of phi > 0 over phi < 0 in kT where it is known (metadynamics);
+    short runs leave that state and hardly ever enter it.
     """
 
     budget_s: float | None = None
@@ -59,6 +63,7 @@ class PeptideTraining:
     bf16: bool = True
     device: str = "cpu"
     time_reversal: bool = False
+    positive_phi_kt: dict[str, float] = field(default_factory=dict)
     validate_every_s: float = 120.0
 
 
@@ -73,17 +78,41 @@ class PeptideSubject:
     chain: ChainFeatures
     weights: npt.NDArray[np.float64] | None = None
 
-    def in_equilibrium(self) -> PeptideSubject:
+    def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
         """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
+        kept = np.concatenate([np.arange(low, high) for low, high in ranges])
+        states, shares = self._signs_of_phi(kept, positive_phi_kt)
         found = equilibrium_weights(
-            [self._torsions(low, high) for low, high in ranges], max(1, round(_MARKOV_LAG_PS / self.frames.lag_ps))
-        )
+            [self._torsions(low, high) for low, high in ranges], max(1, round(_MARKOV_LAG_PS / self.frames.lag_ps)),
+            states=states if len(shares) > 1 else None, shares=shares,
+        )  # fmt: skip
         if found is None:
             return self
         weights = np.zeros(self.frames.n_frames)
-        weights[np.concatenate([np.arange(low, high) for low, high in ranges])] = found
+        weights[kept] = found
         return replace(self, weights=weights)
+
+    def _signs_of_phi(
+        self, kept: npt.NDArray[np.int64], positive_phi_kt: Mapping[str, float]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
+
+        Residues are taken to be independent; those whose free energy is not given play no part.
+        """
+        scene = self.frames.scene
+        states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
+        for quad in backbone_torsions(scene)["phi"]:
+            name = scene.residue_names[scene.residue_of_atom[quad[2]]]
+            if name in positive_phi_kt:
+                phi = np.concatenate(
+                    [torsion(self.frames.positions_nm(kept[k : k + _BLOCK]).astype(np.float64), quad[None])[:, 0]
+                     for k in range(0, len(kept), _BLOCK)]
+                )  # fmt: skip
+                states = states + len(shares) * (phi > 0)
+                odds = float(np.exp(-positive_phi_kt[name]))
+                shares = np.concatenate([shares, shares * odds])
+        return states, shares
 
     def _torsions(self, low: int, high: int) -> npt.NDArray[np.float64]:
         """Return cosines and sines `(n, 2 n_torsions)` of frames."""
@@ -210,7 +239,7 @@ def train_peptides(
     )
     normalise(model, subjects, training.seed)
     if training.time_reversal:
-        subjects = [subject.in_equilibrium() for subject in subjects]
+        subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     stage = StageConfig(
         "flow", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
         bf16=training.bf16, validate_every_s=training.validate_every_s,
@@ -244,6 +273,8 @@ def train_peptides(
 
     def write(spent_s: float) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "flow_s": round(spent_s, 1)}
+        if training.positive_phi_kt:
+            settings["positive_phi_kt"] = training.positive_phi_kt
         save_weights(out, model, domain, provenance_of(sets[0], settings, None, sets[1:]))
 
     state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")

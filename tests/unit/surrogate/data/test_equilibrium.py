@@ -60,6 +60,14 @@ def test_states_never_left_tell_nothing_of_each_other() -> None:
     assert len(np.unique(states[weights > 0])) == 1, "one state alone has weight"
 
 
+def test_what_is_known_otherwise_weighs_states_that_no_run_goes_between() -> None:
+    runs, states = _runs(40, 200, 2, connected=False)
+    weights = equilibrium_weights(runs, 20, states=states, shares=7.0 * POPULATION)
+    assert weights is not None
+    found = np.bincount(states, weights=weights, minlength=4) / len(states)
+    np.testing.assert_allclose(found, POPULATION, rtol=1e-6)
+
+
 def test_runs_shorter_than_the_lag_have_no_weights() -> None:
     runs, _ = _runs(8, 15, 3)
     assert equilibrium_weights(runs, 20) is None

@@ -16,6 +16,8 @@ from surrogate.data.weights import load_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.trainer import PeptideSubject, PeptideTraining, _with_scale, normalise, train_peptides
 from surrogate.sampling.runner import RolloutConfig, rollout
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
 
@@ -75,6 +77,26 @@ def test_windows_read_backwards_came_from_where_equilibrium_is(frames: TrainingF
     assert of_run[2] == of_run[3] == 0
     assert of_run[1] / of_run[0] == pytest.approx(3.0, rel=0.2)
     assert len((idx[~backwards, 0] // 200).unique()) == 4, "forwards they start anywhere"
+
+
+def test_positive_phi_weighs_what_metadynamics_says() -> None:
+    """Two runs at either sign of phi of both residues: each of the four patterns weighs what its residues' odds say."""
+    scene = build_peptide("ACE-ALA-VAL-NME")
+    mirrored = scene.positions_nm * np.array([1.0, 1.0, -1.0])
+    rng = np.random.default_rng(0)
+    x = np.stack([scene.positions_nm, mirrored])[np.arange(8) % 2][:, None] + 0.002 * rng.normal(
+        size=(8, 100, scene.n_atoms, 3)
+    )
+    posed = canonicalise(x.reshape(-1, scene.n_atoms, 3), scene)
+    frames = TrainingFrames(scene, quantise(posed), np.arange(9) * 100, 1.0, True, CONDITIONS, (), split=Split(0.2))
+    subject = PeptideSubject(frames, chain_features(scene, _with_scale(SMALL, [frames])))
+    weights = subject.in_equilibrium({"ALA": 1.0, "VAL": 2.0}).weights
+    assert weights is not None
+    of_run = weights.reshape(8, 100)
+    assert (of_run[:, 80:] == 0).all(), "held out"
+    positive = int(torsion(scene.positions_nm[None], backbone_torsions(scene)["phi"])[0, 0] <= 0)
+    ratio = of_run[positive::2].sum() / of_run[1 - positive :: 2].sum()
+    assert np.log(ratio) == pytest.approx(-3.0, abs=1e-6)
 
 
 def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: PeptideConfig) -> None:
