@@ -1,0 +1,175 @@
+"""One peptide in training: its frames, how likely each is in equilibrium, and the windows drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from surrogate.data.equilibrium import equilibrium_weights
+from surrogate.data.frames import TrainingFrames
+from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions
+from systems.errors import InputError
+
+# Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
+_EVEN_SHARE = 0.5
+# Share of windows whose later frames are drawn from equilibrium, at a time when the given one is forgotten.
+_FORGOTTEN_SHARE = 0.1
+_MARKOV_LAG_PS = 50.0
+_BLOCK = 20_000
+_TRIES = 20
+
+
+@dataclass(eq=False)
+class PeptideSubject:
+    """One sequence's frames, its input features, and the stretches that windows may be taken from.
+
+    `weights` (n_frames,): of frames in equilibrium; zero in what is held out. Without them no window is read backwards.
+    """
+
+    frames: TrainingFrames
+    chain: ChainFeatures
+    weights: npt.NDArray[np.float64] | None = None
+
+    def in_equilibrium(self, positive_phi_kt: Mapping[str, float]) -> PeptideSubject:
+        """Return this subject with weights, or itself where its runs do not tell how likely its states are."""
+        ranges = self.frames.split.ranges(self.frames.starts, validation=False)
+        kept = np.concatenate([np.arange(low, high) for low, high in ranges])
+        states, shares = self._signs_of_phi(kept, positive_phi_kt)
+        found = equilibrium_weights(
+            [self._torsions(low, high) for low, high in ranges], max(1, round(_MARKOV_LAG_PS / self.frames.lag_ps)),
+            states=states if len(shares) > 1 else None, shares=shares,
+        )  # fmt: skip
+        if found is None:
+            return self
+        weights = np.zeros(self.frames.n_frames)
+        weights[kept] = found
+        return replace(self, weights=weights)
+
+    def _signs_of_phi(
+        self, kept: npt.NDArray[np.int64], positive_phi_kt: Mapping[str, float]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
+
+        Residues are taken to be independent; those whose free energy is not given play no part.
+        """
+        scene = self.frames.scene
+        states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
+        for quad in backbone_torsions(scene)["phi"]:
+            name = scene.residue_names[scene.residue_of_atom[quad[2]]]
+            if name in positive_phi_kt:
+                phi = np.concatenate(
+                    [torsion(self.frames.positions_nm(kept[k : k + _BLOCK]).astype(np.float64), quad[None])[:, 0]
+                     for k in range(0, len(kept), _BLOCK)]
+                )  # fmt: skip
+                states = states + len(shares) * (phi > 0)
+                odds = float(np.exp(-positive_phi_kt[name]))
+                shares = np.concatenate([shares, shares * odds])
+        return states, shares
+
+    def _torsions(self, low: int, high: int) -> npt.NDArray[np.float64]:
+        """Return cosines and sines `(n, 2 n_torsions)` of frames."""
+        at = self.chain.code.turning_at
+        found = []
+        for start in range(low, high, _BLOCK):
+            frames = self.frames.positions_nm(np.arange(start, min(start + _BLOCK, high)))
+            found.append(self.chain.code.encode(torch.from_numpy(frames)).flatten(-2)[:, torch.cat([at, at + 1])])
+        return torch.cat(found).double().numpy()
+
+    def windows(
+        self, n: int, config: PeptideConfig, generator: torch.Generator, *, validation: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Draw windows: frames `(n, 1 + chunk_frames)` and the times `(n, chunk_frames)` ps after the first.
+
+        Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
+        longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
+        read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first.
+        """
+        lag = self.frames.lag_ps
+        ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
+        longest = min(int(config.longest_ps / lag), int((ranges[:, 1] - ranges[:, 0]).max()) - 1)
+        if longest < config.chunk_frames:
+            raise InputError(
+                f"{self.frames.scene.name}: runs hold no window of {config.chunk_frames} frames; run longer."
+            )
+        t = config.chunk_frames
+        even = torch.rand(n, 1, generator=generator) < _EVEN_SHARE
+        top = float(np.log(longest / t))
+        stride = torch.exp(torch.rand(n, 1, generator=generator) * top).round().clamp(1, longest // t)
+        drawn = torch.exp(torch.rand(n, t, generator=generator) * float(np.log(longest))).round().long()
+        drawn = torch.stack([_distinct(row, longest) for row in drawn.sort(dim=1).values])
+        ahead = torch.where(even, (stride * torch.arange(1, t + 1)).long(), drawn)
+        span = ahead[:, -1].numpy()
+        first = self._starts(span, ranges, generator)
+        idx = torch.cat([first[:, None], first[:, None] + ahead], dim=1)
+        times = ahead.float() * lag
+        if self.weights is None or validation:
+            return idx, times
+        starts, found = self._likely_starts(span, ranges, generator)
+        backwards = found & (torch.rand(n, generator=generator) < 0.5)
+        turned = starts[:, None] + ahead[:, -1:] - torch.cat([torch.zeros_like(ahead[:, :1]), ahead], dim=1)
+        idx = torch.where(backwards[:, None], turned, idx)
+        forgotten = torch.rand(n, 1, generator=generator) < _FORGOTTEN_SHARE
+        anywhere = self._likely(n * t, generator).reshape(n, t)
+        idx[:, 1:] = torch.where(forgotten, anywhere, idx[:, 1:])
+        return idx, torch.where(forgotten, config.forgotten_ps, times)
+
+    def _starts(self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator) -> Tensor:
+        """Draw first frames `(n,)` of windows that reach `span` (n,) frames further, each as likely as any other."""
+        first = torch.empty(len(span), dtype=torch.int64)
+        place = torch.rand(len(span), generator=generator, dtype=torch.float64).numpy()
+        for k, reach in enumerate(span.tolist()):
+            rooms = np.maximum(ranges[:, 1] - ranges[:, 0] - reach, 0)
+            at = int(place[k] * rooms.sum())
+            which = int(np.searchsorted(np.cumsum(rooms), at, side="right"))
+            first[k] = int(ranges[which, 0]) + at - int(rooms[:which].sum())
+        return first
+
+    def _likely_starts(
+        self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Draw first frames `(n,)` by their weights; False `(n,)` where none was met that lies so far from an end."""
+        first = np.zeros(len(span), dtype=np.int64)
+        found = np.zeros(len(span), dtype=bool)
+        for _ in range(_TRIES):
+            drawn = self._likely(len(span), generator).numpy()
+            end = ranges[np.searchsorted(ranges[:, 0], drawn, side="right") - 1, 1]
+            fits = ~found & (drawn + span < end)
+            first[fits] = drawn[fits]
+            found |= fits
+        return torch.from_numpy(first), torch.from_numpy(found)
+
+    def _likely(self, n: int, generator: torch.Generator) -> Tensor:
+        """Draw frames `(n,)` by their weights."""
+        place = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
+        return torch.from_numpy(np.searchsorted(self._cumulative, place * self._cumulative[-1], side="right"))
+
+    @cached_property
+    def _cumulative(self) -> npt.NDArray[np.float64]:
+        assert self.weights is not None
+        return np.cumsum(self.weights)
+
+    def numbers(self, model: PeptideSlide, idx: Tensor) -> Tensor:
+        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames."""
+        frames = torch.from_numpy(self.frames.positions_nm(idx.numpy())).to(model.token_mean.device)
+        return model.normalised(frames, self.chain)
+
+
+def _distinct(ahead: Tensor, longest: int) -> Tensor:
+    """Return ascending whole numbers from 1 to `longest`, each once, near those given (ascending)."""
+    found = ahead.clone()
+    for k in range(1, len(found)):
+        found[k] = max(int(found[k]), int(found[k - 1]) + 1)
+    surplus = int(found[-1]) - longest
+    if surplus > 0:
+        top = torch.arange(longest - len(found) + 1, longest + 1)
+        found = torch.minimum(found, top)
+    return found
