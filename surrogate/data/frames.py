@@ -48,8 +48,28 @@ class _Header:
     canonical: bool
     conditions: dict[str, float | bool | str | None]
     sources: tuple[dict[str, Any], ...]
-    quantum_nm: float
+    quantum_nm: float = QUANTUM_NM
     split: Split = field(default_factory=Split)
+
+    def of(
+        self,
+        coordinates: npt.NDArray[np.int16],
+        starts: npt.NDArray[np.int64],
+        velocities: npt.NDArray[np.float32] | None,
+    ) -> TrainingFrames:
+        """Return the frames with what is said of them."""
+        said = {f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"}
+        return TrainingFrames(**said, coordinates=coordinates, starts=starts, velocities=velocities)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": self.split.to_dict()}
+        return {f.name: getattr(self, f.name) for f in fields(_Header)} | plain
+
+    def enter(self, handle: h5py.File, starts: npt.NDArray[np.int64]) -> None:
+        """Write it into a windows file whose frames are there."""
+        handle.attrs["surromd_windows"] = json.dumps(self.to_dict())
+        handle.create_dataset("starts", data=starts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,22 +121,28 @@ class TrainingFrames:
             raise InputError(f"no {kind} window of {length} frames fits; give longer trajectories or shorter chunks.")
         return np.concatenate(found)
 
+    def spread_starts(self, n: int, length: int = 1, *, validation: bool = False) -> npt.NDArray[np.int64]:
+        """Return the first frames of at most `n` of these windows, evenly spaced."""
+        found = self.window_starts(length, validation=validation)
+        return found[np.linspace(0, len(found) - 1, min(n, len(found))).astype(int)]
+
+    def some_nm(self, n: int) -> npt.NDArray[np.float32]:
+        """Return at most `n` training frames `(n, n_atoms, 3)` nm, evenly spaced."""
+        return self.positions_nm(self.spread_starts(n))
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """How much reference these frames are, and of which files, as the record of a training has it."""
+        return {"reference_ns": self.total_ps * 1e-3, "sources": list(self.sources)}
+
     def refuse_leaks(self) -> None:
         """Raise InputError when held-out frames are trained on as well."""
         names = [str(source["file"]) for source in self.sources]
         refuse_leaks(self.coordinates, self.starts, self.split, lambda k: names[k] if names else f"trajectory {k}")
 
-    def header(self) -> dict[str, Any]:
-        """What a windows file says of its frames."""
-        return {
-            "scene": self.scene.to_dict(),
-            "lag_ps": self.lag_ps,
-            "canonical": self.canonical,
-            "conditions": self.conditions,
-            "sources": list(self.sources),
-            "quantum_nm": QUANTUM_NM,
-            "split": self.split.to_dict(),
-        }
+    def header(self) -> _Header:
+        """Return what a windows file says of its frames."""
+        return _Header(**{f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"})
 
     def save(self, path: str | Path) -> None:
         """Write one HDF5 file that `load_frames` takes back; it appears whole or not at all."""
@@ -130,7 +156,7 @@ class TrainingFrames:
                     handle["coordinates"][part] = self.coordinates[part]
                     if self.velocities is not None:
                         handle["velocities"][part] = self.velocities[part]
-                _close_with(handle, self)
+                self.header().enter(handle, self.starts)
 
         create_whole(Path(path), fill)
 
@@ -144,11 +170,6 @@ def _new_file(path: Path, n_frames: int, n_atoms: int, *, moving: bool) -> h5py.
     if moving:
         handle.create_dataset("velocities", (n_frames, n_atoms, 3), dtype=np.float32)
     return handle
-
-
-def _close_with(handle: h5py.File, frames: TrainingFrames) -> None:
-    handle.attrs["surromd_windows"] = json.dumps(frames.header())
-    handle.create_dataset("starts", data=frames.starts)
 
 
 def load_frames(path: str | Path) -> TrainingFrames:
@@ -167,12 +188,7 @@ def load_frames(path: str | Path) -> TrainingFrames:
     kinds = [(column.shape, column.dtype.str) for column in columns]
     if kinds != [(shape, kind) for kind in ("<i2", "<f4")][: len(kinds)] or (np.diff(starts, prepend=0) < 0).any():
         raise InputError(f"{path} is damaged: its frames are not those that it says it holds.")
-    return TrainingFrames(
-        **{f.name: getattr(header, f.name) for f in fields(_Header) if f.name != "quantum_nm"},
-        coordinates=columns[0],
-        starts=starts,
-        velocities=columns[1] if len(columns) > 1 else None,
-    )
+    return header.of(columns[0], starts, columns[1] if len(columns) > 1 else None)
 
 
 def _mapped(path: Path, dataset: h5py.Dataset) -> npt.NDArray[Any]:
@@ -207,12 +223,11 @@ def collect_frames(
     are kept in a nameless file in the folder `spool`, mapped, which goes when the process does.
     """
     found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
-    n_frames, n_atoms = int(found.starts[-1]), found.scene.n_atoms
+    n_frames, n_atoms = int(found.starts[-1]), found.header.scene.n_atoms
     if n_frames * n_atoms * (18 if velocities else 6) <= memory_bytes:
         coordinates = np.empty((n_frames, n_atoms, 3), dtype=np.int16)
         moving = np.empty((n_frames, n_atoms, 3), dtype=np.float32) if velocities else None
-        return replace(_fill(found, [*paths, *(held or [])], coordinates, moving), coordinates=coordinates,
-                       velocities=moving)  # fmt: skip
+        return found.read_into(coordinates, moving).of(coordinates, found.starts, moving)
     with tempfile.TemporaryDirectory(dir=spool, prefix=".surromd-windows-") as folder:
         file = Path(folder) / "windows.h5"
         write_windows(paths, file, canonical=canonical, velocities=velocities, held=held)
@@ -231,15 +246,49 @@ def write_windows(
     found = _survey(paths, held or [], canonical=canonical, velocities=velocities)
 
     def fill(temporary: Path) -> None:
-        with _new_file(temporary, int(found.starts[-1]), found.scene.n_atoms, moving=velocities) as handle:
-            moving = handle["velocities"] if velocities else None
-            _close_with(handle, _fill(found, [*paths, *(held or [])], handle["coordinates"], moving))
+        n_frames, n_atoms = int(found.starts[-1]), found.header.scene.n_atoms
+        with _new_file(temporary, n_frames, n_atoms, moving=velocities) as handle:
+            header = found.read_into(handle["coordinates"], handle["velocities"] if velocities else None)
+            header.enter(handle, found.starts)
 
     create_whole(out, fill)
 
 
-def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> TrainingFrames:
-    """Return what the files say of themselves, no frame read yet."""
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """What trajectories say of themselves, no frame read yet. `starts`: see TrainingFrames."""
+
+    paths: tuple[Path, ...]
+    header: _Header
+    starts: npt.NDArray[np.int64]
+
+    def read_into(self, coordinates: Target, moving: Target | None) -> _Header:
+        """Read all frames into `coordinates` and `moving` (arrays or data sets); return the header with its sources."""
+        from systems.trajectory.codec import open_trajectory
+
+        scene, sources = self.header.scene, []
+        for path, begin in zip(self.paths, self.starts[:-1].tolist(), strict=True):
+            with open_trajectory(path) as reader:
+                digest, at = hashlib.sha256(), begin
+                for frames in reader.iter_blocks(_BLOCK):
+                    if not np.isfinite(frames).all():
+                        raise InputError(f"{path} holds frames that are not finite; it cannot be trained on.")
+                    if moving is not None:
+                        given = _velocities(reader, at - begin, len(frames))
+                        moving[at : at + len(frames)] = at_rest(given, scene.masses_da).astype(np.float32)
+                        block = quantise(at_rest(frames, scene.masses_da))
+                    else:
+                        block = quantise(canonicalise(frames, scene) if self.header.canonical else centre(frames))
+                    coordinates[at : at + len(frames)] = block
+                    digest.update(block.tobytes())
+                    at += len(frames)
+                sources.append({"file": Path(path).name, "n_frames": reader.n_frames,
+                                "seed": reader.record.get("seed"), "sha256": digest.hexdigest()[:16]})  # fmt: skip
+        return replace(self.header, sources=tuple(sources))
+
+
+def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> _Survey:
+    """Return what the files say of themselves. Raises InputError when they do not go together."""
     from systems.trajectory.codec import open_trajectory
 
     if not paths:
@@ -273,33 +322,7 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
     assert scene is not None
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     split = Split(held=tuple(range(len(paths), len(lengths))))
-    return TrainingFrames(scene, np.empty((0, scene.n_atoms, 3), np.int16), starts, lag_ps, canonical, conditions, (),
-                          split=split)  # fmt: skip
-
-
-def _fill(found: TrainingFrames, paths: list[Path], coordinates: Target, moving: Target | None) -> TrainingFrames:
-    """Read all frames into `coordinates` and `moving` (arrays or data sets); return `found` with its sources."""
-    from systems.trajectory.codec import open_trajectory
-
-    scene, sources = found.scene, []
-    for path, begin in zip(paths, found.starts[:-1].tolist(), strict=True):
-        with open_trajectory(path) as reader:
-            digest, at = hashlib.sha256(), begin
-            for frames in reader.iter_blocks(_BLOCK):
-                if not np.isfinite(frames).all():
-                    raise InputError(f"{path} holds frames that are not finite; it cannot be trained on.")
-                if moving is not None:
-                    given = _velocities(reader, at - begin, len(frames))
-                    moving[at : at + len(frames)] = at_rest(given, scene.masses_da).astype(np.float32)
-                    block = quantise(at_rest(frames, scene.masses_da))
-                else:
-                    block = quantise(canonicalise(frames, scene) if found.canonical else centre(frames))
-                coordinates[at : at + len(frames)] = block
-                digest.update(block.tobytes())
-                at += len(frames)
-            sources.append({"file": Path(path).name, "n_frames": reader.n_frames, "seed": reader.record.get("seed"),
-                            "sha256": digest.hexdigest()[:16]})  # fmt: skip
-    return replace(found, sources=tuple(sources))
+    return _Survey((*paths, *held), _Header(scene, lag_ps, canonical, conditions, (), split=split), starts)
 
 
 def _velocities(reader: TrajectoryReader, start: int, n_frames: int) -> npt.NDArray[np.float32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,12 @@ class FrameSets:
     @property
     def names(self) -> str:
         return ", ".join(frames.scene.name for frames in self.trained)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """How much reference is trained on, and of which files, as the record of a training has it."""
+        sources = [source for frames in self.trained for source in frames.sources]
+        return {"reference_ns": sum(frames.total_ps for frames in self.trained) * 1e-3, "sources": sources}
 
 
 def collect_sets(paths: list[Path], *, held: list[Path] | None = None, spool: Path | None = None) -> FrameSets:

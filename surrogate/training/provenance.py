@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 import torch
 
 from surrogate.data.frames import TrainingFrames
@@ -21,32 +20,28 @@ def training_domain(
 ) -> TrainingDomain:
     """Return the domain of weights trained on every `stride`-th of `frames`; its checks are measured on evenly spaced
     training frames. `strides`: those of a model that takes the lag, from 1 on, for each of which jumps are measured."""
-    starts = frames.window_starts(stride + 1, validation=False)
-    picked = starts[np.linspace(0, len(starts) - 1, min(n_geometry_frames, len(starts))).astype(int)]
+    picked = frames.spread_starts(n_geometry_frames, stride + 1)
     positions = frames.positions_nm(picked)
     geometry = geometry_from_frames(frames.scene, positions)
     limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + stride))
     jumps = []
     for wide in strides:
-        starts = frames.window_starts(wide + 1, validation=False)
-        picked = starts[np.linspace(0, len(starts) - 1, min(n_geometry_frames, len(starts))).astype(int)]
+        picked = frames.spread_starts(n_geometry_frames, wide + 1)
         found = limits_from_frames(frames.scene, frames.positions_nm(picked), frames.positions_nm(picked + wide))
         jumps.append((frames.lag_ps * wide, found.jump_min_nm, found.jump_max_nm))
     return TrainingDomain(frames.scene, frames.lag_ps * stride, frames.conditions, geometry.to_dict(), limits.to_dict(),
                           tuple(jumps))  # fmt: skip
 
 
-def provenance_of(frames: TrainingFrames, settings: dict[str, Any], start: Weights | None = None,
-                  further: Sequence[TrainingFrames] = ()) -> dict[str, Any]:  # fmt: skip
-    """Return when, where and from what weights were made, with the training's `settings`; `start` is what it began
-    with, `further` the frames of other molecules."""
+def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weights | None = None) -> dict[str, Any]:
+    """Return when, where and from what weights were made. `origin`: of the frames trained on (`TrainingFrames.origin`);
+    `settings`: of the training; `start`: the weights that it began with."""
     earlier = {} if start is None else {"from": {"hash": start.hash, **start.provenance}}
     return {
         **earlier,
         "trained": datetime.now(UTC).isoformat(timespec="seconds"),
         "torch": torch.__version__,
         "machine": platform.machine(),
-        "reference_ns": sum(f.total_ps for f in (frames, *further)) * 1e-3,
-        "sources": [source for f in (frames, *further) for source in f.sources],
+        **origin,
         **settings,
     }

@@ -112,7 +112,8 @@ class WalkTrainer(Trainer):
                       StagePlace(state, request.out.with_suffix(".csv"), torch.device("cpu")),
                       progress=lambda name, share, metrics: advance(name, share))  # fmt: skip
             state.unlink()
-            save_weights(request.out, model, training_domain(frames), provenance_of(frames, {"seed": training.seed}))
+            provenance = provenance_of(frames.origin, {"seed": training.seed})
+            save_weights(request.out, model, training_domain(frames), provenance)
             return request.out
 
         return Prepared(frames.scene.name, start)

@@ -155,8 +155,7 @@ def ship(source: Path, target: Path, references: Sequence[Path] = ()) -> Path:
     provenance, stiff = weights.provenance, weights.stiff
     if references:
         frames = collect_frames(list(references))
-        measured = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
-        provenance, stiff = {**provenance, "stiff_terms": measured}, drawn_terms(frames)
+        provenance, stiff = {**provenance, "stiff_terms": frames.origin}, drawn_terms(frames)
     save_weights(target, weights.model, weights.domain, provenance, stiff=stiff, half=True)
     return target
 

@@ -180,9 +180,8 @@ def _symmetrised(counts: npt.NDArray[np.float64], hands: int, fold: int) -> npt.
 
 def _shape_frames(frames: TrainingFrames) -> Tensor:
     """Evenly spaced training frames `(n, n_atoms, 3)` nm, in double precision."""
-    starts = frames.window_starts(1, validation=False)
-    most = min(_SHAPE_FRAMES, max(500, _SHAPE_ATOMS // frames.scene.n_atoms), len(starts))
-    return _tensor(frames, starts[np.linspace(0, len(starts) - 1, most).astype(int)])
+    most = min(_SHAPE_FRAMES, max(500, _SHAPE_ATOMS // frames.scene.n_atoms))
+    return _tensor(frames, frames.spread_starts(most))
 
 
 def _blocks(idx: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:

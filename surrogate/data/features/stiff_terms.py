@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -15,9 +16,11 @@ from surrogate.models.stiff import StiffPlan, StiffTerms, Tree
 from systems.errors import InputError
 from systems.scene import Scene
 
+FloatArray = npt.NDArray[np.floating]
 # Bonds that a reference holds rigid vary by less, by rounding alone; others by ten times as much.
 RIGID_NM = 2e-4
-_LOOKED_AT = 1000
+# Frames that are looked at for what is rigid.
+LOOKED_AT = 1000
 _BLOCK = 8192
 # Ridge of the regression of terms on features, relative to their power: for torsions that hardly turn.
 _RIDGE = 1e-3
@@ -25,18 +28,25 @@ _RIDGE = 1e-3
 _STRAIGHTEST_RAD = np.radians(165.0)
 
 
-def rigid_hydrogens(frames: TrainingFrames) -> list[tuple[int, int]]:
-    """Return the bonds (hydrogen, its one neighbour) that keep their length in these frames, as constraints do."""
-    idx = np.linspace(0, frames.n_frames - 1, min(_LOOKED_AT, frames.n_frames)).astype(int)
-    x, scene = frames.positions_nm(idx), frames.scene
+def rigid_hydrogens(scene: Scene, positions_nm: FloatArray) -> list[tuple[int, int]]:
+    """Return the bonds (hydrogen, its one neighbour) that keep their length, as constraints do, in frames `(n, n_atoms,
+    3)` nm."""
     bonds = [(i, near[0]) for i, near in enumerate(scene.neighbours()) if scene.elements[i] == "H" and len(near) == 1]
-    return [(i, j) for i, j in bonds if np.linalg.norm(x[:, i] - x[:, j], axis=-1).std() < RIGID_NM]
+    lengths = [np.linalg.norm(positions_nm[:, i] - positions_nm[:, j], axis=-1) for i, j in bonds]
+    return [bond for bond, length in zip(bonds, lengths, strict=True) if length.std() < RIGID_NM]
 
 
-def rigid_terms(frames: TrainingFrames) -> StiffTerms | None:
-    """Return the bonds to hydrogen that a reference holds rigid, with their lengths; None where it holds none."""
-    rigid = rigid_hydrogens(frames)
-    return _with_lengths(StiffPlan(tuple(rigid)), frames) if rigid else None
+def holds_hydrogens(scene: Scene, positions_nm: FloatArray) -> bool:
+    """Return whether all bonds to hydrogen keep their length in frames `(n, n_atoms, 3)` nm."""
+    is_hydrogen = np.array(scene.elements) == "H"
+    return len(rigid_hydrogens(scene, positions_nm)) == int(is_hydrogen[scene.bonds].any(axis=1).sum())
+
+
+def rigid_terms(scene: Scene, positions_nm: FloatArray) -> StiffTerms | None:
+    """Return the bonds to hydrogen that are rigid in frames `(n, n_atoms, 3)` nm, with their lengths; None where there
+    are none."""
+    rigid = rigid_hydrogens(scene, positions_nm)
+    return _with_lengths(StiffPlan(tuple(rigid)), positions_nm) if rigid else None
 
 
 def drawn_terms(frames: TrainingFrames) -> StiffTerms:
@@ -44,11 +54,11 @@ def drawn_terms(frames: TrainingFrames) -> StiffTerms:
 
     Raises InputError for molecules that have rings, straight angles, or fewer than four atoms.
     """
-    plan = replace(plan_terms(frames.scene), rigid=tuple(rigid_hydrogens(frames)))
-    known = _with_lengths(plan, frames)
-    tree, starts = known.tree, frames.window_starts(1, validation=False)
-    near = np.linspace(0, len(starts) - 1, min(_LOOKED_AT, len(starts))).astype(int)
-    lengths, angles, turns = tree.measure(_tensor(frames, starts[near]))
+    some = frames.some_nm(LOOKED_AT)
+    plan = replace(plan_terms(frames.scene), rigid=tuple(rigid_hydrogens(frames.scene, some)))
+    known = _with_lengths(plan, some)
+    tree = known.tree
+    lengths, angles, turns = tree.measure(torch.from_numpy(some).double())
     if float(angles[:, tree.bent].max()) > _STRAIGHTEST_RAD:
         raise InputError(f"{frames.scene.name} has an angle that is straight, or nearly; its stiff terms are modelled.")
     means = tree.terms(lengths, angles, turns)
@@ -58,7 +68,7 @@ def drawn_terms(frames: TrainingFrames) -> StiffTerms:
     gram, cross, power = (torch.zeros(1, 1, dtype=torch.float64) for _ in range(3))
     for features, off in _measured(frames, tree, rest):
         gram, cross, power = gram + features.T @ features, cross + features.T @ off, power + off.T @ off
-    n = len(starts)
+    n = len(frames.window_starts(1, validation=False))
     held = torch.full((len(gram),), _RIDGE * n, dtype=torch.float64)
     held[0] = 0.0
     weights = torch.linalg.solve(gram + held.diag(), cross)
@@ -130,9 +140,8 @@ def _levels(near: list[list[int]], start: int) -> list[list[int]]:
     return levels[:-1]
 
 
-def _with_lengths(plan: StiffPlan, frames: TrainingFrames) -> StiffTerms:
-    starts = frames.window_starts(1, validation=False)
-    x = _tensor(frames, starts[np.linspace(0, len(starts) - 1, min(_LOOKED_AT, len(starts))).astype(int)])
+def _with_lengths(plan: StiffPlan, positions_nm: FloatArray) -> StiffTerms:
+    x = torch.from_numpy(positions_nm).double()
     hydrogen, parent = torch.tensor(plan.rigid, dtype=torch.long).reshape(-1, 2).T
     return StiffTerms(plan, {"rigid_nm": (x[:, hydrogen] - x[:, parent]).norm(dim=-1).mean(0)})
 
@@ -141,9 +150,6 @@ def _measured(frames: TrainingFrames, tree: Tree, rest: Tensor) -> Iterator[tupl
     """Features and deviations from rest of all training frames, block by block."""
     starts = frames.window_starts(1, validation=False)
     for begin in range(0, len(starts), _BLOCK):
-        lengths, angles, turns = tree.measure(_tensor(frames, starts[begin : begin + _BLOCK]))
+        x = torch.from_numpy(frames.positions_nm(starts[begin : begin + _BLOCK])).double()
+        lengths, angles, turns = tree.measure(x)
         yield tree.features(turns), tree.deviation(tree.terms(lengths, angles, turns), rest)
-
-
-def _tensor(frames: TrainingFrames, idx: np.ndarray) -> Tensor:
-    return torch.from_numpy(frames.positions_nm(idx)).double()

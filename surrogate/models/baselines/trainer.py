@@ -43,7 +43,7 @@ def fit_baseline(arch: str, frames: TrainingFrames, out: str | Path, *, n_new: i
         raise InputError(f"{arch} is fitted to canonical frames; make the windows without `canonical=False`.")
     model = FITS[kind](frames, n_new, np.random.default_rng(seed))
     out = Path(out)
-    save_weights(out, model, training_domain(frames), provenance_of(frames, {"seed": seed}))
+    save_weights(out, model, training_domain(frames), provenance_of(frames.origin, {"seed": seed}))
     return out
 
 

@@ -54,8 +54,7 @@ class Subject:
     @torch.no_grad()
     def reconstruction_error_nm(self, model: LamSlide) -> float:
         """Return the root mean square error of held-out frames that went through the autoencoder."""
-        held = self.frames.window_starts(1, validation=True)
-        held = held[np.linspace(0, len(held) - 1, min(_HELD_FRAMES, len(held))).astype(int)]
+        held = self.frames.spread_starts(_HELD_FRAMES, validation=True)
         x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(held)), None)
         error = model.decode(model.encode(x, self.molecule.elements, atoms), self.n_atoms, atoms) - x
         return float(error.square().sum(-1).mean().sqrt())

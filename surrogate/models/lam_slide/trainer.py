@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from surrogate.data.features.stiff_terms import drawn_terms, rigid_hydrogens, rigid_terms
+from surrogate.data.features.stiff_terms import LOOKED_AT, drawn_terms, holds_hydrogens, rigid_terms
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
@@ -122,7 +122,8 @@ def train_lam_slide(
     sets = frames if isinstance(frames, FrameSets) else FrameSets((frames,))
     first = sets.trained[0]
     model_config = _settle(sets, model_config, config)
-    if start is None and model_config.graph and all(holds_hydrogens(frames) for frames in sets.trained):
+    held = model_config.graph and all(holds_hydrogens(f.scene, f.some_nm(LOOKED_AT)) for f in sets.trained)
+    if held and start is None:
         model_config = replace(model_config, atoms=replace(model_config.atoms, rigid_hydrogens=True))
     length = model_config.approximator.chunk_frames
     told_of = model_config.approximator.rare_kinds
@@ -157,10 +158,12 @@ def train_lam_slide(
     domains = [training_domain(f, strides=strides if len(strides) > 1 else ()) for f in sets.trained]
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=model_config.graph)
 
+    origin, told = sets.origin, _told(config, [frames.scene.name for frames in sets.unseen])
+
     def write(spent_s: float) -> None:
         whole, of = (model, domain) if heavy is None else heavy.dressed(model)
-        save_weights(out, whole, of, _provenance(sets, config, spent_one, spent_s, start),
-                     stiff=stiff)  # fmt: skip
+        settings = told | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
+        save_weights(out, whole, of, provenance_of(origin, settings, start), stiff=stiff)
 
     spent_two = _stage_two(shown, config, two, places[1], progress, write)
     if is_first_process():
@@ -197,18 +200,12 @@ def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfi
     return replace(model_config, approximator=told)
 
 
-def holds_hydrogens(frames: TrainingFrames) -> bool:
-    """Return whether bonds to hydrogen keep their length in these frames, as a reference with constraints has them."""
-    is_hydrogen = np.array(frames.scene.elements) == "H"
-    return len(rigid_hydrogens(frames)) == int(is_hydrogen[frames.scene.bonds].any(axis=1).sum())
-
-
 def _stiff_terms(frames: TrainingFrames, config: TrainingConfig, start: Weights | None) -> StiffTerms | None:
     """Return the stiff terms that the weights are to have: drawn where they are asked for, or were before."""
     before = None if start is None else start.stiff
     if config.stiff == "drawn" or (before is not None and before.plan.rows):
         return drawn_terms(frames)
-    return rigid_terms(frames) if config.stiff == "held" else None
+    return rigid_terms(frames.scene, frames.some_nm(LOOKED_AT)) if config.stiff == "held" else None
 
 
 def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
@@ -384,16 +381,12 @@ def _take_over(model: LamSlide, start: Weights) -> None:
     assert not surplus and all(name.startswith(("approximator.embed_kind", "approximator.odds")) for name in missing)
 
 
-def _provenance(sets: FrameSets, config: TrainingConfig, spent_one: float, spent_two: float,
-                start: Weights | None) -> dict[str, Any]:  # fmt: skip
+def _told(config: TrainingConfig, held_out: list[str]) -> dict[str, Any]:
+    """Return what the weights' provenance says of the settings."""
     settings: dict[str, Any] = {
         "seed": config.seed,
         "time_reversal": config.time_reversal,
         "rare_draws": config.rare_draws,
         "rare_kinds": config.rare_kinds,
-        "stage_one_s": round(spent_one, 1),
-        "stage_two_s": round(spent_two, 1),
     }
-    if sets.unseen:
-        settings["held_out_molecules"] = [frames.scene.name for frames in sets.unseen]
-    return provenance_of(sets.trained[0], settings, start, sets.trained[1:])
+    return settings | ({"held_out_molecules": held_out} if held_out else {})

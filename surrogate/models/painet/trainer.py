@@ -115,7 +115,9 @@ def train_painet(
     def write(spent_s: float) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
                     "every_frame": config.every_frame}  # fmt: skip
-        save_weights(out, model, domain, provenance_of(frames, {**settings, "training_s": round(spent_s, 1)}, start))
+        save_weights(
+            out, model, domain, provenance_of(frames.origin, {**settings, "training_s": round(spent_s, 1)}, start)
+        )
 
     place = StagePlace(state, log_path, device, resume)
     spent = run_stage(model, stage, loss_fn, validate, place, progress=progress, on_save=write)
@@ -140,9 +142,8 @@ class StateWindows:
         self.velocities = frames.velocities
         self.span = config.n_new * config.frame_stride
         self.starts = frames.window_starts(2 * self.span + 1, validation=False)
-        held = frames.window_starts(self.span + 1, validation=True)
-        self.held = held[np.linspace(0, len(held) - 1, min(128, len(held))).astype(int)]
-        sample = self.starts[np.linspace(0, len(self.starts) - 1, min(512, len(self.starts))).astype(int)]
+        self.held = frames.spread_starts(128, self.span + 1, validation=True)
+        sample = frames.spread_starts(512, 2 * self.span + 1)
         (x, v), (x_new, v_new) = self.state(sample), self.future(sample)
         self.position_scale_nm = max(float((x_new - x[:, None]).square().mean().sqrt()), 1e-6)
         self.change_scale_nm_ps = max(float((v_new - v).square().mean().sqrt()), 1e-6)

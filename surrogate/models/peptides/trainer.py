@@ -14,6 +14,7 @@ from torch import Tensor
 
 from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
 from surrogate.data.frames import TrainingFrames
+from surrogate.data.molecules import FrameSets
 from surrogate.data.weights import save_weights
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.losses import TAU_MAX
@@ -118,7 +119,7 @@ def train_peptides(
         settings: dict[str, Any] = {"seed": training.seed, "flow_s": round(spent_s, 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
-        save_weights(out, model, domain, provenance_of(sets[0], settings, None, sets[1:]))
+        save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings))
 
     state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")
     if not resume and is_first_process():
@@ -145,13 +146,8 @@ def _with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> Peptid
         return config
     layouts = [chain_layout(frames.scene) for frames in sets]
     share = max(200, _MEASURED_FRAMES // len(sets))
-    scale = chain_scale((layout, _some(frames, share)) for layout, frames in zip(layouts, sets, strict=True))
+    scale = chain_scale((layout, frames.some_nm(share)) for layout, frames in zip(layouts, sets, strict=True))
     return replace(config, scale=scale, types=tuple(sorted({name for layout in layouts for name in layout.types})))
-
-
-def _some(frames: TrainingFrames, n: int) -> npt.NDArray[np.float32]:
-    starts = frames.window_starts(1, validation=False)
-    return frames.positions_nm(starts[np.linspace(0, len(starts) - 1, min(n, len(starts))).astype(int)])
 
 
 @torch.no_grad()
@@ -166,7 +162,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     sums = torch.zeros(3, n_types, n_slots, dtype=torch.float64)
     for subject in subjects:
         tokens = subject.chain.code.encode(
-            torch.from_numpy(_some(subject.frames, _MEASURED_FRAMES // len(subjects) + 100))
+            torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + 100))
         )
         for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
             for power in range(3):

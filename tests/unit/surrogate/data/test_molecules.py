@@ -12,13 +12,14 @@ import pytest
 import torch
 
 from surrogate.data.descriptions import describe
+from surrogate.data.features.stiff_terms import holds_hydrogens
 from surrogate.data.frames import collect_frames
 from surrogate.data.molecules import FrameSets, collect_sets
 from surrogate.data.poses import in_standard_pose
 from surrogate.data.weights import Weights, load_weights, read_header
 from surrogate.models.lam_slide.config import GraphConfig, LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.trainer import TrainingConfig, holds_hydrogens, train_lam_slide
+from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.symmetry import local_handedness
@@ -259,7 +260,7 @@ def test_rigid_hydrogens_are_learned_from_the_references(
     config = replace(graph_config, atoms=replace(graph_config.atoms, latents="atoms"))
     for paths, held in (([rigid], True), ([rigid, write(smiles("CCO"), "ethanol")], False)):
         sets = collect_sets(paths)
-        assert [holds_hydrogens(frames) for frames in sets.trained] == ([True] if held else [True, False])
+        assert [holds_hydrogens(f.scene, f.some_nm(100)) for f in sets.trained] == ([True] if held else [True, False])
         out = train_lam_slide(sets, tmp_path / f"{held}.safetensors", config, QUICK)
         weights = load_weights(out)
         assert weights.model.config.atoms.rigid_hydrogens is held

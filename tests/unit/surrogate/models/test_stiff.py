@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
-from surrogate.data.features.stiff_terms import drawn_terms, plan_terms, rigid_hydrogens, rigid_terms
+from surrogate.data.features.stiff_terms import LOOKED_AT, drawn_terms, plan_terms, rigid_hydrogens, rigid_terms
 from surrogate.data.frames import TrainingFrames, quantise
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights, save_weights
@@ -62,6 +62,10 @@ def terms(reference: TrainingFrames) -> StiffTerms:
     return drawn_terms(reference)
 
 
+def _looked_at(frames: TrainingFrames) -> tuple[Scene, np.ndarray]:
+    return frames.scene, frames.some_nm(LOOKED_AT)
+
+
 def _off(terms: StiffTerms, x: Tensor) -> Tensor:
     lengths, angles, turns = terms.tree.measure(x)
     found = terms.tree.deviation(terms.tree.terms(lengths, angles, turns), terms.numbers["rest"])
@@ -79,7 +83,7 @@ def test_torsions_of_the_tree_are_those_of_the_backbone(alanine_dipeptide: Scene
 def test_too_narrow_frames_get_the_width_and_keep_their_torsions(
     reference: TrainingFrames, terms: StiffTerms, alanine_dipeptide: Scene
 ) -> None:
-    assert sorted(terms.plan.rigid) == sorted(rigid_hydrogens(reference)) and len(terms.plan.rigid) == 12
+    assert sorted(terms.plan.rigid) == sorted(rigid_hydrogens(*_looked_at(reference))) and len(terms.plan.rigid) == 12
     assert terms.imposed == (RIGID_BONDS, BONDS, ANGLES)
     narrow = _made(alanine_dipeptide, 0.5, 1)
     drawn = terms.apply(narrow[None], [5])[0]
@@ -122,7 +126,7 @@ def test_a_frame_that_is_none_of_the_ensemble_stays_for_the_guards(
 
 
 def test_rigid_bonds_alone_move_hydrogens_alone(reference: TrainingFrames, alanine_dipeptide: Scene) -> None:
-    terms = rigid_terms(reference)
+    terms = rigid_terms(*_looked_at(reference))
     assert terms is not None and terms.imposed == (RIGID_BONDS,)
     shaken = _made(alanine_dipeptide, 1.0, 4)[:50]
     shaken = shaken + 0.0008 * torch.randn(
@@ -139,7 +143,7 @@ def test_rigid_bonds_alone_move_hydrogens_alone(reference: TrainingFrames, alani
 
 
 def test_a_reference_without_rigid_bonds_has_none(harmonic_frames: TrainingFrames) -> None:
-    assert rigid_terms(harmonic_frames) is None
+    assert rigid_terms(*_looked_at(harmonic_frames)) is None
     assert drawn_terms(harmonic_frames).imposed == (BONDS, ANGLES)
 
 
