@@ -195,7 +195,7 @@ def test_files_that_cannot_be_meant_are_refused_in_one_line(alanine: Path, tmp_p
         with pytest.raises(InputError, match=said):
             explained([alanine], config=config)
     refused = run("train", str(alanine), "--steps", "4")
-    assert refused.exit_code == 2 and "-o w.safetensors" in refused.stderr
+    assert refused.exit_code == 2 and "train needs --out" in refused.stderr
 
 
 def test_a_record_comes_back_from_its_toml() -> None:
