@@ -302,12 +302,15 @@ def info(
         Path,
         typer.Argument(metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's folder."),
     ],
+    scene: Annotated[
+        str | None, typer.Argument(metavar="SCENE", help="Of weights: say whether they cover it, and how nearly.")
+    ] = None,
     as_json: JsonOpt = False,
 ) -> None:
-    """What a file is and where it came from."""
+    """What a file is and where it came from; of weights and a scene, whether they cover it."""
     from surrogate import api
 
-    found = api.info(path)
+    found = api.info(path, scene)
     if as_json:
         print_json(found)
     else:

@@ -9,23 +9,44 @@ from typing import Any
 from surrogate.data.shipped import shipped_weights
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.options import PathLike
-from systems.errors import InputError
+from systems.errors import InputError, OutOfDomainError
 from systems.units import format_time_ps
 
 UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
 
 
-def info(path: PathLike) -> dict[str, Any]:
+def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
     """Return what a trajectory, a windows or weights file or a campaign's folder is and where it came from (JSON-able).
     Shipped weights may be given by name.
 
-    Raises InputError when there is no such file, TrajectoryError or WeightsError when it is damaged.
+    `scene`: anything that a rollout takes; of weights it is then said whether they cover it, and how near what they
+    were trained on comes to it. Raises InputError when there is no such file, or `scene` is asked of other files,
+    TrajectoryError or WeightsError when it is damaged.
     """
-    if not Path(path).exists():
-        return describe_file(shipped_weights().get(str(path), Path(path)))
-    if Path(path).is_dir():
-        return describe_campaign(Path(path))
-    return describe_file(Path(path))
+    named = Path(path) if Path(path).exists() else shipped_weights().get(str(path), Path(path))
+    if scene is not None:
+        if named.suffix.lower() != ".safetensors":
+            raise InputError(f"{path} is no weights file; what covers {scene} can be asked of weights alone.")
+        return _coverage(named, scene)
+    return describe_campaign(named) if named.is_dir() else describe_file(named)
+
+
+def _coverage(path: Path, scene: str) -> dict[str, Any]:
+    from surrogate.data.weights import load_weights
+    from surrogate.sampling.domain import match_domain
+    from systems.source import prepare
+
+    weights, prepared = load_weights(path), prepare(scene)
+    try:
+        match = match_domain(prepared, weights, force=True)
+    except OutOfDomainError as error:
+        return {"scene": prepared.name, "covered": "no", "reason": str(error)}
+    return {
+        "scene": prepared.name,
+        "covered": "only with force" if match.deviations else "yes",
+        "training": "trained on this molecule" if match.seen else f"never saw this molecule; {match.nearness}",
+        **({"reason": "; ".join(f"{d.what}: {d.reason}" for d in match.deviations)} if match.deviations else {}),
+    }
 
 
 def describe_file(path: Path) -> dict[str, Any]:

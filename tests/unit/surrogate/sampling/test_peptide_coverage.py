@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from surrogate import api
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
@@ -19,7 +20,7 @@ from surrogate.models.peptides.trainer import _with_scale, normalise
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.provenance import training_domain
-from systems.errors import OutOfDomainError
+from systems.errors import InputError, OutOfDomainError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.selection import reordered
@@ -101,6 +102,17 @@ def test_longer_and_strained_peptides_roll_when_forced(weights: Weights) -> None
     scene = build_peptide("ACE-SER-ALA-NME")
     strained = scene.with_positions(1.5 * scene.positions_nm)
     assert [d.what for d in find_deviations(strained, weights.domain, model=weights.model)] == ["start"]
+
+
+def test_info_says_how_near_training_comes(weights: Weights) -> None:
+    unseen = api.info(weights.path, "sequence:ACE-SER-ALA-NME")
+    assert unseen["covered"] == "yes" and "SER-ALA" in unseen["training"] and "reason" not in unseen
+    assert "trained on this molecule" in api.info(weights.path, "sequence:ACE-ALA-SER-NME")["training"]
+    longer = api.info(weights.path, "sequence:ACE-SER-ALA-SER-NME")
+    assert longer["covered"] == "only with force" and "3 amino acids" in longer["reason"]
+    assert api.info(weights.path, "sequence:ACE-GLY-NME")["covered"] == "no"
+    with pytest.raises(InputError, match="no weights file"):
+        api.info(Path(__file__), "sequence:ACE-GLY-NME")
 
 
 def test_an_unseen_peptide_rolls_in_the_order_of_its_file(weights: Weights, tmp_path: Path) -> None:
