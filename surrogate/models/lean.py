@@ -15,11 +15,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.layers import KeysValues, ParallelBlock, attend, gelu
+from surrogate.models.layers import CrossAttentionBlock, KeysValues, ParallelBlock, attend, gelu
 
 _Model = TypeVar("_Model", bound=nn.Module)
 # Rows that packed weights are laid out for: those of a single replica, where the layout matters most.
 _ROWS = 32
+# Vectors to read from, up to which products of single heads are too small to be fast.
+_FEW = 8
 
 
 def with_lean_parts(model: _Model) -> _Model:
@@ -32,6 +34,8 @@ def with_lean_parts(model: _Model) -> _Model:
         for name, child in list(parent.named_children()):
             if isinstance(child, ParallelBlock):
                 setattr(parent, name, LeanBlock(child))
+            elif isinstance(child, CrossAttentionBlock):
+                setattr(parent, name, LeanCrossBlock(child))
             elif isinstance(child, nn.GELU):
                 setattr(parent, name, _Gelu())
             elif isinstance(child, nn.Linear) and _has_lean_form(child):
@@ -42,7 +46,7 @@ def with_lean_parts(model: _Model) -> _Model:
 def _has_lean_form(module: nn.Module) -> bool:
     if isinstance(module, nn.Linear):
         return module.weight.dtype == torch.bfloat16
-    return isinstance(module, ParallelBlock)
+    return isinstance(module, ParallelBlock | CrossAttentionBlock)
 
 
 class PackedLinear(nn.Module):
@@ -123,6 +127,45 @@ class LeanBlock(nn.Module):
         out = torch.empty(2, rows, self.n_heads, length, head_dim, dtype=self.dtype, device=qk.device)
         out.copy_(qk.permute(2, 0, 3, 1, 4))
         return cast(tuple[Tensor, Tensor], out.unbind(0))
+
+
+class LeanCrossBlock(nn.Module):
+    """`layers.CrossAttentionBlock` as it is evaluated: of few vectors, all heads read in one product."""
+
+    own_head: Tensor
+
+    def __init__(self, block: CrossAttentionBlock) -> None:
+        super().__init__()
+        self.block = block
+        self.register_buffer("own_head", torch.eye(block.n_heads)[None, None, :, :, None], persistent=False)
+
+    def forward(self, x: Tensor, context: Tensor, key_mask: Tensor | None = None) -> Tensor:
+        """See `CrossAttentionBlock.forward`; `x` may be one row (1, n, width) for all of the context."""
+        block = self.block
+        if key_mask is not None or not 1 < context.shape[-2] <= _FEW:
+            return cast(Tensor, block(x, context, key_mask))
+        normed = block.norm(x)
+        k, v = block.kv(context).chunk(2, dim=-1)
+        attended = self._read(block.q(normed), k, v)
+        if block.gate is not None:
+            attended = attended * block.gate(normed)
+        x = x + block.out(attended)
+        return cast(Tensor, x + block.mlp(x))
+
+    def _read(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Queries `(b or 1, n, numbers)`, keys and values `(b, m, numbers)` of all heads -> `(b, n, numbers)`."""
+        batch, m, numbers = k.shape
+        q = q.expand(batch, -1, -1)
+        n_heads = self.block.n_heads
+        scores = self._apart(k * (numbers // n_heads) ** -0.5) @ q.transpose(1, 2)
+        shares = torch.softmax(scores.view(batch, m, -1), 1, dtype=torch.float32).to(v.dtype)
+        return shares.view(batch, m * n_heads, -1).transpose(1, 2) @ self._apart(v)
+
+    def _apart(self, z: Tensor) -> Tensor:
+        """`(b, m, numbers)` -> `(b, m heads, numbers)`: a row for each head, all but its own numbers zero."""
+        batch, m, numbers = z.shape
+        rows = z.view(batch, m, 1, self.block.n_heads, -1) * self.own_head.to(z.dtype)
+        return rows.view(batch, -1, numbers)
 
 
 class _Gelu(nn.Module):

@@ -17,6 +17,7 @@ from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.models.lean import with_lean_parts
 from surrogate.models.precision import choose_precision
+from surrogate.sampling.memory import keep_freed_memory
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
 
@@ -52,6 +53,7 @@ class ChunkSampler:
         compile: bool = False, stiff: str | None = None,
     ) -> None:  # fmt: skip
         model, template = weights.model, weights.domain.scene
+        keep_freed_memory()
         known = model.solvers
         if solver is not None and solver not in known:
             raise InputError(

@@ -26,8 +26,6 @@ from systems.imposed import RIGID_BONDS
 # Redraws of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much
 # as all others.
 MAX_REDRAWS = 12
-# Atoms decoded at once: so many that their hidden layer stays in a core's cache.
-_DECODED_AT_ONCE = 1024
 
 
 def code_of(config: LamSlideConfig) -> Code:
@@ -163,9 +161,7 @@ class LamSlide(Surrogate):
         z = latents.reshape(-1, *latents.shape[-2:]) * self.latent_scale + self.latent_mean
         if atoms is None:
             # Identifiers are those of all frames: what follows from them alone is computed once.
-            identifiers = self.identifiers(n_atoms)[None]
-            at_once = len(z) if torch.is_grad_enabled() else max(1, _DECODED_AT_ONCE // n_atoms)
-            x = torch.cat([self.autoencoder.decode(part, identifiers).positions for part in z.split(at_once)])
+            x = self.autoencoder.decode(z, self.identifiers(n_atoms)[None]).positions
         else:
             each = atoms.spread(lead)
             x = self.autoencoder.decode(z, each.tags).positions + each.template

@@ -56,7 +56,8 @@ def test_the_first_batch_alone_is_compiled(small_weights: Weights, rows_compiled
     whole = sampler.draw(last, [1, 2, 3]).frames_nm
     one = sampler.draw(last[:1], [1]).frames_nm
     assert rows_compiled == [3, 3], "two steps of the whole batch, none of the row drawn again"
-    assert np.array_equal(whole, plain.draw(last, [1, 2, 3]).frames_nm)
+    # The compiled networks are the plain ones, those of a plain rollout their lean form (models.lean): rounding apart.
+    assert np.allclose(whole, plain.draw(last, [1, 2, 3]).frames_nm, atol=1e-5)
     assert np.array_equal(one, plain.draw(last[:1], [1]).frames_nm)
     assert not any(type(module).__name__ == "Compiled" for module in small_weights.model.modules())
 
