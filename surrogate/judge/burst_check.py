@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from surrogate.judge.measure import msm
 from surrogate.judge.measure.slow_motion import tica_features
-from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.measure.structure import Yardstick
 from surrogate.judge.read.ensemble import Ensemble
 from systems.errors import InputError
 
@@ -82,8 +82,7 @@ class States:
     def __init__(self, candidate: Ensemble, lag_ps: float) -> None:
         """Raises InputError where the molecule has no torsion, or the candidate is too short, to tell states apart."""
         self._candidate = candidate
-        self._geometry, self._probes = reference_geometry(candidate), reference_probes(candidate)
-        self._torsions = backbone(candidate.scene)
+        self._yardstick = Yardstick.of(candidate)
         self.lag = max(1, round(lag_ps / candidate.lag_ps))
         self.lag_ps = self.lag * candidate.lag_ps
         features = self._features(candidate)
@@ -102,7 +101,7 @@ class States:
         self.of_candidate = model.lump(model.assign(coordinates))
 
     def _features(self, ensemble: Ensemble) -> list[FloatArray]:
-        return tica_features(measure(ensemble, self._torsions, self._geometry, self._probes))
+        return tica_features(self._yardstick.measure(ensemble))
 
     def of(self, frames_nm: npt.NDArray[np.floating]) -> IntArray:
         """Return the states `(n,)` of frames `(n, n_atoms, 3)` nm, -1 for those in none."""

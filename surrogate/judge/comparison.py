@@ -13,15 +13,8 @@ from surrogate.judge import remarks, verdict
 from surrogate.judge.measure.movie import Movie, make_movie
 from surrogate.judge.measure.slow_motion import longest_correlation
 from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
-from surrogate.judge.measure.structure import (
-    Backbone,
-    Features,
-    backbone,
-    measure,
-    reference_geometry,
-    reference_probes,
-)
-from surrogate.judge.read.ensemble import Ensemble, equal_lags, on_common_atoms
+from surrogate.judge.measure.structure import Backbone, Features, Yardstick
+from surrogate.judge.read.ensemble import Ensemble, alike
 from surrogate.judge.rows import curves, metrics
 from surrogate.judge.rows.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.rows.charts import Chart
@@ -29,7 +22,7 @@ from surrogate.judge.rows.curves import Curves
 from surrogate.judge.rows.imposed_rows import imposed_notes
 from surrogate.judge.rows.intervention_rows import intervention_rows
 from surrogate.judge.rows.motion import relaxation_rows
-from surrogate.judge.rows.motion.forecast import forecast_charts
+from surrogate.judge.rows.motion.forecast import find_pairs, forecast_charts
 from surrogate.judge.rows.motion.lifetimes import lifetime_rows
 from surrogate.judge.rows.motion.msm_rows import msm_rows
 from surrogate.judge.rows.motion.peptide_protocol import peptide_charts
@@ -53,6 +46,8 @@ from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import format_time_ps
 
+# Frames whose bonds tell whether a topology fits.
+_FRAMES_FOR_BONDS = 20
 # Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
 Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
 ROOMS: tuple[Room, ...] = (
@@ -180,27 +175,25 @@ def compare(
         raise InputError("Nothing to compare with the reference: give at least one trajectory.")
     chosen = options or Options()
     stage = scene or reference.scene
-    everyone, kept = on_common_atoms([reference, *candidates, *([] if replicate is None else [replicate])])
+    everyone = [reference, *candidates, *([] if replicate is None else [replicate])]
+    thinned, kept = alike(everyone)
     # Torsions and rings are found in the whole molecule; only hydrogens or side chains may be missing.
-    whole, stage = stage, stage if kept is None else everyone[0].scene
-    for ensemble in everyone:
+    whole, stage = stage, stage if kept is None else thinned[0].scene
+    for ensemble in thinned:
         if ensemble.scene.elements != stage.elements:
             raise InputError(f"{ensemble.label}: its atoms are not those of {stage.name!r} in the same order.")
-    thinned = equal_lags(everyone)
-    refuse_wrong_topology(thinned[0])
-    if replicate is not None:
-        refuse_wrong_topology(thinned[-1])
-    torsions = backbone(whole, kept)
-    geometry = reference_geometry(thinned[0])
-    probes = reference_probes(thinned[0], parent=whole, kept=kept)
-    measured = [measure(e, torsions, geometry, probes) for e in thinned]
+    floor = None if replicate is None else thinned[-1]
+    for ensemble in thinned[:1] if floor is None else (thinned[0], floor):
+        refuse_wrong_topology(ensemble.label, stage, ensemble.sample(_FRAMES_FOR_BONDS))
+    yardstick = Yardstick.of(thinned[0], parent=whole, kept=kept)
+    measured = [yardstick.measure(e) for e in thinned]
     if energy_fn is not None and kept is None:
         measured = [
             replace(m, energy_kj=measure_energies(e, energy_fn)) for m, e in zip(measured, thinned, strict=True)
         ]
     notes = [note for e in thinned for note in e.notes]
     for rolled in thinned[1 : 1 + len(candidates)]:
-        long, said = bonds_that_are_none(rolled)
+        long, said = bonds_that_are_none(stage, rolled.sample(_FRAMES_FOR_BONDS))
         notes += [f"{rolled.label}: {said}; does its topology fit its coordinates?"] if long else []
     notes += jumps(measured)
     truth = measured[0]
@@ -219,16 +212,18 @@ def compare(
         temperature = 300.0
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     accounts = [account_of(e) for e in everyone]
-    floor = None if replicate is None else thinned[-1]
-    setting = _Setting(stage, torsions, geometry, truth, other, chosen, float(temperature), accounts[0])
+    beside = None if floor is None else find_pairs(thinned[0], floor)
+    setting = _Setting(
+        stage, yardstick.torsions, yardstick.geometry, truth, other, chosen, float(temperature), accounts[0]
+    )
     judgements = tuple(
         _with_forecast(
             _judge(setting, features, account),
-            *forecast_charts(thinned[0], rolled, floor),
+            *forecast_charts(find_pairs(thinned[0], rolled), beside, thinned[0].lag_ps),
         )
         for features, account, rolled in zip(measured[1:], accounts[1:], thinned[1 : 1 + len(candidates)], strict=False)
     )
-    notes += [f"Validity check left out: {x}." for x in geometry.excluded]
+    notes += [f"Validity check left out: {x}." for x in yardstick.geometry.excluded]
     return Comparison(
         scene_name=stage.name,
         formula=stage.formula,

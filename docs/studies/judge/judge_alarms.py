@@ -150,15 +150,15 @@ def count_intervals(runs: Sequence[Ensemble], piece_ps: float) -> Intervals:
     from surrogate.judge.measure.kinetics import zero_crossing
     from surrogate.judge.measure.slow_motion import longest_correlation
     from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
-    from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+    from surrogate.judge.measure.structure import Yardstick
     from surrogate.judge.rows.motion.relaxation_rows import relaxation_of, turning
     from surrogate.judge.rows.rows import Options, make_sample
 
-    torsions, geometry, probes = backbone(runs[0].scene), reference_geometry(runs[0]), reference_probes(runs[0])
+    yardstick = Yardstick.of(runs[0])
     n, lag_ps = round(piece_ps / runs[0].lag_ps), runs[0].lag_ps
     pieces = []
     for run in runs:
-        whole = measure(run, torsions, geometry, probes)
+        whole = yardstick.measure(run)
         pieces += [whole.frames(start, start + n) for start in range(0, whole.n_frames - n + 1, n)]
     shares = np.array([_quarters(piece) for piece in pieces])
     held_by_all = shares.mean(axis=0) >= _SEEN_SHARE
@@ -178,7 +178,7 @@ def count_intervals(runs: Sequence[Ensemble], piece_ps: float) -> Intervals:
                     asked += 1
                     held += found.low <= truth * lag_ps <= found.high
     times = [lag_ps * zero_crossing([x for m in moving for x in m[k][2]])[1] for k in range(len(moving[0]))]
-    names = [label or torsions.psi_labels[k] for k, (_, label, _) in enumerate(moving[0])]
+    names = [label or yardstick.torsions.psi_labels[k] for k, (_, label, _) in enumerate(moving[0])]
     return Intervals(asked, held, int((~met).sum()), dict(zip(names, times, strict=True)))
 
 

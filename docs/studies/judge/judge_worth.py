@@ -46,15 +46,16 @@ def calibrate(
 
     Raises InputError for fewer than three runs, or runs without φ and ψ.
     """
-    from surrogate.judge.measure.structure import backbone, measure, reference_geometry
+    from surrogate.judge.measure.structure import Yardstick
     from surrogate.judge.worth import worth_by
     from surrogate.judge.worth_measures import joint_measure
 
     if len(runs) < _LEAST_RUNS:
         raise InputError(f"{len(runs)} runs: a reference, a replicate and one to cut candidates from are needed.")
-    torsions, geometry = backbone(runs[0].scene), reference_geometry(runs[0])
+    yardstick = Yardstick.of(runs[0], probing=False)
+    torsions = yardstick.torsions
     # The map needs phi and psi alone: contacts and the like of a million frames take an hour.
-    reference, replicate, *others = (measure(run, torsions, geometry) for run in runs)
+    reference, replicate, *others = (yardstick.measure(run) for run in runs)
     n_truth = round(min(truth_ps, reference.total_ps) / runs[0].lag_ps)
     reference, replicate = reference.frames(0, n_truth), replicate.frames(0, n_truth)
     found = []

@@ -14,13 +14,13 @@ from surrogate.bench.stress.frame_statistics import HALF_ANGSTROM_RULE, measure_
 from surrogate.judge.measure.distributions import block_occupancy
 from surrogate.judge.measure.slow_motion import longest_correlation
 from surrogate.judge.measure.statistics import block_length, estimate, make_blocks
-from surrogate.judge.measure.structure import Backbone, Features, backbone, measure, reference_geometry
+from surrogate.judge.measure.structure import Features, Yardstick, backbone
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
 from surrogate.judge.rows.motion.relaxation_rows import relaxation_of
 from surrogate.judge.rows.rows import Options, Sample, make_sample
 from surrogate.judge.worth import Worth, distance_to_truth, errors_by_length, worth_by
 from surrogate.judge.worth_measures import joint_measure
-from systems.chemistry.validity import BOND_20_PERCENT, INVALID, NOT_FINITE, Geometry
+from systems.chemistry.validity import BOND_20_PERCENT, INVALID, NOT_FINITE
 from systems.errors import InputError
 from systems.scene import Scene
 
@@ -36,8 +36,7 @@ class Truth:
     """Held-out reference and its replicate, measured once. `length_ps`: of each, as far as they are compared."""
 
     scene: Scene
-    torsions: Backbone
-    geometry: Geometry
+    yardstick: Yardstick
     reference: Features
     replicate: Features
 
@@ -48,12 +47,11 @@ class Truth:
 
 def read_truth(scene: Scene, reference: Sequence[Path], replicate: Sequence[Path]) -> Truth:
     """Measure two held-out runs of `scene`, atoms in its order. Raises InputError for a scene without φ and ψ."""
-    torsions = backbone(scene)
-    if not torsions.residues:
+    if not backbone(scene).residues:
         raise InputError(f"{scene.name} has no residue with φ and ψ, by whose map errors are measured here.")
     first, second = (load_ensemble(paths, template=scene) for paths in (reference, replicate))
-    geometry = reference_geometry(first)
-    return Truth(scene, torsions, geometry, measure(first, torsions, geometry), measure(second, torsions, geometry))
+    yardstick = Yardstick.of(first, probing=False)
+    return Truth(scene, yardstick, yardstick.measure(first), yardstick.measure(second))
 
 
 def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[str, Any], Worth]:
@@ -65,8 +63,8 @@ def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[s
     with intervals are dictionaries of `judge.statistics.Estimate`. Raises InputError where frames are too few.
     """
     rolled = Ensemble("rollout", [x.astype(np.float32) for x in frames], truth.reference.lag_ps, truth.scene)
-    features = measure(rolled, truth.torsions, truth.geometry)
-    found = joint_measure(truth.reference, features, truth.replicate, truth.torsions)
+    features = truth.yardstick.measure(rolled)
+    found = joint_measure(truth.reference, features, truth.replicate, truth.yardstick.torsions)
     worth = None if found is None else worth_by(*found, seed)
     if found is None or worth is None:
         raise InputError("too few frames to tell an error; give longer references, or a longer `time_ps`.")
@@ -77,7 +75,7 @@ def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[s
         "curve": np.stack(errors_by_length(found[0], features.total_ps), axis=1).tolist(),
         "correlation": correlation.to_dict(),
         "relaxation_ps": relaxation.to_dict(),
-        **measure_bonds(np.concatenate(list(frames)), truth.geometry),
+        **measure_bonds(np.concatenate(list(frames)), truth.yardstick.geometry),
     }
     for key, mask in CHECKS.items():
         inside, total = block_occupancy([(f & mask) == 0 for f in features.flags], sample.blocks)
@@ -89,7 +87,7 @@ def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[s
 def judge_truth(truth: Truth, *, seed: int = 0) -> dict[str, Any]:
     """Return what stands beside the rollouts: the errors of MD of each length, the floor (the two runs against each
     other), and the reference's own autocorrelation and relaxation time."""
-    found = joint_measure(truth.reference, truth.replicate, truth.replicate, truth.torsions)
+    found = joint_measure(truth.reference, truth.replicate, truth.replicate, truth.yardstick.torsions)
     worth = None if found is None else worth_by(*found, seed)
     if worth is None:
         raise InputError("the references are too short to tell the error of MD; give longer ones.")

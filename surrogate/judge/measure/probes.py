@@ -1,6 +1,6 @@
 """What is measured beside phi, psi, bonds and validity: index arrays and names, found once per comparison.
 
-`find_probes` looks at the scene and at a sample of the reference; `measure_block` measures frames with the result.
+`find_probes` looks at the scene and at a sample of the reference; `Probes.measure` measures frames with the result.
 """
 
 from __future__ import annotations
@@ -90,6 +90,54 @@ class Probes:
         }
         return made[family]()
 
+    def measure(self, frames_nm: npt.NDArray[np.float32]) -> dict[Family, npt.NDArray[Any]]:
+        """Return every family for frames `(n, n_atoms, 3)` nm."""
+        from systems.chemistry.geometry import superpose
+
+        n = len(frames_nm)
+        out: dict[Family, npt.NDArray[Any]] = {
+            "torsions": np.empty((n, len(self.torsions)), dtype=np.float32),
+            "angles": np.empty((n, len(self.angles)), dtype=np.float32),
+            "shape": np.full((n, 5), np.nan, dtype=np.float32),
+            "deviation": np.empty((n, len(self.fit_idx)), dtype=np.float32),
+            "contacts": np.zeros((n, len(self.contacts)), dtype=bool),
+            "hydrogen_bonds": np.zeros((n, len(self.hydrogen_bonds)), dtype=bool),
+            "puckers": np.empty((n, 2 * len(self.rings)), dtype=np.float32),
+            "secondary": secondary.secondary_structure(frames_nm, self.chains),
+        }
+        quads = np.array([q for t in self.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
+        of_torsion = np.repeat(np.arange(len(self.torsions)), [len(t.equal) or 1 for t in self.torsions])
+        masses = self.scene.masses_da / max(float(self.scene.masses_da.sum()), 1e-9)
+        widest = _widest(self.all_contacts, self.hydrogen_bonds, self.angles)
+        with np.errstate(invalid="ignore", over="ignore"):
+            moved = superpose(frames_nm[:, self.fit_idx], self.mean_nm)
+            squared = ((moved - self.mean_nm.astype(np.float32)) ** 2).sum(axis=2)
+            out["deviation"][:] = squared
+            out["shape"][:, 1] = np.sqrt(squared.mean(axis=1))
+            for start, x in column_blocks(frames_nm, widest):
+                part = slice(start, start + x.shape[2])
+                angles = torsion_angle(x, quads)
+                for k, torsion in enumerate(self.torsions):
+                    out["torsions"][part, k] = _folded(angles[of_torsion == k], torsion.fold)
+                out["angles"][part] = bond_angle(x, self.angles).T
+                out["hydrogen_bonds"][part] = hydrogen_bonds.is_formed(x, self.hydrogen_bonds).T
+                out["contacts"][part] = (squared_distance(x, self.contacts) < self.contact_nm**2).T
+                centre = np.einsum("a,xan->xn", masses, x)
+                out["shape"][part, 0] = np.sqrt(np.einsum("a,xan->n", masses, (x - centre[:, None]) ** 2))
+                if self.ends is not None:
+                    out["shape"][part, 2] = np.sqrt(squared_distance(x, np.array([self.ends]))[0])
+                near = squared_distance(x, self.all_contacts) < self.contact_nm**2
+                out["shape"][part, 3] = near.sum(axis=0)
+                if len(self.native):
+                    out["shape"][part, 4] = near[self.native].mean(axis=0)
+                for k, ring in enumerate(self.rings):
+                    out["puckers"][part, 2 * k : 2 * k + 2] = puckers.pucker(x, ring).T
+        broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
+        if broken.any():
+            for values in out.values():
+                values[broken] = np.nan if values.dtype.kind == "f" else 0
+        return out
+
 
 def find_probes(
     scene: Scene, sample_nm: FloatArray, *, parent: Scene | None = None, kept: IntArray | None = None
@@ -143,55 +191,6 @@ def find_probes(
         left_out=tuple(left_out),
         whole=kept is None,
     )
-
-
-def measure_block(frames_nm: npt.NDArray[np.float32], probes: Probes) -> dict[Family, npt.NDArray[Any]]:
-    """Return every family of `Probes` for frames `(n, n_atoms, 3)` nm."""
-    from systems.chemistry.geometry import superpose
-
-    n = len(frames_nm)
-    out: dict[Family, npt.NDArray[Any]] = {
-        "torsions": np.empty((n, len(probes.torsions)), dtype=np.float32),
-        "angles": np.empty((n, len(probes.angles)), dtype=np.float32),
-        "shape": np.full((n, 5), np.nan, dtype=np.float32),
-        "deviation": np.empty((n, len(probes.fit_idx)), dtype=np.float32),
-        "contacts": np.zeros((n, len(probes.contacts)), dtype=bool),
-        "hydrogen_bonds": np.zeros((n, len(probes.hydrogen_bonds)), dtype=bool),
-        "puckers": np.empty((n, 2 * len(probes.rings)), dtype=np.float32),
-        "secondary": secondary.secondary_structure(frames_nm, probes.chains),
-    }
-    quads = np.array([q for t in probes.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
-    of_torsion = np.repeat(np.arange(len(probes.torsions)), [len(t.equal) or 1 for t in probes.torsions])
-    masses = probes.scene.masses_da / max(float(probes.scene.masses_da.sum()), 1e-9)
-    widest = _widest(probes.all_contacts, probes.hydrogen_bonds, probes.angles)
-    with np.errstate(invalid="ignore", over="ignore"):
-        moved = superpose(frames_nm[:, probes.fit_idx], probes.mean_nm)
-        squared = ((moved - probes.mean_nm.astype(np.float32)) ** 2).sum(axis=2)
-        out["deviation"][:] = squared
-        out["shape"][:, 1] = np.sqrt(squared.mean(axis=1))
-        for start, x in column_blocks(frames_nm, widest):
-            part = slice(start, start + x.shape[2])
-            angles = torsion_angle(x, quads)
-            for k, torsion in enumerate(probes.torsions):
-                out["torsions"][part, k] = _folded(angles[of_torsion == k], torsion.fold)
-            out["angles"][part] = bond_angle(x, probes.angles).T
-            out["hydrogen_bonds"][part] = hydrogen_bonds.is_formed(x, probes.hydrogen_bonds).T
-            out["contacts"][part] = (squared_distance(x, probes.contacts) < probes.contact_nm**2).T
-            centre = np.einsum("a,xan->xn", masses, x)
-            out["shape"][part, 0] = np.sqrt(np.einsum("a,xan->n", masses, (x - centre[:, None]) ** 2))
-            if probes.ends is not None:
-                out["shape"][part, 2] = np.sqrt(squared_distance(x, np.array([probes.ends]))[0])
-            near = squared_distance(x, probes.all_contacts) < probes.contact_nm**2
-            out["shape"][part, 3] = near.sum(axis=0)
-            if len(probes.native):
-                out["shape"][part, 4] = near[probes.native].mean(axis=0)
-            for k, ring in enumerate(probes.rings):
-                out["puckers"][part, 2 * k : 2 * k + 2] = puckers.pucker(x, ring).T
-    broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
-    if broken.any():
-        for values in out.values():
-            values[broken] = np.nan if values.dtype.kind == "f" else 0
-    return out
 
 
 def _folded(angles_rad: FloatArray, fold: int) -> FloatArray:

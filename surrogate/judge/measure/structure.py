@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.probes import FAMILIES, Family, Probes, find_probes, measure_block
+from surrogate.judge.measure.probes import FAMILIES, Family, Probes, find_probes
 from surrogate.judge.read.ensemble import Ensemble, Flags, InSegments
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
@@ -127,75 +127,80 @@ def backbone(scene: Scene, kept: IntArray | None = None) -> Backbone:
     return Backbone(phi, psi, *labels, residues)
 
 
-def sample_frames(ensemble: Ensemble, n_frames: int) -> npt.NDArray[np.float32]:
-    """Return about `n_frames` finite frames spread evenly over an ensemble (fewer of very large scenes)."""
-    wanted = max(min(n_frames, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 10)
-    stride = max(1, -(-ensemble.n_frames // wanted))
-    frames = np.concatenate([s[::stride] for s in ensemble.segments])
-    return frames[np.isfinite(frames).all(axis=(1, 2))]
+@dataclass(frozen=True, eq=False)
+class Yardstick:
+    """What every frame of a comparison is measured by: torsions of the backbone, what valid frames look like, and what
+    else is measured, `probes`, None for nothing."""
 
+    torsions: Backbone
+    geometry: Geometry
+    probes: Probes | None
 
-def reference_geometry(reference: Ensemble) -> Geometry:
-    """Return what valid frames look like, learned from at most 20,000 frames spread over the reference."""
-    from systems.chemistry.validity import geometry_from_frames
+    @staticmethod
+    def of(
+        reference: Ensemble, *, parent: Scene | None = None, kept: IntArray | None = None, probing: bool = True
+    ) -> Yardstick:
+        """Return the yardstick that a reference gives: geometry from at most 20,000 of its frames, probes (where
+        `probing`) chosen on at most 2,000. `parent`, `kept`: see `backbone` and `find_probes`."""
+        from systems.chemistry.validity import geometry_from_frames
 
-    return geometry_from_frames(reference.scene, sample_frames(reference, _GEOMETRY_FRAMES))
+        scene = reference.scene
+        probes = None
+        if probing:
+            probes = find_probes(scene, reference.sample(_PROBE_FRAMES), parent=parent, kept=kept)
+        geometry = geometry_from_frames(scene, reference.sample(_GEOMETRY_FRAMES))
+        return Yardstick(backbone(parent or scene, kept), geometry, probes)
 
+    def measure(self, ensemble: Ensemble) -> Features:
+        """Measure every frame of `ensemble`, block by block: no more than a block of positions is held at a time."""
+        from systems.chemistry.frame_columns import column_blocks, squared_distance, torsion_angle
+        from systems.chemistry.validity import check_frames
 
-def reference_probes(reference: Ensemble, *, parent: Scene | None = None, kept: IntArray | None = None) -> Probes:
-    """Return what else to measure, chosen on at most 2,000 frames of the reference; see `find_probes`."""
-    return find_probes(reference.scene, sample_frames(reference, _PROBE_FRAMES), parent=parent, kept=kept)
-
-
-def measure(ensemble: Ensemble, torsions: Backbone, geometry: Geometry, probes: Probes | None = None) -> Features:
-    """Measure every frame of `ensemble`, block by block: no more than a block of positions is held at a time."""
-    from systems.chemistry.frame_columns import column_blocks, squared_distance, torsion_angle
-    from systems.chemistry.validity import check_frames
-
-    bonds = np.asarray(geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
-    phi, psi, lengths, flags, moved = [], [], [], [], []
-    series: dict[Family, list[npt.NDArray[Any]]] = {family: [] for family in FAMILIES} if probes else {}
-    size = max(min(_BLOCK_FRAMES, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 1)
-    for segment in ensemble.segments:
-        n = len(segment)
-        phi.append(np.empty((n, len(torsions.phi)), dtype=np.float32))
-        psi.append(np.empty((n, len(torsions.psi)), dtype=np.float32))
-        lengths.append(np.empty((n, len(bonds)), dtype=np.float32))
-        flags.append(np.empty(n, dtype=np.uint16))
-        moved.append(np.full(n, np.nan, dtype=np.float32))
-        before = np.empty((0, ensemble.scene.n_atoms, 3), dtype=np.float32)
-        for start in range(0, n, size):
-            part = slice(start, min(start + size, n))
-            block = segment[part]
-            broken = ~np.isfinite(block).all(axis=(1, 2))
-            before = _moved(before, block, moved[-1][part])
-            with np.errstate(invalid="ignore", over="ignore"):
-                for first, x in column_blocks(block, max(len(bonds), 1)):
-                    rows = slice(start + first, start + first + x.shape[2])
-                    phi[-1][rows] = torsion_angle(x, torsions.phi).T
-                    psi[-1][rows] = torsion_angle(x, torsions.psi).T
-                    lengths[-1][rows] = np.sqrt(squared_distance(x, bonds)).T
-                flags[-1][part] = check_frames(block, geometry)
-            for column in (phi[-1], psi[-1], lengths[-1]):
-                column[part][broken] = np.nan
-            if probes is not None:
-                for family, values in measure_block(block, probes).items():
-                    if start == 0:
-                        series[family].append(np.empty((n, values.shape[1]), dtype=values.dtype))
-                    series[family][-1][part] = values
-    return Features(
-        ensemble.label,
-        ensemble.lag_ps,
-        phi,
-        psi,
-        lengths,
-        flags,
-        ensemble.chunk_idx,
-        series=series,
-        probes=probes,
-        changed=ensemble.changed,
-        moved_nm=moved,
-    )
+        torsions, geometry, probes = self.torsions, self.geometry, self.probes
+        bonds = np.asarray(geometry.bond_idx, dtype=np.int64).reshape(-1, 2)
+        phi, psi, lengths, flags, moved = [], [], [], [], []
+        series: dict[Family, list[npt.NDArray[Any]]] = {family: [] for family in FAMILIES} if probes else {}
+        size = max(min(_BLOCK_FRAMES, _BLOCK_VALUES // max(3 * ensemble.scene.n_atoms, 1)), 1)
+        for segment in ensemble.segments:
+            n = len(segment)
+            phi.append(np.empty((n, len(torsions.phi)), dtype=np.float32))
+            psi.append(np.empty((n, len(torsions.psi)), dtype=np.float32))
+            lengths.append(np.empty((n, len(bonds)), dtype=np.float32))
+            flags.append(np.empty(n, dtype=np.uint16))
+            moved.append(np.full(n, np.nan, dtype=np.float32))
+            before = np.empty((0, ensemble.scene.n_atoms, 3), dtype=np.float32)
+            for start in range(0, n, size):
+                part = slice(start, min(start + size, n))
+                block = segment[part]
+                broken = ~np.isfinite(block).all(axis=(1, 2))
+                before = _moved(before, block, moved[-1][part])
+                with np.errstate(invalid="ignore", over="ignore"):
+                    for first, x in column_blocks(block, max(len(bonds), 1)):
+                        rows = slice(start + first, start + first + x.shape[2])
+                        phi[-1][rows] = torsion_angle(x, torsions.phi).T
+                        psi[-1][rows] = torsion_angle(x, torsions.psi).T
+                        lengths[-1][rows] = np.sqrt(squared_distance(x, bonds)).T
+                    flags[-1][part] = check_frames(block, geometry)
+                for column in (phi[-1], psi[-1], lengths[-1]):
+                    column[part][broken] = np.nan
+                if probes is not None:
+                    for family, values in probes.measure(block).items():
+                        if start == 0:
+                            series[family].append(np.empty((n, values.shape[1]), dtype=values.dtype))
+                        series[family][-1][part] = values
+        return Features(
+            ensemble.label,
+            ensemble.lag_ps,
+            phi,
+            psi,
+            lengths,
+            flags,
+            ensemble.chunk_idx,
+            series=series,
+            probes=probes,
+            changed=ensemble.changed,
+            moved_nm=moved,
+        )
 
 
 def _moved(before: Series, block: Series, out: Series) -> Series:

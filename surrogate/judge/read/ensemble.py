@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ Flags = npt.NDArray[np.uint16]
 IntArray = npt.NDArray[np.int64]
 
 IN_MEMORY_BYTES = 128 * 2**20
+_LEAST_FRAMES = 10
+# Of a sample of frames, about as many numbers.
+_SAMPLED_VALUES = 20_000_000
 
 
 class InSegments:
@@ -93,6 +97,13 @@ class Ensemble(InSegments):
     @property
     def segment_lengths(self) -> list[int]:
         return [len(s) for s in self.segments]
+
+    def sample(self, n_frames: int) -> npt.NDArray[np.float32]:
+        """Return about `n_frames` finite frames `(n, n_atoms, 3)` nm, spread evenly (fewer of very large scenes)."""
+        wanted = max(min(n_frames, _SAMPLED_VALUES // max(3 * self.scene.n_atoms, 1)), 10)
+        stride = max(1, -(-self.n_frames // wanted))
+        frames = np.concatenate([s[::stride] for s in self.segments])
+        return frames[np.isfinite(frames).all(axis=(1, 2))]
 
     def strided(self, stride: int) -> Ensemble:
         """Return every `stride`-th frame of each segment, with the lag that follows."""
@@ -193,48 +204,47 @@ def load_ensemble(
     )
 
 
-def on_common_atoms(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
-    """Return the ensembles on the atoms that all of them hold, and which of the first's these are (None: all).
+def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
+    """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
+    interval; and which of the first's atoms these are (None: all).
 
     The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
-    are left.
+    are left, or when no common interval leaves 10 frames of each.
     """
-    reference = ensembles[0]
-    if all(e.kept is None for e in ensembles[1:]):
-        return list(ensembles), None
-    common = np.arange(reference.scene.n_atoms)
-    for ensemble in ensembles[1:]:
-        if ensemble.kept is not None:
-            common = np.intersect1d(common, ensemble.kept)
+    reference, out = ensembles[0], list(ensembles)
+    every = np.arange(reference.scene.n_atoms)
+    common = _common_atoms(every, [e.kept for e in out[1:]])
+    if common is not None:
+        scene = part_of(reference.scene, common)
+        held = [every if e is reference or e.kept is None else e.kept for e in out]
+        out = [e.restricted(np.searchsorted(atoms, common), scene) for e, atoms in zip(out, held, strict=True)]
+        note = f"Compared on the {len(common)} atoms that all trajectories hold, of {len(every)}."
+        out[0] = replace(out[0], notes=(*out[0].notes, note))
+    strides = _common_strides([e.lag_ps for e in out])
+    if any(e.n_frames // stride < _LEAST_FRAMES for e, stride in zip(out, strides, strict=True)):
+        intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in out)
+        raise InputError(
+            f"Save intervals have no common multiple short enough to compare at ({intervals}); "
+            "save again at a multiple of one another, or state the interval with `lag_ps`."
+        )
+    return [e.strided(stride) for e, stride in zip(out, strides, strict=True)], common
+
+
+def _common_atoms(every: IntArray, kept: Sequence[IntArray | None]) -> IntArray | None:
+    """Return those of the atoms that all keep, None where nobody leaves any out."""
+    parts = [atoms for atoms in kept if atoms is not None]
+    if not parts:
+        return None
+    common = reduce(np.intersect1d, parts, every)
     if len(common) < 3:
         raise InputError("The trajectories have fewer than three atoms in common; save more, or compare them apart.")
-    scene = part_of(reference.scene, common)
-    out = []
-    for ensemble in ensembles:
-        held = np.arange(reference.scene.n_atoms) if ensemble is reference or ensemble.kept is None else ensemble.kept
-        out.append(ensemble.restricted(np.searchsorted(held, common), scene))
-    note = f"Compared on the {len(common)} atoms that all trajectories hold, of {reference.scene.n_atoms}."
-    out[0] = replace(out[0], notes=(*out[0].notes, note))
-    return out, common
+    return common
 
 
-def equal_lags(ensembles: Sequence[Ensemble]) -> list[Ensemble]:
-    """Return the ensembles at their least common save interval, thinned by whole strides.
-
-    Raises InputError when no common interval leaves 10 frames of each.
-    """
-    lags = [Fraction(float(f"{e.lag_ps:.6g}")).limit_denominator(1_000_000) for e in ensembles]
+def _common_strides(lags_ps: Sequence[float]) -> list[int]:
+    """Return by how many of its frames each must step, so that all step by the same time."""
+    lags = [Fraction(float(f"{lag:.6g}")).limit_denominator(1_000_000) for lag in lags_ps]
     common = lags[0]
     for lag in lags[1:]:
         common = Fraction(math.lcm(common.numerator, lag.numerator), math.gcd(common.denominator, lag.denominator))
-    out = []
-    for ensemble, lag in zip(ensembles, lags, strict=True):
-        stride = int(common / lag)
-        if ensemble.n_frames // stride < 10:
-            intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in ensembles)
-            raise InputError(
-                f"Save intervals have no common multiple short enough to compare at ({intervals}); "
-                "save again at a multiple of one another, or state the interval with `lag_ps`."
-            )
-        out.append(ensemble.strided(stride))
-    return out
+    return [int(common / lag) for lag in lags]

@@ -10,18 +10,18 @@ import numpy.typing as npt
 
 from surrogate.judge.measure.probes import Family
 from surrogate.judge.measure.statistics import Estimate
-from surrogate.judge.measure.structure import Features, bond_label, sample_frames
-from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.measure.structure import Features, bond_label
 from surrogate.judge.rows.charts import Chart
 from surrogate.judge.rows.rows import Row, Trio
 from systems.errors import InputError
+from systems.scene import Scene
 from systems.units import format_time_ps
 
 Skipped = tuple[str, str]
+Frames = npt.NDArray[np.float32]
 
 # Longer than so many times the sum of covalent radii no bond is, not even to a metal.
 _LONGEST_BOND = 1.4
-_SAMPLED_FRAMES = 20
 _REFUSED = (3, 0.05)
 _KEY_COLUMNS = 6
 _GRID = 1e-3
@@ -32,22 +32,21 @@ _USUAL = 0.999
 _MOST_JUMPS = 20
 
 
-def refuse_wrong_topology(ensemble: Ensemble) -> None:
-    """Raise InputError where a truth has bonds that are none: its topology does not fit its coordinates."""
-    long, words = bonds_that_are_none(ensemble)
-    if long >= _REFUSED[0] and long >= _REFUSED[1] * len(ensemble.scene.bonds):
+def refuse_wrong_topology(label: str, scene: Scene, frames: Frames) -> None:
+    """Raise InputError where frames of a truth have bonds that are none: its topology does not fit them."""
+    long, words = bonds_that_are_none(scene, frames)
+    if long >= _REFUSED[0] and long >= _REFUSED[1] * len(scene.bonds):
         raise InputError(
-            f"{ensemble.label}: {words}. The topology does not fit the coordinates, whose atoms are in another order; "
+            f"{label}: {words}. The topology does not fit the coordinates, whose atoms are in another order; "
             "name the one that belongs to them with `top`."
         )
 
 
-def bonds_that_are_none(ensemble: Ensemble) -> tuple[int, str]:
-    """Return how many bonds are longer, in the median frame, than any bond between such elements is, and say so."""
+def bonds_that_are_none(scene: Scene, frames: Frames) -> tuple[int, str]:
+    """Return how many bonds are longer, in the median of frames `(n, n_atoms, 3)` nm, than any bond between such
+    elements is, and say so."""
     from systems.chemistry.element_data import covalent_radius_nm
 
-    scene = ensemble.scene
-    frames = sample_frames(ensemble, _SAMPLED_FRAMES)
     if scene.interactions is not None or not len(scene.bonds) or not len(frames):
         return 0, ""
     i, j = scene.bonds.T

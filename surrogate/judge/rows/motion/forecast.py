@@ -93,18 +93,17 @@ def forecasts(pairs: Pairs, role: Role = "candidate") -> list[Forecast]:
 
 
 def forecast_charts(
-    reference: Ensemble, candidate: Ensemble, replicate: Ensemble | None
+    pairs: Pairs | None, beside: Pairs | None, lag_ps: float
 ) -> tuple[list[Chart], list[tuple[str, str]]]:
-    """Return charts of FDE and ADE against time, or why there are none."""
-    pairs = find_pairs(reference, candidate)
+    """Return charts of FDE and ADE against time, or why there are none, of the candidate's pairs; `beside` are the
+    replicate's."""
     if pairs is None:
         return [], [(_NAME, "the reference and the candidate do not start from the same frame, or never part")]
     found = forecasts(pairs)
-    beside = None if replicate is None else find_pairs(reference, replicate)
     if beside is not None:
         found += forecasts(beside, "replicate")
     n_times = min(f.distance_nm.shape[1] for f in found)
-    time_ps = reference.lag_ps * np.arange(1, n_times + 1)
+    time_ps = lag_ps * np.arange(1, n_times + 1)
     said = "; ".join(f"{f.name} {f.average()[n_times - 1]:.3g} and {f.final()[n_times - 1]:.3g} Å" for f in found)
     caption = (
         f"{len(pairs.truth)} pairs over {format_time_ps(float(time_ps[-1]))} after {pairs.n_given} shared frames. Mean "

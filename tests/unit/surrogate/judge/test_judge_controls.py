@@ -398,7 +398,7 @@ def test_real_torsions_equal_mdtrajs(shared_data: Path) -> None:
     folder = shared_data / "alanine-dipeptide"
     files = [folder / "trajectory-1.dcd"]
     ensemble = load_ensemble(files, top=folder / "ala2.pdb", lag_ps=1.0)
-    features = structure.measure(ensemble, structure.backbone(ensemble.scene), structure.reference_geometry(ensemble))
+    features = structure.Yardstick.of(ensemble, probing=False).measure(ensemble)
     theirs = mdtraj.load(str(files[0]), top=str(folder / "ala2.pdb"))
     for own, compute in ((features.phi, mdtraj.compute_phi), (features.psi, mdtraj.compute_psi)):
         step = own[0][:, 0] - compute(theirs)[1][:, 0]

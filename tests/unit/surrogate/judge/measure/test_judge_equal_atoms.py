@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from surrogate.judge.measure.probes import MAX_COLUMNS, _foremost, measure_block
+from surrogate.judge.measure.probes import MAX_COLUMNS, _foremost
 from surrogate.judge.measure.statistics import make_blocks
-from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.measure.structure import Yardstick
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.motion.lifetimes import lifetime_rows
 from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
@@ -42,17 +42,17 @@ def rattled(scene: Scene, seed: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def judged(glycine: Scene) -> Judge:
     reference = Ensemble("reference", [rattled(glycine, 1).astype(np.float32)], 1.0, glycine)
-    quads, geometry, probes = backbone(glycine), reference_geometry(reference), reference_probes(reference)
+    yardstick = Yardstick.of(reference)
 
     def measured(frames: np.ndarray):  # type: ignore[no-untyped-def]
-        return measure(Ensemble("x", [frames.astype(np.float32)], 1.0, glycine), quads, geometry, probes)
+        return yardstick.measure(Ensemble("x", [frames.astype(np.float32)], 1.0, glycine))
 
-    fixed = measure(reference, quads, geometry, probes), measured(rattled(glycine, 3))
+    fixed = yardstick.measure(reference), measured(rattled(glycine, 3))
 
     def judge(frames: np.ndarray) -> tuple[dict[str, Row], list[object]]:
         three = fixed[0], measured(frames), fixed[1]
         samples = [make_sample(f, make_blocks(f.segment_lengths, 100), OPTIONS, k) for k, f in enumerate(three)]
-        trio = Trio(glycine, quads, geometry, *samples, OPTIONS)
+        trio = Trio(glycine, yardstick.torsions, yardstick.geometry, *samples, OPTIONS)
         found = [room(trio) for room in ROOMS]
         return {row.key: row for rows, _, _ in found for row in rows}, [c for _, charts, _ in found for c in charts]
 
@@ -91,8 +91,9 @@ def test_two_equal_hydrogens_swapped_change_nothing(judged: Judge, glycine: Scen
         assert bars(charts, title)[0] == bars(others, title)[0]
         assert bars(charts, title)[1] == pytest.approx(bars(others, title)[1], rel=1e-4)
     # Negative controls: one by one they do differ, and a hydrogen of another kind is not equal to them.
-    probes = reference_probes(Ensemble("x", [frames.astype(np.float32)], 1.0, glycine))
-    one_by_one = [measure_block(x.astype(np.float32), probes)["hydrogen_bonds"].mean(0) for x in (frames, other)]
+    probes = Yardstick.of(Ensemble("x", [frames.astype(np.float32)], 1.0, glycine)).probes
+    assert probes is not None
+    one_by_one = [probes.measure(x.astype(np.float32))["hydrogen_bonds"].mean(0) for x in (frames, other)]
     assert np.abs(one_by_one[0] - one_by_one[1]).max() > 0.3
     stranger = next(i for i, e in enumerate(glycine.elements) if e == "H" and i not in givers(glycine))
     wrong, _ = judged(swapped(frames, bonded, stranger))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surrogate.judge.measure import puckers
-from surrogate.judge.measure.probes import find_probes, mean_structure, measure_block
+from surrogate.judge.measure.probes import find_probes, mean_structure
 from surrogate.judge.measure.structure import backbone
 from surrogate.judge.measure.torsions import find_torsions
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
@@ -53,10 +53,10 @@ def names(scene: Scene, quad: tuple[int, ...]) -> str:
 def test_shape_equals_mdtraj(real: Ensemble, as_mdtraj: object) -> None:
     frames = real.segments[0][:]
     probes = find_probes(real.scene, frames)
-    measured = measure_block(frames, probes)
+    measured = probes.measure(frames)
     # MDTraj weighs distances from the unweighted centre; with equal weights both mean the same.
     equal = find_probes(replace(real.scene, masses_da=np.ones(22)), frames)
-    assert measure_block(frames, equal)["shape"][:, 0] == pytest.approx(mdtraj.compute_rg(as_mdtraj), abs=2e-6)
+    assert equal.measure(frames)["shape"][:, 0] == pytest.approx(mdtraj.compute_rg(as_mdtraj), abs=2e-6)
     universe = mda.Universe.empty(22, trajectory=True)
     universe.add_TopologyAttr("masses", real.scene.masses_da)
     for k in range(0, 2000, 400):
@@ -83,14 +83,14 @@ def test_angles_equal_mdanalysis(real: Ensemble) -> None:
     probes = find_probes(real.scene, frames)
     a, b, c = (frames[:, probes.angles[:, k]].reshape(-1, 3) for k in range(3))
     expected = distances.calc_angles(a, b, c).reshape(len(frames), -1)
-    assert measure_block(frames, probes)["angles"] == pytest.approx(expected, abs=2e-5)
+    assert probes.measure(frames)["angles"] == pytest.approx(expected, abs=2e-5)
     assert probes.angles.shape == (36, 3)
 
 
 def test_hydrogen_bonds_equal_mdtraj(real: Ensemble, as_mdtraj: object) -> None:
     frames = real.segments[0][:]
     probes = find_probes(real.scene, frames)
-    formed = measure_block(frames, probes)["hydrogen_bonds"]
+    formed = probes.measure(frames)["hydrogen_bonds"]
     ours = {tuple(t): float(share) for t, share in zip(probes.hydrogen_bonds.tolist(), formed.mean(0), strict=True)}
     for threshold in (0.001, 0.01, 0.02):
         theirs = {tuple(t) for t in mdtraj.baker_hubbard(as_mdtraj, freq=threshold, periodic=False).tolist()}
@@ -113,7 +113,7 @@ def test_chi_torsions_equal_mdtraj(peptide: Scene) -> None:
     frames = (peptide.positions_nm + 0.02 * rng.standard_normal((20, peptide.n_atoms, 3))).astype(np.float32)
     trajectory = mdtraj.Trajectory(frames, peptide.to_mdtraj_topology())
     probes = find_probes(peptide, frames)
-    measured = measure_block(frames, probes)["torsions"]
+    measured = probes.measure(frames)["torsions"]
     ours = {t.quad: (k, t.fold) for k, t in enumerate(probes.torsions) if t.kind == "χ"}
     theirs: dict[tuple[int, ...], np.ndarray] = {}
     for compute in (mdtraj.compute_chi1, mdtraj.compute_chi2, mdtraj.compute_chi3, mdtraj.compute_chi4):
@@ -138,7 +138,7 @@ def test_it_does_not_matter_which_of_equal_atoms_is_called_the_first(peptide: Sc
     rng = np.random.default_rng(1)
     frames = (peptide.positions_nm + 0.01 * rng.standard_normal((20, peptide.n_atoms, 3))).astype(np.float32)
     probes = find_probes(peptide, frames)
-    before = measure_block(frames, probes)["torsions"]
+    before = probes.measure(frames)["torsions"]
     atom = {
         (peptide.residue_names[r], n): i
         for i, (r, n) in enumerate(zip(peptide.residue_of_atom.tolist(), peptide.atom_names, strict=True))
@@ -149,7 +149,7 @@ def test_it_does_not_matter_which_of_equal_atoms_is_called_the_first(peptide: Sc
         for residue, a, b in pairs:
             i, j = atom[residue, a], atom[residue, b]
             moved[:, [i, j]] = moved[:, [j, i]]
-        return np.cos(measure_block(moved, probes)["torsions"] - before).min(axis=0)
+        return np.cos(probes.measure(moved)["torsions"] - before).min(axis=0)
 
     ring = [("PHE", f"{x}1", f"{x}2") for x in ("CD", "CE", "HD", "HE")]
     assert swapped(*ring) == pytest.approx(np.ones(before.shape[1]), abs=1e-6)
@@ -188,7 +188,7 @@ def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fol
 
     def value(degrees: float) -> float:
         frame = turned(peptide, i, j, degrees)[None].astype(np.float32)
-        return float(measure_block(frame, probes)["torsions"][0, index])
+        return float(probes.measure(frame)["torsions"][0, index])
 
     start = value(0.0)
     assert np.cos(value(360.0 / fold) - start) == pytest.approx(1.0, abs=1e-5)
@@ -238,7 +238,7 @@ def test_rings_that_can_pucker(peptide: Scene) -> None:
     probes = find_probes(peptide, peptide.positions_nm[None].astype(np.float32))
     assert probes.labels("puckers")[0].startswith("amplitude, ring") and "PRO 4" in probes.labels("puckers")[0]
     mirrored = peptide.positions_nm * [1.0, 1.0, -1.0]
-    both = [measure_block(x[None].astype(np.float32), probes)["puckers"][0] for x in (peptide.positions_nm, mirrored)]
+    both = [probes.measure(x[None].astype(np.float32))["puckers"][0] for x in (peptide.positions_nm, mirrored)]
     assert both[0][0] == pytest.approx(both[1][0], abs=1e-6) and 0.02 < both[0][0] < 0.06
     assert np.cos(both[0][1] - both[1][1]) == pytest.approx(-1.0, abs=1e-4), "the mirror image puckers the other way"
 
@@ -267,10 +267,10 @@ def test_a_frame_that_is_not_finite_measures_nothing(simulate: Callable[..., Ens
     made = simulate(41, 30)
     frames = made.segments[0][:].copy()
     probes = find_probes(made.scene, frames)
-    whole = measure_block(frames, probes)
+    whole = probes.measure(frames)
     frames[7, 3, 1] = np.nan
     frames[9] = np.inf
-    broken = measure_block(frames, probes)
+    broken = probes.measure(frames)
     for family, values in broken.items():
         bad = np.zeros(30, dtype=bool)
         bad[[7, 9]] = True

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate.judge.read.ensemble import Ensemble, equal_lags, load_ensemble
+from surrogate.judge.read.ensemble import Ensemble, alike, load_ensemble
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
 from systems.scene import Scene
@@ -166,14 +166,14 @@ def test_least_common_interval(
     simulate: Callable[..., Ensemble], lags: tuple[float, float], common: float
 ) -> None:  # fmt: skip
     made = [replace(simulate(22, 400), lag_ps=lag) for lag in lags]
-    thinned = equal_lags(made)
+    thinned, _ = alike(made)
     assert [e.lag_ps for e in thinned] == pytest.approx([common, common])
     assert np.array_equal(thinned[0].segments[0], made[0].segments[0][:: round(common / lags[0])])
 
 
 def test_intervals_without_a_common_multiple_are_refused(simulate: Callable[..., Ensemble]) -> None:
     with pytest.raises(InputError, match="no common multiple"):
-        equal_lags([simulate(23, 100), replace(simulate(23, 100), lag_ps=0.997)])
+        alike([simulate(23, 100), replace(simulate(23, 100), lag_ps=0.997)])
 
 
 def test_shapes_are_checked(alanine_dipeptide: Scene) -> None:

@@ -12,9 +12,9 @@ import pytest
 from surrogate.judge.comparison import compare
 from surrogate.judge.measure import distributions
 from surrogate.judge.measure.statistics import Blocks
-from surrogate.judge.measure.structure import backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.measure.structure import Yardstick, backbone
 from surrogate.judge.read.common_atoms import match_scenes, solute_atoms
-from surrogate.judge.read.ensemble import Ensemble, load_ensemble, on_common_atoms
+from surrogate.judge.read.ensemble import Ensemble, alike, load_ensemble
 from surrogate.judge.read.stored_frames import StoredFrames, bond_tree, make_whole
 from surrogate.judge.rows.rows import Options
 from systems.errors import InputError, OutOfDomainError
@@ -173,11 +173,10 @@ def test_a_periodic_file_is_read_whole(tmp_path: Path, simulate: Callable[..., E
     trajectory.unitcell_vectors = np.repeat(BOX[None], 30, axis=0)
     trajectory.save_trr(str(tmp_path / "p.trr"))
     read = load_ensemble([tmp_path / "p.trr"], template=made.scene)
-    quads = backbone(made.scene)
     assert any("periodic; molecules are made whole" in note for note in read.notes)
-    geometry = reference_geometry(made)
+    yardstick = Yardstick.of(made, probing=False)
     for name in ("phi", "psi", "bonds_nm"):
-        one, other = (getattr(measure(e, quads, geometry), name)[0] for e in (read, made))
+        one, other = (getattr(yardstick.measure(e), name)[0] for e in (read, made))
         assert one == pytest.approx(other, abs=2e-4), name
     # MDTraj's own unwrapping puts the atoms in the same places.
     trajectory._unitcell_lengths = trajectory.unitcell_lengths.astype(np.float32)
@@ -224,8 +223,8 @@ def test_frames_left_on_disk_measure_the_same(tmp_path: Path, simulate: Callable
     atoms = np.array([1, 4, 8])
     small = [e.restricted(atoms, part_of(made.scene, atoms)).segments[1] for e in (left, held)]
     assert isinstance(small[0], StoredFrames) and np.array_equal(small[0][5:500], small[1][5:500])
-    geometry, probes, quads = reference_geometry(left), reference_probes(left), backbone(made.scene)
-    features = [measure(e, quads, geometry, probes) for e in (left, held)]
+    yardstick = Yardstick.of(left)
+    features = [yardstick.measure(e) for e in (left, held)]
     for name in ("phi", "psi", "bonds_nm", "flags"):
         for one, other in zip(*(getattr(f, name) for f in features), strict=True):
             assert np.array_equal(one, other)
@@ -252,17 +251,17 @@ def test_a_heavy_atom_candidate_is_judged_on_what_it_has(tmp_path: Path, simulat
     path = write(tmp_path / "heavy.h5", part_of(scene, heavy), candidate.segments[0][:, heavy])
     part = load_ensemble([path], template=scene)
     assert part.kept is not None and np.array_equal(part.kept, heavy)
-    everyone, kept = on_common_atoms([reference, part, replicate])
+    everyone, kept = alike([reference, part, replicate])
     assert kept is not None and {e.scene.n_atoms for e in everyone} == {10}
     quick = Options(n_bootstrap=50, n_permutations=50, peptide_recipe=False)
     comparison = compare(reference, [part], replicate, options=quick)
     assert comparison.n_atoms == 10 and any("10 atoms that all trajectories hold" in n for n in comparison.notes)
     found = comparison.judgements[0]
-    quads = backbone(scene)
-    assert quads.phi_labels == backbone(scene, heavy).phi_labels
+    yardstick = Yardstick.of(reference, probing=False)
+    assert yardstick.torsions.phi_labels == backbone(scene, heavy).phi_labels
     counts = [distributions.block_counts_joint([x[:, 0] for x in f.phi], [x[:, 0] for x in f.psi],
               distributions.RAMACHANDRAN_BINS, Blocks.whole([1500])).sum(0)
-              for f in (measure(e, quads, reference_geometry(reference)) for e in (reference, candidate))]  # fmt: skip
+              for f in (yardstick.measure(e) for e in (reference, candidate))]  # fmt: skip
     expected = float(distributions.distance(*counts))
     assert found.row("joint_jsd").candidate.value == pytest.approx(expected, abs=1e-6)
     wrong = part.segments[0][:] * np.array([-1.0, 1.0, 1.0], dtype=np.float32)

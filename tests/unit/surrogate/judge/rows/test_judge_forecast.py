@@ -58,7 +58,7 @@ def test_what_starts_elsewhere_is_no_forecast(alanine_dipeptide: Scene) -> None:
     broken = [np.full_like(s, np.nan) for s in truth.segments]
     for other in (mirrored, replace(truth, segments=moved), replace(truth, segments=broken), truth):
         assert find_pairs(truth, other) is None
-        charts, skipped = forecast_charts(truth, other, None)
+        charts, skipped = forecast_charts(find_pairs(truth, other), None, truth.lag_ps)
         assert charts == [] and skipped[0][0].startswith("Forecast error")
 
 

@@ -26,8 +26,8 @@ def real(shared_data: Path, alanine_dipeptide: Scene) -> tuple[Features, Feature
         return load_ensemble(files, template=alanine_dipeptide, top=folder / "ala2.pdb", lag_ps=1.0)
 
     first, second = load(1), load(2)
-    geometry = structure.reference_geometry(first)
-    found = [structure.measure(e, structure.backbone(first.scene), geometry) for e in (first, second)]
+    yardstick = structure.Yardstick.of(first, probing=False)
+    found = [yardstick.measure(e) for e in (first, second)]
     return found[0], found[1]
 
 

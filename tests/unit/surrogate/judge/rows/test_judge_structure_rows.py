@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.judge.measure.statistics import make_blocks
-from surrogate.judge.measure.structure import Features, backbone, measure, reference_geometry, reference_probes
+from surrogate.judge.measure.structure import Features, Yardstick, backbone
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
 from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
@@ -37,18 +37,18 @@ def ensembles(simulate: Callable[..., Ensemble]) -> tuple[Ensemble, Ensemble, En
 def judged(ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> Judge:
     """Rows by key of the candidate's frames, words included, between reference and replicate."""
     reference = ensembles[0]
-    quads, geometry, probes = backbone(reference.scene), reference_geometry(reference), reference_probes(reference)
+    yardstick = Yardstick.of(reference)
 
     def measured(ensemble: Ensemble, frames: np.ndarray | None = None):  # type: ignore[no-untyped-def]
         made = ensemble if frames is None else Ensemble("wrong", [frames.astype(np.float32)], 1.0, ensemble.scene)
-        return measure(made, quads, geometry, probes)
+        return yardstick.measure(made)
 
     fixed = measured(ensembles[0]), measured(ensembles[2])
 
     def judge(frames: np.ndarray) -> dict[str, Row]:
         three = fixed[0], measured(ensembles[1], frames), fixed[1]
         samples = [make_sample(f, make_blocks(f.segment_lengths, 200), OPTIONS, k) for k, f in enumerate(three)]
-        trio = Trio(reference.scene, quads, geometry, *samples, OPTIONS)
+        trio = Trio(reference.scene, yardstick.torsions, yardstick.geometry, *samples, OPTIONS)
         return {row.key: row for row in judge_rows([r for room in ROOMS for r in room(trio)[0]], OPTIONS)}
 
     return judge
@@ -182,8 +182,8 @@ def test_one_exploded_frame_drowns_nothing(
 def test_hydrogen_bonds_that_are_never_formed_are_missed(ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> None:
     """Formed 30 % of the time in the reference, as often in a fair candidate, never in a wrong one."""
     reference = ensembles[0]
-    quads, geometry, probes = backbone(reference.scene), reference_geometry(reference), reference_probes(reference)
-    plain = measure(reference, quads, geometry, probes)
+    yardstick = Yardstick.of(reference)
+    plain = yardstick.measure(reference)
     rng = np.random.default_rng(6)
 
     def with_bonds(share: float) -> Features:
@@ -194,7 +194,9 @@ def test_hydrogen_bonds_that_are_never_formed_are_missed(ensembles: tuple[Ensemb
     def rows(share: float) -> dict[str, Row]:
         three = with_bonds(0.3), with_bonds(share), with_bonds(0.3)
         samples = [make_sample(f, make_blocks(f.segment_lengths, 200), OPTIONS, k) for k, f in enumerate(three)]
-        found, charts, _ = hydrogen_bond_rows(Trio(reference.scene, quads, geometry, *samples, OPTIONS))
+        found, charts, _ = hydrogen_bond_rows(
+            Trio(reference.scene, yardstick.torsions, yardstick.geometry, *samples, OPTIONS)
+        )
         assert len(charts) == 1
         return {row.key: row for row in judge_rows(found, OPTIONS)}
 

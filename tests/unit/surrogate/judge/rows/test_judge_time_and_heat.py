@@ -71,10 +71,8 @@ def test_phi_shifted_against_psi_is_seen_within_the_basins(runs: list[Ensemble])
     from surrogate.judge.measure import structure
 
     three = runs
-    torsions = structure.backbone(three[0].scene)
-    geometry = structure.reference_geometry(three[0])
-    probes = structure.reference_probes(three[0])
-    measured = [structure.measure(e, torsions, geometry, probes) for e in three]
+    yardstick = structure.Yardstick.of(three[0])
+    measured = [yardstick.measure(e) for e in three]
     shifted = replace(measured[1], phi=[np.roll(measured[1].phi[0], 5_000, axis=0)])
     for features, expected in ((measured[1], ("agrees",)), (shifted, ("differs",))):
         assert _within(three[0], measured, features)["phi_given_psi:ALA 2"] in expected
@@ -85,10 +83,10 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     from surrogate.judge.measure import structure
     from surrogate.judge.rows.motion.within_rows import within_rows
 
-    torsions, geometry = structure.backbone(reference.scene), structure.reference_geometry(reference)
+    yardstick = structure.Yardstick.of(reference, probing=False)
     account = account_of(reference)
     setting = comparison._Setting(
-        reference.scene, torsions, geometry, measured[0], measured[2], OPTIONS, 300.0, account
+        reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account
     )
     trio = comparison._equal_terms(setting, candidate)[0]
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
