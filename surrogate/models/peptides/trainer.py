@@ -20,7 +20,7 @@ from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain

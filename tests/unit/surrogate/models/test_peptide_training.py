@@ -14,7 +14,7 @@ from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import PeptideTraining, _with_scale, normalise, train_peptides
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.geometry import torsion

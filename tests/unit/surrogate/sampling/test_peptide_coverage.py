@@ -15,7 +15,7 @@ from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import _with_scale, normalise
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
