@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 from surrogate.judge.measure.statistics import holm
 from surrogate.judge.rows.imposed_rows import is_imposed
-from surrogate.judge.rows.rows import Options, Row, Word
+from surrogate.judge.rows.rows import UNLIKE_BELOW, Options, Row, Word
 from systems.chemistry import validity
 
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
@@ -18,10 +18,8 @@ _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0, "imposed": 0}
 _MENTIONED = 3
-_FAST_KEYS = (
-    "valid:", "copies", "bond_", "angle_", "temperature", "energy_", "phi_given", "torsions_given", "torsion_step",
-    "hydrogen_bond_lifetime", "chunk_step",
-)  # fmt: skip
+_WITHIN_KEYS = ("phi_given", "torsions_given", "torsion_step", "hydrogen_bond_lifetime")
+_FAST_KEYS = ("valid:", "copies", "bond_", "angle_", "temperature", "energy_", "chunk_step", *_WITHIN_KEYS)
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
 
@@ -119,9 +117,17 @@ def _share_word(row: Row) -> Word:
 def untested(rows: Sequence[Row]) -> list[Row]:
     """Return the rows of a comparison too short to test what follows the slow motion: those rows without a p-value.
 
-    What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state).
+    What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state). What moves
+    within a state is not, where the reference and its replicate differ by it: there a state they do not share, such as
+    another rotamer beside it, is as good a reason as a wrong.
     """
-    return [r if r.key.startswith(_FAST_KEYS) else replace(r, p_value=math.nan, p_replicate=math.nan) for r in rows]
+
+    def tested(row: Row) -> bool:
+        if not row.key.startswith(_FAST_KEYS):
+            return False
+        return not (row.key.startswith(_WITHIN_KEYS) and row.p_replicate < UNLIKE_BELOW)
+
+    return [r if tested(r) else replace(r, p_value=math.nan, p_replicate=math.nan) for r in rows]
 
 
 def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:

@@ -16,6 +16,7 @@ from surrogate.judge.report.figures import (
     LINE,
     MAP_MAX_KJ,
     MAP_SIZE,
+    PAGE,
     REPLICATE,
     TEXT,
     Figure,
@@ -63,10 +64,14 @@ def _caption(title: str, caption: str) -> str:
 
 def _lines(chart: LineChart) -> str:
     def paint(figure: Any, axes: Any) -> None:
-        for line in chart.lines:
+        # Of dots those drawn last are seen best.
+        for line in sorted(chart.lines, key=lambda x: x.role != "replicate") if chart.dots else chart.lines:
             colour, dash = _COLOURS[line.role], _DASHES[line.role]
             if line.low is not None and line.high is not None:
                 axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.17, linewidth=0)
+            if chart.dots:
+                axes.plot(line.x, line.y, color=colour, linestyle="none", marker=".", markersize=2.2, alpha=0.75)
+                continue
             marker = "o" if line.role != "other" and np.count_nonzero(np.isfinite(line.y)) <= 12 else None
             axes.plot(line.x, line.y, color=colour, linestyle=dash, marker=marker, markersize=3)
         if chart.log_x:
@@ -98,7 +103,7 @@ def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
 
 
 def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
-    """Write the name of each guide line at its end, except where it would run into another name."""
+    """Write the name of each guide line, up to a comma, at its end, except where it would run into another name."""
     taken: list[float] = []
     for line in lines:
         finite = np.flatnonzero(np.isfinite(line.y))
@@ -108,7 +113,15 @@ def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
         height = float(axes.transAxes.inverted().transform(axes.transData.transform((x, y)))[1])
         if all(abs(height - other) > _NAME_HEIGHT for other in taken):
             taken.append(height)
-            axes.annotate(line.name, (x, y), xytext=(-2, 3), textcoords="offset points", ha="right", fontsize=7)
+            axes.annotate(
+                line.name.partition(",")[0],
+                (x, y),
+                xytext=(-4, 4),
+                textcoords="offset points",
+                ha="right",
+                fontsize=7,
+                bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 0.4},
+            )
 
 
 def short_name(name: str) -> str:

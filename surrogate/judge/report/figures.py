@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 import re
+import textwrap
 from collections.abc import Callable
 from io import StringIO
 from typing import Any, NamedTuple
@@ -24,8 +25,10 @@ DIFFERENCE_MAX_KJ = 4.0
 # The two ends of the difference map, in words: high (too rare) and low (too frequent).
 DIFFERENCE_COLOURS = ("orange", "purple")
 _MIN_COUNT = 5
+# Characters in a line below a narrow picture.
+_LABEL_WIDTH = 36
 # Stand-ins that matplotlib carries through; each becomes a CSS variable in the finished SVG.
-TEXT, CANDIDATE, REPLICATE, FAULT, STRAINED, LINE, EMPTY = (f"#01010{i}" for i in range(1, 8))
+TEXT, CANDIDATE, REPLICATE, FAULT, STRAINED, LINE, EMPTY, PAGE = (f"#01010{i}" for i in range(1, 9))
 _VARIABLES = {
     TEXT: "currentColor",
     CANDIDATE: "var(--candidate)",
@@ -34,6 +37,7 @@ _VARIABLES = {
     STRAINED: "var(--strained)",
     LINE: "var(--line)",
     EMPTY: "var(--map-empty)",
+    PAGE: "var(--page)",
 }
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -217,7 +221,7 @@ def histogram(data: Histogram) -> str:
         if data.unit == "rad":
             _degrees(axes, both=False)
         unit = "°" if data.unit == "rad" else data.unit
-        axes.set_xlabel(f"{data.label} / {unit}" if unit else data.label)
+        axes.set_xlabel(textwrap.fill(f"{data.label} / {unit}" if unit else data.label, _LABEL_WIDTH))
         axes.set_ylabel("density")
         axes.set_yticks([])
 

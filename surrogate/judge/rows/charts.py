@@ -73,7 +73,10 @@ class Line(Curve):
 
 @dataclass(frozen=True, eq=False)
 class LineChart(Curve):
-    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen."""
+    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen.
+
+    `dots`: a dot for each number instead of strokes between them, where lines would hide each other.
+    """
 
     section: Section
     title: str
@@ -83,6 +86,7 @@ class LineChart(Curve):
     lines: tuple[Line, ...]
     log_x: bool = False
     log_y: bool = False
+    dots: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +129,11 @@ def bar_chart(
     section: Section, title: str, caption: str, y_label: str, names: Sequence[str], made: Sequence[Sequence[Estimate]]
 ) -> BarChart:
     """Return the chart of numbers with their 95 % intervals; `made`: of (reference, candidate, replicate), one estimate
-    for each name, in the unit of `y_label`."""
+    for each name, in the unit of `y_label`. Intervals of shares in % end at 0 and 100."""
 
     def pick(which: int, name: str) -> FloatArray:
-        return np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
+        found = np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
+        return np.clip(found, 0.0, 100.0) if y_label.endswith("/ %") else found
 
     return BarChart(
         section=section,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -61,7 +61,7 @@ class Metric:
     `tolerance` is in `unit`; of a positive, skewed number, such as a time or a width (`relative`), it is a share of the
     reference's value, and logarithms are compared. `tolerance_text` says it where that takes other words. A difference
     below `resolution`, in `unit`, is not a physical one (rounding of files, tolerance of constraint solvers) and never
-    significant.
+    significant. Numbers in % are shares: their intervals end at 0 and 100.
     """
 
     key: str
@@ -315,6 +315,8 @@ def observable_row(
     """
     log = metric.relative
     made = [estimate(v, d, s.blocks.n_blocks, log=log) for v, d, s in zip(values, draws, trio.samples, strict=True)]
+    if metric.unit == "%":
+        made = [replace(e, low=max(e.low, 0.0), high=min(e.high, 100.0)) for e in made]
     ref, cand, rep = made
     both = truth_of(ref, rep, log=log)
     ratio = Estimate(math.nan)

@@ -197,7 +197,9 @@ def _decorrelation_chart(trio: Trio) -> Chart:
                     continue
                 drawn = np.unique(np.geomspace(1, n_lags - 1, 80).astype(int))
                 x = drawn * sample.features.lag_ps
-                lines.append(Line(f"{kind}, {role}", role, x, np.nanmean(curves, axis=0)[drawn]))  # type: ignore[arg-type]
+                # At the longest lags no torsion may have a pair of frames left.
+                mean = np.ma.masked_invalid(curves[:, drawn]).mean(axis=0).filled(np.nan)
+                lines.append(Line(f"{kind}, {role}", role, x, mean))  # type: ignore[arg-type]
     return LineChart(
         section="kinetics",
         title="Decorrelation of torsions, by the peptide papers' recipe",

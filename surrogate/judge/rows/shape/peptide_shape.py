@@ -45,17 +45,15 @@ def _series_chart(trio: Trio, values: Sequence[FloatArray], title: str, y_label:
     lines = []
     for role, series in zip(_ROLES, values, strict=True):
         y: FloatArray = series[:shortest:step]
-        if y_label.endswith("°"):
-            # An angle that runs over the end of its range is no jump across the picture.
-            y = np.asarray(np.where(np.append(np.abs(np.diff(y)) > 180.0, False), np.nan, y), dtype=np.float64)
         lines.append(Line(role, role, np.arange(len(y), dtype=np.float64) * step * lag_ps * scale, y))
     return LineChart(
         section="structure",
         title=title,
-        caption=f"First segment of each trajectory, every {step}. frame." if step > 1 else "First segment of each.",
+        caption=f"First segment of each trajectory, one frame in {step}." if step > 1 else "First segment of each.",
         x_label=f"time / {unit}",
         y_label=y_label,
         lines=tuple(lines),
+        dots=True,
     )
 
 
@@ -67,7 +65,9 @@ def secondary_structure(trio: Trio) -> tuple[list[Row], list[Chart], list[Skippe
         return [], [], []
     if not probes.chains.labels:
         return [], [], [("Secondary structure", f"fewer than {LEAST_RESIDUES} residues have N, CA, C and O")]
-    rows, charts = [], []
+    rows: list[Row] = []
+    charts: list[Chart] = []
+    skipped: list[Skipped] = []
     for name, code in (("helix", HELIX), ("strand", STRAND), ("coil", COIL)):
         percent = [[100.0 * (x == code) for x in family_of(s, "secondary")] for s in trio.samples]
         if code != COIL:
@@ -76,8 +76,11 @@ def secondary_structure(trio: Trio) -> tuple[list[Row], list[Chart], list[Skippe
             metric = Metric(f"secondary:{name}", "structure", f"Residues in {name} (DSSP)", "%", _TOLERANCE)
             rows.append(mean_row(trio, metric, means, 0, _in_words(name)))
         each = [block_means(s, v) for s, v in zip(trio.samples, percent, strict=True)]
-        charts.append(_residue_chart(f"Residues in {name}", probes.chains.labels, each))
-    return rows, charts, []
+        if any((m.values > 0).any() for m in each):
+            charts.append(_residue_chart(f"Residues in {name}", probes.chains.labels, each))
+        else:
+            skipped.append((f"Residues in {name}", "there are none in any frame"))
+    return rows, charts, skipped
 
 
 def _in_words(name: str) -> Callable[[float, float], str]:

@@ -75,7 +75,8 @@ def test_a_candidate_that_unfolds_is_named_residue_by_residue(peptide: Scene) ->
     assert wrong.row("secondary:helix").verdict == "differs"
     assert "of residues are in helix instead of" in wrong.row("secondary:helix").statement
     charts = {c.title: c for c in wrong.curves.charts if c.section == "structure"}
-    parts = [charts[f"Residues in {name}"].to_dict() for name in ("helix", "strand", "coil")]
+    assert "Residues in strand" not in charts and dict(wrong.skipped)["Residues in strand"]
+    parts = [charts[f"Residues in {name}"].to_dict() for name in ("helix", "coil")]
     total = np.sum([part["candidate"] for part in parts], axis=0)
     np.testing.assert_allclose(total, 100.0, rtol=1e-5)
     at = parts[0]["names"].index("ALA 5")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from surrogate.judge.comparison import Judgement, compare
@@ -28,8 +27,7 @@ def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
         lines = charts[title].lines
         assert [line.name for line in lines] == ["reference", "candidate", "replicate"]
         assert all(len(line.x) == len(line.y) == 300 for line in lines), "900 frames, every third"
-    phi = charts["φ of ALA 2 along time"].lines[0].y
-    assert np.nanmax(np.abs(np.diff(phi))) <= 180.0, "no stroke across the picture"
+        assert charts[title].dots, "no stroke across the picture where an angle runs over the end of its range"
     assert "fewer than 5 residues" in dict(judged.skipped)["Secondary structure"]
 
 

@@ -19,6 +19,7 @@ from surrogate.judge.read.ensemble import Ensemble, load_ensemble
 from surrogate.judge.rows.account import account_of
 from surrogate.judge.rows.motion import relaxation_rows
 from surrogate.judge.rows.rows import Options
+from systems.scene import Scene
 
 OPTIONS = Options(peptide_recipe=False)
 
@@ -105,6 +106,64 @@ def test_a_reference_that_starts_in_one_state_breaks_no_short_candidate(simulate
     found = compare(like(three[0], ordered, "ordered"), [three[1]], three[2], options=OPTIONS).judgements[0]
     row = found.row("phi_given_psi")
     assert np.isfinite(row.candidate.value) and row.verdict != "fails" and found.status != "broken", found.verdict
+
+
+def hopping(seed: int, *, far: bool = False, stride: int = 1) -> Features:
+    """Phi and psi that hop between beta and alpha and shiver; `far`: one long visit to phi > 0, where they shiver twice
+    as much; `stride`: one frame in so many."""
+    from scipy.signal import lfilter
+
+    n, rng = 10_000, np.random.default_rng(seed)
+    alpha = np.cumsum(rng.random(n * stride) < 0.02) % 2
+    centre = np.radians(np.where(alpha[:, None] == 1, [-70.0, 100.0], [-75.0, 150.0]))
+    shiver = 0.15 * lfilter([1.0], [1.0, -0.6], rng.standard_normal((n * stride, 2)), axis=0)
+    if far:
+        centre[4_000:6_000], shiver[4_000:6_000] = np.radians([60.0, 40.0]), 2.0 * shiver[4_000:6_000]
+    angles = np.arctan2(np.sin(centre + shiver), np.cos(centre + shiver)).astype(np.float32)[::stride]
+    none = [np.empty((n, 0), dtype=np.float32)]
+    return Features("x", 1.0, [angles[:, :1]], [angles[:, 1:]], none, [np.zeros(n, np.uint16)], None)
+
+
+@pytest.mark.parametrize("visitor", [0, 1, 2])
+def test_a_state_that_one_run_alone_has_met_is_no_wrong_time(
+    visitor: int, alanine_dipeptide: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps are larger there, in the reference, the candidate or the replicate; every second frame is still seen."""
+    from surrogate.judge import verdict
+    from surrogate.judge.measure.structure import backbone
+    from surrogate.judge.rows.motion import within_rows
+    from surrogate.judge.rows.rows import Trio, make_sample
+
+    def word(candidate: Features) -> str:
+        three = [hopping(1, far=visitor == 0), candidate, hopping(3, far=visitor == 2)]
+        blocks = make_blocks([10_000], 1_000)
+        samples = [make_sample(f, blocks, OPTIONS, k, 10_000) for k, f in enumerate(three)]
+        torsions = backbone(alanine_dipeptide)
+        trio = Trio(alanine_dipeptide, torsions, None, *samples, OPTIONS)  # type: ignore[arg-type]
+        judged = verdict.judge_rows(within_rows.within_rows(trio)[0], OPTIONS)
+        return next(r.verdict for r in judged if r.key == "torsion_step")
+
+    assert word(hopping(2, far=visitor == 1)) == "agrees"
+    assert word(hopping(2, far=visitor == 1, stride=2)) == "differs"
+    if visitor == 1:
+        together = [[np.zeros(10_000, dtype=np.int64)] for _ in range(3)]
+        monkeypatch.setattr(within_rows, "states_apart", lambda trio: together)
+        assert word(hopping(2, far=True)) == "differs", "negative control: the far state not told apart"
+
+
+def test_within_states_few_samples_blame_nobody_where_the_replicate_differs_too() -> None:
+    """Below twenty samples a fast row stands, unless reference and replicate differ by it themselves."""
+    from surrogate.judge import verdict
+    from surrogate.judge.measure.statistics import Estimate
+    from surrogate.judge.rows.rows import Row
+
+    def row(key: str, p_replicate: float) -> Row:
+        one = Estimate(1.0, 0.9, 1.1, 0.05)
+        return Row(key, "kinetics", key, "", "observable", one, one, one, None, 1e-6, p_replicate, 0.2, "", "")
+
+    kept = verdict.untested([row("torsion_step", 0.5), row("torsion_step", 1e-5), row("bond_width:x", 1e-5),
+                             row("correlation_time:x", 0.5)])  # fmt: skip
+    assert [np.isfinite(r.p_value) for r in kept] == [True, False, True, False]
 
 
 def test_blocks_of_one_kind_are_exchanged_with_their_like() -> None:
