@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from surrogate.bench.cost_error.effective_page import effective_lines, plot_effective
 from surrogate.bench.stress.stress_page import table
 from systems.files.whole_file import create_whole
 
@@ -18,13 +19,17 @@ _MD_STYLES = (":", "--", "-")
 
 
 def write_cost_error(result: dict[str, Any], folder: Path) -> list[Path]:
-    """Write cost_error.json, .md and, where a setting was measured, .svg; return them. Raises StorageError."""
+    """Write cost_error.json, .md and, where a setting was measured, .svg and effective_samples.svg; return them. Raises
+    StorageError."""
     written = [folder / "cost_error.json", folder / "cost_error.md"]
     create_whole(written[0], json.dumps(result, indent=1))
     create_whole(written[1], markdown(result))
     if any("jsd" in row for row in result["rows"]):
         written.append(folder / "cost_error.svg")
         create_whole(written[2], lambda path: plot(result, path))
+    if any(row.get("effective_per_s") for row in result["rows"]):
+        written.append(folder / "effective_samples.svg")
+        create_whole(written[-1], lambda path: plot_effective(result, path, SOUND_PERCENT))
     return written
 
 
@@ -65,6 +70,7 @@ def markdown(result: dict[str, Any]) -> str:
         "not depend on those beside them.",
         "",
         *crossings(result),
+        *effective_lines(result, SOUND_PERCENT),
     ]
     return "\n".join(lines)
 
@@ -93,7 +99,7 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
     figure = Figure(figsize=(8.2, 5.4), layout="constrained")
     axes = figure.add_subplot()
     md = result["md"]
-    for cost, style in zip(md["cost"], _MD_STYLES, strict=False):
+    for cost, style in zip((c for c in md["cost"] if not c["plain"]), _MD_STYLES, strict=False):
         x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["mean"]
         label = f"OpenMM, {cost['timestep_fs']:g} fs"
         axes.plot(x, md["errors"], style, color="black", lw=1.4 if style == "-" else 0.9, label=label)
@@ -183,7 +189,7 @@ def _row(row: dict[str, Any], varies: list[str], shortest: float) -> dict[str, A
 
 def _md_row(row: dict[str, Any], md: dict[str, Any]) -> dict[str, Any]:
     return {
-        "time step": f"{row['timestep_fs']:g} fs",
+        "time step": row["label"].removeprefix("OpenMM, "),
         "s/ns": _range(row["cpu_s_per_ns"]),
         "wall s/ns": f"{row['wall_s_per_ns']['mean']:.3g}",
         f"s to {md['floor']:.3f}": f"{1e-3 * md['length_ps'] * row['cpu_s_per_ns']['mean']:.3g}",

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from surrogate.bench.cost_error.effective_samples import slowest_torsion
 from surrogate.bench.rolling import Frames
 from surrogate.bench.stress.frame_statistics import HALF_ANGSTROM_RULE, measure_bonds
 from surrogate.judge.measure.distributions import block_occupancy
@@ -54,13 +55,16 @@ def read_truth(scene: Scene, reference: Sequence[Path], replicate: Sequence[Path
     return Truth(scene, yardstick, yardstick.measure(first), yardstick.measure(second))
 
 
-def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[str, Any], Worth]:
+def judge_frames(
+    frames: Frames, truth: Truth, *, seed: int = 0, slowest: int | None = None
+) -> tuple[dict[str, Any], Worth]:
     """Return what replicas `(rows, n_frames, n_atoms, 3)` nm get wrong, JSON-able, and their worth by the φ/ψ map.
 
     `jsd`: Jensen-Shannon distance of the joint φ/ψ histograms (50 x 50, overflow bins), the root mean square of those
     to the two held-out runs; `curve`: the same of parts of the rollout, (ps, distance); shares of valid frames; the
     autocorrelation of cos ψ after one frame and its relaxation time; bonds (stress_measures.measure_bonds). Numbers
-    with intervals are dictionaries of `judge.statistics.Estimate`. Raises InputError where frames are too few.
+    with intervals are dictionaries of `judge.statistics.Estimate`. `slow_relaxation_ps`: of the torsion `slowest`,
+    where one is named (effective_samples). Raises InputError where frames are too few.
     """
     rolled = Ensemble("rollout", [x.astype(np.float32) for x in frames], truth.reference.lag_ps, truth.scene)
     features = truth.yardstick.measure(rolled)
@@ -77,6 +81,8 @@ def judge_frames(frames: Frames, truth: Truth, *, seed: int = 0) -> tuple[dict[s
         "relaxation_ps": relaxation.to_dict(),
         **measure_bonds(np.concatenate(list(frames)), truth.yardstick.geometry),
     }
+    if slowest is not None:
+        out["slow_relaxation_ps"] = relaxation_of(sample, slowest)[1].to_dict()
     for key, mask in CHECKS.items():
         inside, total = block_occupancy([(f & mask) == 0 for f in features.flags], sample.blocks)
         draws = 100.0 * (sample.weights @ inside) / (sample.weights @ total)
@@ -102,6 +108,7 @@ def judge_truth(truth: Truth, *, seed: int = 0) -> dict[str, Any]:
         "floor": worth.errors[-1],
         "correlation": [pair[0] for pair in kinetic],
         "relaxation_ps": [pair[1] for pair in kinetic],
+        "slowest": slowest_torsion(samples),
     }
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
 from surrogate.bench.rolling import Frames, Roller
 from surrogate.bench.stress.other_arithmetic import openmm_of
+from systems.errors import SurromdError
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -52,22 +53,51 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
 
 
 def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
-    """Return processor and wall seconds of OpenMM for a ns at each time step, by turns."""
+    """Return processor and wall seconds of OpenMM for a ns at each time step, by turns: our set-up, and what OpenMM's
+    manual makes of the model on one thread (`md_setups.plain`), where it knows the force field.
+
+    A plain step is timed once: it takes the same at any time step, of which 4 fs wants heavier hydrogens.
+    """
     with ExitStack() as stack:
         engines = {dt: stack.enter_context(openmm_of(weights.domain, dt, config.seed)) for dt in TIMESTEPS_PS}
         found: dict[float, list[tuple[float, float]]] = {dt: [] for dt in TIMESTEPS_PS}
+        simple = _plain_steps(weights, config)
+        steps: list[tuple[float, float]] = []
         for _ in range(config.rounds):
             for dt, engine in engines.items():
                 n = _steps(config.slice_ps, dt)
                 found[dt].append(_seconds_per_ns(config.slice_ps, lambda e=engine, n=n: e.step(n)))  # type: ignore[misc]
-    return [
-        {
-            "timestep_fs": 1e3 * dt,
-            "cpu_s_per_ns": _spread([cpu for cpu, _ in times]),
-            "wall_s_per_ns": _spread([wall for _, wall in times]),
-        }
-        for dt, times in found.items()
-    ]
+            if simple is not None:
+                steps.append(_seconds_per_ns(_steps(config.slice_ps, TIMESTEPS_PS[-1]), simple))
+    rows = [_md_cost("", dt, times) for dt, times in found.items()]
+    if steps:
+        rows += [_md_cost(", plain", dt, [(cpu / dt, wall / dt) for cpu, wall in steps]) for dt in TIMESTEPS_PS]
+    return rows
+
+
+def _md_cost(how: str, timestep_ps: float, times: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    return {
+        "label": f"OpenMM, {1e3 * timestep_ps:g} fs{how}",
+        "plain": bool(how),
+        "timestep_fs": 1e3 * timestep_ps,
+        "cpu_s_per_ns": _spread([cpu for cpu, _ in times]),
+        "wall_s_per_ns": _spread([wall for _, wall in times]),
+    }
+
+
+def _plain_steps(weights: Weights, config: CostErrorConfig) -> Callable[[], object] | None:
+    """Return what runs plain OpenMM for as many steps as a slice has at 4 fs; None where it cannot be set up."""
+    from surrogate.bench.md_setups import Case, plain
+
+    domain = weights.domain
+    case = Case(domain.scene.name, "", str(domain.conditions["solvent"]), str(domain.conditions["force_field"]))
+    try:
+        context = plain(case, domain.scene, threads=config.threads).context
+    except (KeyError, ValueError, SurromdError):
+        return None
+    context.setPositions(domain.scene.positions_nm)
+    n_steps = _steps(config.slice_ps, TIMESTEPS_PS[-1])
+    return lambda: (context.getIntegrator().step(n_steps), context.getState())
 
 
 def _steps(time_ps: float, timestep_ps: float) -> int:

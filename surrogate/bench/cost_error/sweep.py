@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from surrogate.bench.cost_error.cost_page import write_cost_error
+from surrogate.bench.cost_error.effective_samples import effective_row, training_cost
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
 from surrogate.bench.cost_error.sweep_settings import (
@@ -92,14 +93,15 @@ def run_cost_error(
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with _threads(config.threads):
-            if "md" not in result:
+            if "slowest" not in result.get("md", {}):  # an earlier version's did not say
                 report("OpenMM")
                 result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(weights[0], config)}
             for one, settings in chosen:
                 for setting in settings:
                     if not any(row["weights_hash"] == one.hash and _is(row, setting) for row in result["rows"]):
                         report(f"{one.path.stem}: {setting.label}")
-                        result["rows"].append(measure_setting(one, setting, truth, config))
+                        row = measure_setting(one, setting, truth, config, result["md"].get("slowest"))
+                        result["rows"].append(row | _earned(row, one, result["md"]))
                         write_cost_error(result, folder)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{folder} keeps the settings that were finished; the same command goes on") from None
@@ -107,8 +109,19 @@ def run_cost_error(
     return result
 
 
-def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: CostErrorConfig) -> dict[str, Any]:
+def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[str, Any]:
+    """Return effective samples of a setting, and what its weights cost before; nothing of one that is only timed."""
+    if "slow_relaxation_ps" not in row:
+        return {}
+    fastest = min(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"])
+    return effective_row(row, row["slow_relaxation_ps"]["value"], md) | {"before": training_cost(weights, fastest)}
+
+
+def measure_setting(
+    weights: Weights, setting: Setting, truth: Truth, config: CostErrorConfig, slowest: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Roll one setting in parts, by turns with OpenMM; return its cost, its errors and its worth, JSON-able.
+    `slowest`: the torsion that effective samples are counted by (effective_samples.slowest_torsion).
 
     A batch smaller than the usual one is only timed, over a few chunks: replicas do not depend on those beside them.
     """
@@ -140,7 +153,9 @@ def measure_setting(weights: Weights, setting: Setting, truth: Truth, config: Co
     row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
     if only_timed:
         return row | {"timed_only": True}
-    errors, worth = judge_frames(frames, truth, seed=config.seed)
+    errors, worth = judge_frames(
+        frames, truth, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
+    )
     spent = ns * row["cpu_s_per_ns"]["mean"]
     return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["mean"])
 

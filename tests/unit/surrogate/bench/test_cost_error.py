@@ -156,6 +156,10 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
     assert row["cpu_s_per_ns"]["least"] <= row["cpu_s_per_ns"]["mean"] <= row["cpu_s_per_ns"]["greatest"]
     assert row["spent_s"] == pytest.approx(row["ns"] * row["cpu_s_per_ns"]["mean"])
     assert timed["timed_only"] and "jsd" not in timed
+    assert row["effective_per_s"] == pytest.approx(
+        1e3 / row["cpu_s_per_ns"]["mean"] / (2 * max(row["slow_tau_ps"], first["md"]["slowest"]["tau_ps"]))
+    )
+    assert [cost["label"] for cost in first["md"]["cost"]][3:] == [f"OpenMM, {n} fs, plain" for n in (1, 2, 4)]
     fast, slow = (first["md"]["cost"][k]["cpu_s_per_ns"]["mean"] for k in (2, 0))
     assert slow > 2 * fast, "1 fs takes four times as many steps as 4 fs"
     # Gone on with: what is there is kept, word for word.
@@ -164,7 +168,13 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
     assert told == ["reading the references", "tiny: euler 2, fp32"] and again["rows"][:2] == first["rows"]
     assert json.loads((tmp_path / "cost_error.json").read_text()) == json.loads(json.dumps(again))
     text = (tmp_path / "cost_error.md").read_text()
-    assert text == markdown(again) and "| fitted 2, fp32 |" in text and "(timed)" in text and "4 fs" in text
+    assert (
+        "## Effective samples" in text
+        and text == markdown(again)
+        and "| fitted 2, fp32 |" in text
+        and "(timed)" in text
+        and "4 fs" in text
+    )
     assert (tmp_path / "cost_error.svg").read_text().rstrip().endswith("</svg>")
     with pytest.raises(InputError, match="other references, times or rounds"):
         run_cost_error([(weights, [one])], held[1:], held[:1], tmp_path, config)
