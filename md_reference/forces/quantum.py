@@ -138,8 +138,8 @@ class Potential:
         self._name = scene.name
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
-        self._calculator.update(positions=positions_nm / NM_PER_BOHR)
         try:
+            self._calculator.update(positions=positions_nm / NM_PER_BOHR)
             result = self._calculator.singlepoint()
         except (RuntimeError, ValueError) as error:
             raise PreparationError(

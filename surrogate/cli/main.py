@@ -226,7 +226,8 @@ def windows(
 @with_options
 def train(
     references: Annotated[
-        list[str], typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file.")
+        list[str],
+        typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file; a SCENE with --level."),
     ],
     *,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Weights to write, .safetensors.")] = None,
@@ -236,7 +237,7 @@ def train(
     ] = False,
     as_json: JsonOpt = False,
 ) -> None:
-    """Train a surrogate that suits the reference trajectories."""
+    """Train a surrogate that suits the reference trajectories, or a potential of a molecule's quantum forces."""
     from surrogate import api
 
     if explain:

@@ -176,6 +176,7 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
     arch: str | None = option(
         "lam-slide, painet, egnn, a baseline, or another that is installed.", None, unset="what suits the references"
     )
+    level: str | None = option("gfn2-xtb: learn a molecule's forces at this level, instead of frames.", None)
     budget_s: float | None = option("Wall time to spend, such as 30min.", None)
     steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
     start_from: str | Path | None = option(

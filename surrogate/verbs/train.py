@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from surrogate.data.shipped import weights_path
 from surrogate.models.registry import architecture, names
 from surrogate.progress import progress_bar
+from surrogate.verbs.learn_molecule import learn_molecule
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from surrogate.verbs.telling import tell
@@ -41,6 +42,10 @@ class _Plan:
 def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Path:
     """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
+    With `level='gfn2-xtb'` it learns one molecule, named as by `reference`, from that level's energies and forces:
+    painet as a potential, which asks about the states that it is least sure of. The samples stay beside the weights
+    (NAME.samples.safetensors), and the error of forces against evaluations (NAME.rounds.csv).
+
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
@@ -61,7 +66,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     """
     out = Path(out)
     asked = _asked(options, out)
-    if asked.arch:
+    if asked.arch and options.level is None:
         _trainer(asked.arch).check(asked)
     check_outputs([out], [".safetensors"], resume=options.resume, overwrite=options.overwrite)
     states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
@@ -69,6 +74,11 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
         raise InputError(f"{states[0]} is the state of an interrupted training; add `resume=True` or `overwrite=True`.")
     if options.resume and out.exists() and not states:
         return out
+    if options.level is not None:
+        with Claim(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):
+            written = learn_molecule(references, asked, options, _shown(bar))
+        _conclude(written, fitted=False, quiet=options.quiet)
+        return written
     plan = _plan(references, options.validation, replace(asked, device=_device(options.device)))
     from surrogate.training.devices import is_first_process
 
@@ -79,15 +89,20 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
             tell(out.name, line)
     claim = Claim(out) if first else nullcontext()
     with claim, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
-
-        def advance(stage: str, share: float) -> None:
-            if bar is not None:
-                bar(round(1000 * share), 1000, stage)
-
-        written = prepared.start(advance)
+        written = prepared.start(_shown(bar))
     if first:
         _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
     return written
+
+
+def _shown(bar: Callable[..., None] | None) -> Callable[[str, float], None]:
+    """Return what a training tells its stage and share to."""
+
+    def advance(stage: str, share: float) -> None:
+        if bar is not None:
+            bar(round(1000 * share), 1000, stage)
+
+    return advance
 
 
 @takes(TrainOptions)

@@ -39,7 +39,7 @@ class PotentialConfig:
     psi_limit: float = 0.95
     n_new: int = 10
     lag_ps: float = 0.1
-    timestep_ps: float = 0.0005
+    timestep_ps: float = 0.001
     temperature_k: float = 300.0
     friction_per_ps: float = 1.0
     ensemble: str = "nvt"

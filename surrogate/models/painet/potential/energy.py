@@ -37,7 +37,10 @@ from surrogate.models.painet.surroundings import Surroundings
 # Atomic numbers up to radon, as GFN2-xTB has them.
 N_TYPES = 87
 # Beyond what training has seen pairs are held by a wall: so steep, in units of the energy's scale.
-WALL = 50.0
+WALL = 500.0
+WALL_MARGIN = 1.03
+WALLED_SHELLS = 2
+NO_WALL_NM = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +148,31 @@ class EnergyNetwork(nn.Module):
         nn.init.zeros_(self.table.bias)
         # The shortest and the longest distance of training, by shell and types: beyond them stands a wall.
         self.register_buffer("nearest_nm", torch.zeros(N_SHELLS, N_TYPES, N_TYPES))
-        self.register_buffer("farthest_nm", torch.full((N_SHELLS, N_TYPES, N_TYPES), 1e3))
+        self.register_buffer("farthest_nm", torch.full((N_SHELLS, N_TYPES, N_TYPES), NO_WALL_NM))
         self.nearest_nm: Tensor
         self.farthest_nm: Tensor
+
+    def set_walls(self, positions_nm: Tensor, fabric: Fabric) -> None:
+        """Stand walls a little beyond the distances of samples `(n, n_atoms, 3)` nm: the shortest of all pairs of like
+        types and as many bonds apart, the longest of those one or two bonds apart."""
+        elements = fabric.molecule.elements
+        self.nearest_nm.zero_()
+        self.farthest_nm.fill_(NO_WALL_NM)
+        pairs = {(i, j): N_SHELLS - 1 for i in range(len(elements)) for j in range(i + 1, len(elements))}
+        nearest: dict[tuple[int, int, int], float] = {}
+        farthest: dict[tuple[int, int, int], float] = {}
+        for (i, j), shell in (pairs | fabric.shells).items():
+            distance = (positions_nm[:, i] - positions_nm[:, j]).norm(dim=-1)
+            low, high = sorted((int(elements[i]), int(elements[j])))
+            kind = (shell, low, high)
+            nearest[kind] = min(nearest.get(kind, NO_WALL_NM), float(distance.min()))
+            farthest[kind] = max(farthest.get(kind, 0.0), float(distance.max()))
+        for (shell, low, high), shortest in nearest.items():
+            longest = farthest[shell, low, high]
+            for a, b in ((low, high), (high, low)):
+                self.nearest_nm[shell, a, b] = shortest / WALL_MARGIN
+                if shell < WALLED_SHELLS:
+                    self.farthest_nm[shell, a, b] = longest * WALL_MARGIN
 
     def prepare(self, fabric: Fabric, positions_nm: Tensor) -> Prepared:
         """Return what depends on the molecule, and on frames `(rows, n_atoms, 3)` nm by who is near whom."""
@@ -193,7 +218,7 @@ class EnergyNetwork(nn.Module):
         """Energy `(rows,)` of pairs nearer or farther than any that training saw; zero inside, with two derivatives."""
         near = torch.relu(1.0 - distance_nm / made.nearest_nm.clamp(min=1e-3))
         far = torch.relu(distance_nm / made.farthest_nm - 1.0)
-        return WALL * 10.0 * (near.pow(3) + far.pow(3)).sum(0)
+        return WALL * (near.pow(3) + far.pow(3)).sum(0)
 
 
 def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor:

@@ -67,6 +67,12 @@ class PainetPotential(Surrogate):
         """One vector an atom for the first velocities, then for each step."""
         return (n_atoms, 1 + self.n_new * self.steps_per_frame, 3)
 
+    def train(self, mode: bool = True) -> PainetPotential:
+        """As any module; what was made of earlier weights is forgotten."""
+        self._known = None
+        super().train(mode)
+        return self
+
     def fabric(self, molecule: Molecule) -> Fabric:
         """Return what `evaluate` needs of a molecule. Raises InputError for elements beyond radon."""
         heaviest = int(molecule.elements.max())
@@ -115,9 +121,12 @@ class PainetPotential(Surrogate):
             x, draws = last_frames_nm[:, -1].clone().double(), noise.clone().double()
             masses = self.masses_da(molecule)[:, None]
             thermal = (GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k / masses).sqrt()
-            v = thermal * draws[:, :, 0] if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
+            share = masses / masses.sum()
+            drawn = thermal * draws[:, :, 0]
+            drawn = drawn - (share * drawn).sum(-2, keepdim=True)
+            v = drawn if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
             frames = []
-            move = self._verlet if self.config.ensemble == "nve" else self._langevin
+            move = self.verlet if self.config.ensemble == "nve" else self.langevin
             for draw in draws[:, :, 1:].split(self.steps_per_frame, dim=2):
                 x, v = move(x, v, molecule, masses, thermal, draw)
                 frames.append(x)
@@ -135,22 +144,29 @@ class PainetPotential(Surrogate):
             self._known = known
         return self.evaluate(positions_nm, known[1], known[2]).forces_kj_mol_nm
 
-    def _langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
-                  ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """One frame's steps of the Langevin middle scheme: kick, half a drift, bath, half a drift."""
-        dt = self.config.timestep_ps
+    def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
+                 timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
+        n_steps, 3) holds normal numbers for, by the Langevin middle scheme: kick, half a drift, bath, half a drift.
+
+        `thermal`: what velocities are at the bath's temperature, root mean square; the centre of mass is at rest.
+        """
+        dt = timestep_ps or self.config.timestep_ps
         kept = math.exp(-self.config.friction_per_ps * dt)
         lost = math.sqrt(1.0 - kept * kept) * thermal
+        share = masses / masses.sum()
+        v = v - (share * v).sum(-2, keepdim=True)
         for k in range(draw.shape[2]):
             v = v + dt * self.forces(x, molecule) / masses
             x = x + 0.5 * dt * v
             v = kept * v + lost * draw[:, :, k]
+            v = v - (share * v).sum(-2, keepdim=True)
             x = x + 0.5 * dt * v
         return x, v
 
-    def _verlet(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
-                ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """One frame's steps of velocity Verlet, a leapfrog that shows velocities at full steps."""
+    def verlet(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
+               ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """The same by velocity Verlet, a leapfrog that shows velocities at full steps; without a bath."""
         dt = self.config.timestep_ps
         force = self.forces(x, molecule)
         for _ in range(draw.shape[2]):

@@ -1,15 +1,350 @@
-"""What `train` can do with PAINET as a potential: it learns from forces that are computed for it, not from frames."""
+"""Training of PAINET as a potential: it asks a dear truth about the states it is least sure of, and learns.
+
+States come from hot MD and turned torsions (the teacher's `explore`), then from the model's own rollouts. Members of
+the potential learn from different samples; where their forces spread most, the truth is asked next.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogate.data.frames import TrainingFrames, centre, quantise
 from surrogate.data.references import References
+from surrogate.data.weights import TrainingDomain, save_weights
+from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.model import GAS_CONSTANT_KJ_MOL_K, PainetPotential
+from surrogate.models.painet.potential.samples import Samples
+from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
+from surrogate.training.loss_curves import read_curves
+from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
-from systems.errors import InputError
+from systems.chemistry.limits import limits_from_frames
+from systems.chemistry.validity import geometry_from_frames
+from systems.errors import InputError, SimulationError
+from systems.scene import Scene
+
+# The share of the budget after which no more states are asked for.
+_ASKING_SHARE = 0.6
+# Most of the budget that answers may take.
+_ANSWERING_SHARE = 0.3
+# A sample is learned by a member with this chance.
+_BAG = 0.75
+# Own rollouts: replicas, steps of a ps/1000, and frames kept of each.
+_REPLICAS, _OWN_STEPS, _OWN_FRAMES = 48, 120, 4
+_OWN_STEP_PS = 0.0005
+# Frames of cheap MD on which it is measured how far frames move.
+_MOVING_FRAMES = 400
+
+
+class Answers(Protocol):
+    """States with energies and forces, without those at which the truth finds no answer."""
+
+    @property
+    def positions_nm(self) -> Any: ...
+    @property
+    def energies_kj_mol(self) -> Any: ...
+    @property
+    def forces_kj_mol_nm(self) -> Any: ...
+
+
+class Truth(Protocol):
+    """A dear truth about one molecule (md_reference.run.teacher.Teacher is one)."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+    def explore(self, n_states: int, temperatures_k: tuple[float, ...], *, seed: int) -> Any: ...
+
+    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any: ...
+
+    def label(self, positions_nm: Any) -> Answers: ...
+
+
+@dataclass(frozen=True)
+class PotentialTraining:
+    """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the root mean
+    square error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned.
+    `temperatures_k`: of hot MD and own rollouts. `energy_weight`: of energies beside forces in the loss."""
+
+    budget_s: float | None = None
+    steps: int | None = None
+    batch: int = 16
+    learning_rate: float = 2e-3
+    energy_weight: float = 0.1
+    first: int = 200
+    most: int = 4000
+    rounds: int = 8
+    held_share: float = 0.1
+    tolerance_kj_mol_nm: float = 10.0
+    temperatures_k: tuple[float, ...] = (300.0, 400.0, 500.0, 600.0, 700.0)
+    seed: int = 0
+    device: str = "cpu"
+    validate_every_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if min(self.batch, self.rounds) < 1 or not 8 <= self.first <= self.most:
+            raise InputError(
+                f"batch = {self.batch} and rounds = {self.rounds} must be at least 1, first = {self.first} at least 8 "
+                f"and at most `most` = {self.most}."
+            )
+        if not 0.0 < self.held_share < 1.0 or not self.temperatures_k:
+            raise InputError("held_share must lie between 0 and 1, and temperatures_k name one temperature at least.")
+
+
+class Learner:
+    """A potential, its samples and its teacher: `loss` learns and asks, `errors` measures on held-out states."""
+
+    def __init__(
+        self, model: PainetPotential, truth: Truth, config: PotentialTraining, out: Path, *, resume: bool
+    ) -> None:
+        self.model, self.truth, self.config = model, truth, config
+        self.molecule = Molecule.of(truth.scene)
+        self.fabric = model.fabric(self.molecule)
+        self.path, self.rounds_path = samples_path(out), out.with_name(f"{out.stem}.rounds.csv")
+        self.key = truth.scene.topology_hash
+        self.samples = Samples.none(truth.scene.n_atoms)
+        self.error_kj_mol_nm = np.inf
+        self._spent_s, self._steps = 0.0, 0
+        curves = out.with_suffix(".csv")
+        if resume and curves.exists() and (rows := [row for rows in read_curves(curves).values() for row in rows]):
+            self._spent_s, self._steps = float(rows[-1]["spent_s"]), int(rows[-1]["step"])
+        if resume and self.path.exists():
+            self.samples = Samples.load(self.path, self.key)
+        else:
+            self.rounds_path.unlink(missing_ok=True)
+        self._started = time.monotonic()
+        self._asking = True
+        self._label_s = 0.0
+        if len(self.samples):
+            self._take()
+        else:
+            self._learn(truth.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share)
+            _, energies, forces = self.samples.tensors()
+            model.set_scales(energies, forces)
+
+    @property
+    def share(self) -> float:
+        """Share of the budget that is spent."""
+        c = self.config
+        shares = [0.0 if c.steps is None else self._steps / c.steps]
+        if c.budget_s is not None:
+            shares.append((self._spent_s + time.monotonic() - self._started) / c.budget_s)
+        return max(shares)
+
+    def loss(self, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean square error of the members' forces, in units of the typical force, and of their energies; each sample
+        of a batch is answered by one member, which learns from it or, for some, never does."""
+        self._ask_if_due(generator)
+        self._steps += 1
+        model, c = self.model, self.config
+        x, energies, forces = self._tensors
+        k = torch.randint(len(x), (c.batch,), generator=generator)
+        member = torch.randint(model.config.n_members, (c.batch,), generator=generator)
+        weight = self._bags[k, member]
+        at = x[k].requires_grad_(True)
+        with torch.autocast(at.device.type, enabled=False):
+            found = model.members(at, self.fabric).gather(1, member[:, None])[:, 0]
+            (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
+        scale = model.energy_scale_kj_mol.double()
+        total = weight.sum().clamp(min=1.0)
+        force = (((gradient + forces[k]) / (10.0 * scale)).square().mean((1, 2)) * weight).sum() / total
+        energy = (((found - energies[k]) / scale).square() * weight).sum() / total
+        return force + c.energy_weight * energy, {"force": force.detach(), "energy": energy.detach()}
+
+    def errors(self) -> dict[str, float]:
+        """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
+        absolute force, and of energies (less their mean) in kJ/mol; how many states have been asked for."""
+        held = self.samples.where(self.samples.held)
+        found = self._measured(held)
+        self.error_kj_mol_nm = found["force_rms"]
+        return {f"validation_{k}": v for k, v in found.items()} | {"evaluations": float(len(self.samples))}
+
+    def _measured(self, samples: Samples) -> dict[str, float]:
+        x, energies, forces = samples.tensors()
+        parts = [self.model.evaluate(part, self.fabric) for part in x.split(256)]
+        wrong = torch.cat([part.forces_kj_mol_nm for part in parts]) - forces
+        off = torch.cat([part.energy_kj_mol for part in parts]) - energies
+        return {
+            "force_mae": float(wrong.abs().mean()),
+            "force_rms": float(wrong.square().mean().sqrt()),
+            "mean_force": float(forces.abs().mean()),
+            "energy_mae": float((off - off.mean()).abs().mean()),
+        }
+
+    def _ask_if_due(self, generator: torch.Generator) -> None:
+        c, share = self.config, self.share
+        if not self._asking or share > _ASKING_SHARE or self.error_kj_mol_nm < c.tolerance_kj_mol_nm:
+            return
+        growth = (c.most / c.first) ** (1.0 / c.rounds)
+        due = c.first * growth ** (c.rounds * share / _ASKING_SHARE)
+        have = len(self.samples)
+        if due < min(have * growth, c.most) or have >= c.most:
+            return
+        if c.budget_s is not None and self._label_s > _ANSWERING_SHARE * c.budget_s:
+            self._asking = False
+            return
+        self._ask(round(due) - have, generator)
+
+    def _ask(self, n: int, generator: torch.Generator) -> None:
+        """Ask about `n` states: half those of own rollouts and of hot MD where members spread most, half any."""
+        seed = int(torch.randint(2**31, (), generator=generator))
+        own = self._own_states(seed)
+        hot = self.truth.explore(max(n // 2, 8), self.config.temperatures_k, seed=seed)
+        pool = np.concatenate([own, hot])
+        order = np.random.default_rng(seed).permutation(len(pool))
+        any_ = pool[order[: n // 2]]
+        rest = pool[order[n // 2 :]]
+        spread = self.spread(torch.from_numpy(rest))
+        unsure = rest[np.argsort(-spread)[: n - len(any_)]]
+        self._learn(any_, held=2 * self.config.held_share, measured=True)
+        self._learn(unsure, held=0.0)
+
+    def spread(self, positions_nm: Tensor) -> Any:
+        """Root mean square deviation of the members' forces from their mean, the largest of a state's atoms, `(n,)` in
+        kJ/mol/nm."""
+        parts = [self.model.member_forces(part, self.fabric) for part in positions_nm.double().split(256)]
+        deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
+        return torch.nan_to_num(deviation, nan=0.0).numpy()
+
+    def _own_states(self, seed: int) -> Any:
+        """Return finite states `(n, n_atoms, 3)` of short rollouts from samples, at the temperatures of hot MD."""
+        rng, model = np.random.default_rng(seed), self.model
+        start = rng.integers(len(self.samples), size=_REPLICAS)
+        temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=_REPLICAS))
+        masses = self.molecule.masses_da.double()[:, None]
+        thermal = (GAS_CONSTANT_KJ_MOL_K * temperatures[:, None, None] / masses).sqrt()
+        x = torch.from_numpy(self.samples.positions_nm[start])
+        generator = torch.Generator().manual_seed(seed)
+        v = thermal * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+        frames = []
+        model.eval()
+        for _ in range(_OWN_FRAMES):
+            draw = torch.randn(*x.shape[:2], _OWN_STEPS // _OWN_FRAMES, 3, generator=generator, dtype=x.dtype)
+            x, v = model.langevin(x, v, self.molecule, masses, thermal, draw, timestep_ps=_OWN_STEP_PS)
+            frames.append(x)
+        model.train()
+        found = torch.cat(frames)
+        return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
+
+    def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
+        """Ask about states and take the answers; `measured`: note the error before they are learned."""
+        began = time.monotonic()
+        answers = self.truth.label(states)
+        self._label_s += time.monotonic() - began
+        n = len(answers.energies_kj_mol)
+        if not n:
+            if not len(self.samples):
+                raise SimulationError(f"the truth finds no answer for any state of {self.truth.scene.name!r}.")
+            return
+        kept = np.arange(n) < round(held * n)
+        new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
+        if measured:
+            row = {"evaluations": len(self.samples), "share": self.share, **self._measured(self.samples.plausible(new))}
+            append_row(self.rounds_path, row)
+        self.samples = self.samples.joined(new)
+        self.samples.save(self.path, self.key)
+        self._take()
+
+    def _take(self) -> None:
+        learned = self.samples.where(~self.samples.held)
+        if len(learned) < 2 or not self.samples.held.any():
+            raise SimulationError(f"too few states of {self.truth.scene.name!r} have an answer to learn from.")
+        self._tensors = learned.tensors()
+        bags = torch.rand(len(learned), self.model.config.n_members, generator=torch.Generator().manual_seed(1)) < _BAG
+        self._bags = bags.float()
+        self.model.network.set_walls(self._tensors[0], self.fabric)
+
+
+def samples_path(out: Path) -> Path:
+    """Return where the samples of weights lie."""
+    return out.with_name(f"{out.stem}.samples.safetensors")
+
+
+def learn_potential(
+    truth: Truth, out: Path, model_config: PotentialConfig, config: PotentialTraining, *, resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> Path:  # fmt: skip
+    """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
+    and the error of forces against evaluations, round by round (NAME.rounds.csv)."""
+    torch.manual_seed(config.seed)
+    model = PainetPotential(model_config)
+    log, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.potential.train.safetensors")
+    if not resume:
+        for path in (log, state, samples_path(out)):
+            path.unlink(missing_ok=True)
+    learner = Learner(model, truth, config, out, resume=resume)
+    stage = StageConfig("potential", config.batch, config.learning_rate, config.budget_s, config.steps,
+                        seed=config.seed, bf16=False, validate_every_s=config.validate_every_s)  # fmt: skip
+
+    def advance(name: str, share: float, metrics: dict[str, float]) -> None:
+        if progress is not None:
+            progress(_line(learner), share, metrics)
+
+    place = StagePlace(state, log, torch.device("cpu"), resume)
+    with _one_thread():
+        spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
+    errors = learner.errors()
+    domain, frames = domain_of(truth, learner.samples, model_config, config.seed)
+    found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in errors.items()}
+    settings = {"seed": config.seed, "training_s": round(spent, 1), **found}
+    save_weights(out, model.eval(), domain, provenance_of(frames, settings))
+    state.unlink(missing_ok=True)
+    return out
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Inside, torch computes on one core: its arrays are small, and the truth has use for the others."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _line(learner: Learner) -> str:
+    n = len(learner.samples)
+    if not np.isfinite(learner.error_kj_mol_nm):
+        return f"{n} evaluations"
+    return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
+
+
+def domain_of(
+    truth: Truth, samples: Samples, config: PotentialConfig, seed: int
+) -> tuple[TrainingDomain, TrainingFrames]:
+    """Return what the weights cover, and the frames behind it: the truth's quieter samples say what frames look like,
+    cheap MD of the molecule how far they move from one to the next."""
+    moving = truth.motion(_MOVING_FRAMES, config.lag_ps, config.temperature_k, seed=seed)
+    conditions = {
+        "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
+        "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
+        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": False,
+    }  # fmt: skip
+    sources = ({"file": "samples", "n_frames": len(samples)},)
+    frames = TrainingFrames(truth.scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
+                            conditions, sources)  # fmt: skip
+    quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
+    looks = limits_from_frames(truth.scene, quiet, quiet)
+    moves = training_domain(frames)
+    assert moves.limits is not None
+    limits = replace(looks, **{key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")})
+    geometry = geometry_from_frames(truth.scene, quiet)
+    return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict()), frames
 
 
 class PotentialTrainer(Trainer):
-    """Refuses trajectories, which say too little about forces."""
+    """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its truth."""
 
     def check(self, request: TrainingRequest) -> None:
         raise InputError(
@@ -18,8 +353,19 @@ class PotentialTrainer(Trainer):
         )
 
     def settings(self, request: TrainingRequest) -> Settings:
-        return Settings(PotentialConfig.from_dict(request.model), None)
+        """See `Trainer.settings`."""
+        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
+        training = request.settings(PotentialTraining, asked)
+        return Settings(PotentialConfig.from_dict(request.model), training, frozenset(asked))
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         self.check(request)
         raise AssertionError("refused above")
+
+    def learn(self, truth: Truth, request: TrainingRequest, advance: Callable[[str, float], None]) -> Path:
+        """Learn a molecule from its truth, as the request has it, and return the weights."""
+        settings = self.settings(request)
+        return learn_potential(
+            truth, request.out, settings.model, settings.training, resume=request.resume,
+            progress=lambda stage, share, metrics: advance(stage, share),
+        )  # fmt: skip

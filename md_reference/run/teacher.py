@@ -1,0 +1,174 @@
+"""A dear truth as a teacher: states of a molecule to ask about, and its energies and forces there, a process a core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import TracebackType
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from md_reference.forces.quantum import Potential
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
+from md_reference.run.config import Conditions
+from md_reference.run.engine import Engine
+from md_reference.run.machine import available_cores
+from md_reference.run.parent_watch import end_with_parent
+from systems.chemistry.graph import bonded_graph, rotatable_torsions
+from systems.errors import PreparationError, SimulationError
+from systems.scene import FloatArray, Scene
+
+_TIMESTEP_PS = 0.0005
+_SETTLE_PS = 2.0
+_APART_PS = 0.25
+# Every so many-th hot state has one of its torsions turned to any angle.
+_TURN_EVERY = 3
+# Atoms that a turned torsion brings nearer than this are no state of the molecule.
+_CLASH_NM = 0.14
+_worker: Potential | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in
+    kJ/mol/nm; `failed`: how many more were asked for, at which the truth finds no answer."""
+
+    positions_nm: FloatArray
+    energies_kj_mol: FloatArray
+    forces_kj_mol_nm: FloatArray
+    failed: int = 0
+
+
+class Teacher:
+    """GFN2-xTB of one molecule. Use as a context manager or call `close`.
+
+    Raises PreparationError for what GFN2-xTB refuses.
+    """
+
+    def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
+        self.scene = scene
+        self._potential = Potential(scene)
+        self._potential(scene.positions_nm)  # what the method refuses is known before anything runs
+        n_workers = workers or available_cores()
+        self._pool: Any = None
+        if n_workers > 1:
+            context = multiprocessing.get_context("spawn")
+            self._pool = context.Pool(n_workers, _start, (scene.to_dict(),))
+
+    def __enter__(self) -> Teacher:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+                 ) -> None:  # fmt: skip
+        self.close()
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.terminate()
+            self._pool.join()
+            self._pool = None
+
+    def label(self, positions_nm: FloatArray) -> Labels:
+        """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out."""
+        states = list(np.asarray(positions_nm, dtype=np.float64))
+        if self._pool is None:
+            answers = [_answer(self._potential, state) for state in states]
+        else:
+            answers = self._pool.map(_ask, states, chunksize=4)
+        good = [(state, answer) for state, answer in zip(states, answers, strict=True) if answer is not None]
+        shape = (len(good), self.scene.n_atoms, 3)
+        return Labels(
+            np.array([state for state, _ in good]).reshape(shape),
+            np.array([energy for _, (energy, _) in good]),
+            np.array([forces for _, (_, forces) in good]).reshape(shape),
+            len(states) - len(good),
+        )
+
+    def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
+        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters; of every
+        third one torsion is turned. They are near the molecule's own, and as many at each temperature."""
+        rng = np.random.default_rng(seed)
+        each = -(-n_states // len(temperatures_k))
+        found = []
+        for temperature_k in temperatures_k:
+            found.append(self.motion(each, _APART_PS, temperature_k, seed=int(rng.integers(2**31))))
+        states = np.concatenate(found)
+        torsions = rotatable_torsions(self.scene, rotors=True)
+        if len(torsions):
+            graph = bonded_graph(self.scene)
+            for k in range(0, len(states), _TURN_EVERY):
+                states[k] = _turned(states[k], torsions[rng.integers(len(torsions))], graph, rng.uniform(-np.pi, np.pi))
+        order: FloatArray = states[rng.permutation(len(states))[:n_states]]
+        return order
+
+    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> FloatArray:
+        """Return frames `(n_frames, n_atoms, 3)` nm of MD, `lag_ps` apart, by GAFF2, or by GFN2-xTB where GAFF2 has no
+        parameters; the centre of mass stays where it is."""
+        spec, system = self._cheap
+        conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=_TIMESTEP_PS, seed=seed,
+                                platform="Reference")  # fmt: skip
+        frames = np.empty((n_frames, self.scene.n_atoms, 3))
+        with Engine(self.scene, conditions, system=system) as engine:
+            engine.minimise()
+            engine.thermalise()
+            engine.step(round(_SETTLE_PS / _TIMESTEP_PS))
+            for k in range(n_frames):
+                engine.step(round(lag_ps / _TIMESTEP_PS))
+                frames[k] = engine.positions()
+        share = self.scene.masses_da / self.scene.masses_da.sum()
+        return frames - np.einsum("n,tnk->tk", share, frames)[:, None]
+
+    @cached_property
+    def _cheap(self) -> tuple[ForceFieldSpec, Any]:
+        """The forces of hot MD, and their `openmm.System`."""
+        from md_reference.forces.forcefield import build_system
+
+        spec = ForceFieldSpec("gaff2", "vacuum", None, constrain_hydrogens=False)
+        try:
+            return spec, build_system(self.scene, spec)
+        except PreparationError:
+            spec = ForceFieldSpec(QUANTUM, "vacuum", None, constrain_hydrogens=False)
+            return spec, build_system(self.scene, spec)
+
+
+def _turned(x: FloatArray, torsion: Any, graph: nx.Graph, angle: float) -> FloatArray:
+    """Return positions with what hangs beyond a torsion's middle bond turned about it, unless atoms then collide."""
+    _, b, c, _ = (int(k) for k in torsion)
+    cut = graph.copy()
+    cut.remove_edge(b, c)
+    side = np.array(sorted(nx.node_connected_component(cut, c)))
+    axis = (x[c] - x[b]) / np.linalg.norm(x[c] - x[b])
+    arm = x[side] - x[c]
+    turned = arm * np.cos(angle) + np.cross(axis, arm) * np.sin(angle)
+    turned += np.outer(arm @ axis, axis) * (1.0 - np.cos(angle))
+    out = x.copy()
+    out[side] = x[c] + turned
+    rest = np.setdiff1d(np.arange(len(x)), [*side.tolist(), b])
+    far = side[side != c]
+    apart = np.linalg.norm(out[far][:, None] - out[rest], axis=-1)
+    return x if apart.size and apart.min() < _CLASH_NM else out
+
+
+def _start(scene: dict[str, Any]) -> None:
+    global _worker
+    os.environ["OMP_NUM_THREADS"] = "1"
+    end_with_parent()
+    _worker = Potential(Scene.from_dict(scene))
+
+
+def _ask(state: FloatArray) -> tuple[float, FloatArray] | None:
+    assert _worker is not None
+    return _answer(_worker, state)
+
+
+def _answer(potential: Potential, state: FloatArray) -> tuple[float, FloatArray] | None:
+    try:
+        return potential(state)
+    except (PreparationError, SimulationError):
+        return None

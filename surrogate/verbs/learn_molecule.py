@@ -1,0 +1,57 @@
+"""Training on a molecule itself: a potential that learns the energies and forces of a dear level of theory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from surrogate.models.registry import architecture
+from surrogate.verbs.options import TrainOptions, Trajectories
+from surrogate.verbs.scene_listing import prepare_scene
+from surrogate.verbs.telling import tell
+from systems.errors import InputError
+from systems.preparation import Preparation
+from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from surrogate.training.trainer import TrainingRequest
+
+POTENTIAL = "painet-potential"
+
+
+def learn_molecule(
+    given: Trajectories | Scene, request: TrainingRequest, options: TrainOptions, advance: Callable[[str, float], None]
+) -> Path:
+    """Learn the molecule that `given` names from `options.level` and return the weights.
+
+    Raises InputError for what means nothing here, PreparationError for what the level of theory refuses.
+    """
+    from md_reference.forces.spec import QUANTUM, at_level
+
+    if at_level(options.level, None) != QUANTUM:
+        raise InputError(f"a level is worth learning where it is dear; use `level='{QUANTUM}'`, or a reference of MD.")
+    if request.arch not in ("", "painet", POTENTIAL):
+        raise InputError(f"{request.arch} learns from trajectories; use `arch='painet'`, or leave `level` out.")
+    unknown = {"`start_from`": options.start_from, "`longest_lag_ps`": options.longest_lag_ps,
+               "`validation`": options.validation}  # fmt: skip
+    if told := [name for name, value in unknown.items() if value is not None]:
+        raise InputError(f"{', '.join(told)}: a potential learns from states that it asks about; leave it out.")
+    if request.budget_s is None and request.steps is None:
+        raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
+    if not isinstance(given, str | Path | Scene):
+        named = list(given)
+        if len(named) != 1:
+            raise InputError(f"one molecule a model: {len(named)} are given.")
+        given = named[0]
+    scene = prepare_scene(given, Preparation(), quiet=options.quiet)
+
+    from md_reference.run.teacher import Teacher
+    from surrogate.models.painet.potential.trainer import PotentialTrainer
+
+    trainer: PotentialTrainer = architecture(POTENTIAL).trainer()
+    trainer.settings(request)  # what is wrong with them is known before anything is computed
+    with Teacher(scene) as truth:
+        if not options.quiet:
+            tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
+        return trainer.learn(truth, request, advance)

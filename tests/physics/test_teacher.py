@@ -1,0 +1,57 @@
+"""The teacher: states of a molecule and GFN2-xTB's answers at them, alone and in processes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from md_reference.forces.quantum import Potential
+from md_reference.run.teacher import Teacher
+from systems.errors import PreparationError
+from systems.prepare.molecule import scene_from_smiles
+
+pytest.importorskip("tblite")
+
+
+def test_answers_are_the_potentials_own_whoever_computes_them() -> None:
+    scene = scene_from_smiles("CO")
+    rng = np.random.default_rng(0)
+    states = scene.positions_nm + 0.003 * rng.normal(size=(3, scene.n_atoms, 3))
+    with Teacher(scene, workers=1) as alone, Teacher(scene, workers=2) as many:
+        here, there = alone.label(states), many.label(states)
+    for k, state in enumerate(states):
+        energy, forces = Potential(scene)(state)
+        for found in (here, there):
+            assert found.energies_kj_mol[k] == pytest.approx(energy, abs=1e-6)
+            np.testing.assert_allclose(found.forces_kj_mol_nm[k], forces, atol=1e-4)
+
+
+def test_states_without_an_answer_are_left_out_and_counted() -> None:
+    scene = scene_from_smiles("CO")
+    states = np.stack([scene.positions_nm, np.zeros_like(scene.positions_nm)])
+    with Teacher(scene, workers=1) as teacher:
+        found = teacher.label(states)
+    assert found.failed == 1
+    np.testing.assert_array_equal(found.positions_nm, states[:1])
+
+
+def test_hot_states_keep_their_bonds_and_turn_their_torsions() -> None:
+    scene = scene_from_smiles("OCCO")
+    with Teacher(scene, workers=1) as teacher:
+        found, again = (teacher.explore(24, (300.0, 600.0), seed=1) for _ in range(2))
+    np.testing.assert_array_equal(found, again)
+    assert found.shape == (24, scene.n_atoms, 3)
+    for i, j in scene.bonds:
+        rest = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j])
+        assert (np.abs(np.linalg.norm(found[:, i] - found[:, j], axis=-1) / rest - 1.0) < 0.3).all()
+    # Hydrogens of the hydroxyls stand near and far from the other oxygen.
+    apart = np.linalg.norm(found[:, 4] - found[:, 3], axis=-1)
+    assert np.ptp(apart) > 0.1
+
+
+def test_what_the_level_refuses_is_known_at_once() -> None:
+    scene = scene_from_smiles("CO")
+    with pytest.raises(PreparationError, match="unpaired"):
+        Teacher(replace(scene, provenance=scene.provenance | {"multiplicity": 2}), workers=1)

@@ -1,0 +1,145 @@
+"""PAINET learns a potential whose answer is known: bonds and angles of a small molecule, as a force field has them."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.weights import load_weights
+from surrogate.models.interface import Molecule, draw_noise
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.samples import Samples
+from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
+from systems.errors import InputError, SimulationError
+from systems.prepare.molecule import scene_from_smiles
+from systems.scene import Scene
+
+SMALL = PotentialConfig(width=24, n_radial=8, n_scalars=6, n_vectors=4, n_tensors=2, n_heads=2, head_dim=4, n_new=2,
+                        lag_ps=0.01)  # fmt: skip
+QUICK = PotentialTraining(steps=12, batch=8, first=24, most=60, rounds=2, tolerance_kj_mol_nm=0.0,
+                          temperatures_k=(300.0, 600.0))  # fmt: skip
+
+
+@dataclass
+class Answers:
+    positions_nm: Any
+    energies_kj_mol: Any
+    forces_kj_mol_nm: Any
+
+
+class Springs:
+    """A truth that is quickly told: springs between all atoms at most two bonds apart."""
+
+    def __init__(self, *, silent: bool = False) -> None:
+        self.scene: Scene = scene_from_smiles("O")
+        self.silent, self.asked = silent, 0
+        x = self.scene.positions_nm
+        pairs = [(i, j) for i in range(3) for j in range(i + 1, 3)]
+        self.pairs = [(i, j, float(np.linalg.norm(x[i] - x[j]))) for i, j in pairs]
+
+    def explore(self, n_states: int, temperatures_k: tuple[float, ...], *, seed: int) -> Any:
+        rng = np.random.default_rng(seed)
+        return self.scene.positions_nm + 0.006 * rng.normal(size=(n_states, 3, 3))
+
+    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any:
+        return self.explore(n_frames, (temperature_k,), seed=seed)
+
+    def label(self, positions_nm: Any) -> Answers:
+        self.asked += len(positions_nm)
+        x = positions_nm[:0] if self.silent else np.asarray(positions_nm, dtype=np.float64)
+        energies, forces = np.full(len(x), -7000.0), np.zeros_like(x)
+        for i, j, rest in self.pairs:
+            apart = x[:, i] - x[:, j]
+            length = np.linalg.norm(apart, axis=-1)
+            energies += 0.5 * 2e5 * (length - rest) ** 2
+            pull = (2e5 * (length - rest) / length)[:, None] * apart
+            forces[:, i] -= pull
+            forces[:, j] += pull
+        return Answers(x, energies, forces)
+
+
+def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
+    truth, out = Springs(), tmp_path / "w.safetensors"
+    config = replace(QUICK, steps=100, learning_rate=5e-3)
+    learn_potential(truth, out, SMALL, config)
+    weights = load_weights(out)
+    found = weights.provenance
+    assert found["force_rms"] < 0.4 * found["mean_force"]
+    assert found["evaluations"] > QUICK.first
+    samples = Samples.load(samples_path(out), truth.scene.topology_hash)
+    assert len(samples) == found["evaluations"] <= truth.asked
+    assert 0 < samples.held.sum() < 0.3 * len(samples)
+    with out.with_name("w.rounds.csv").open() as handle:
+        rounds = list(csv.DictReader(handle))
+    assert [int(r["evaluations"]) for r in rounds] == sorted(int(r["evaluations"]) for r in rounds)
+    # The file gives back the potential: its forces at held-out states, and a rollout that stays whole.
+    model, molecule = weights.model, Molecule.of(truth.scene)
+    held = samples.where(samples.held)
+    forces = model.forces(torch.from_numpy(held.positions_nm), molecule).numpy()
+    error = np.sqrt(np.mean((forces - held.forces_kj_mol_nm) ** 2))
+    assert error == pytest.approx(found["force_rms"], rel=0.01)
+    noise = draw_noise(model, 3, [torch.Generator().manual_seed(0)])
+    chunk = model.next_chunk(torch.tensor(truth.scene.positions_nm[None, None]).float(), molecule, noise)
+    lengths = (chunk.frames_nm[..., 0, :] - chunk.frames_nm[..., 1, :]).norm(dim=-1)
+    assert ((lengths - truth.pairs[0][2]).abs() < 0.05).all()
+
+
+def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> None:
+    truth = Springs()
+    from surrogate.models.painet.potential.model import PainetPotential
+
+    torch.manual_seed(0)
+    learner = Learner(PainetPotential(SMALL), truth, QUICK, tmp_path / "w.safetensors", resume=False)
+    optimiser = torch.optim.Adam(learner.model.parameters(), 5e-3)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(90):
+        loss, _ = learner.loss(generator)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    near = torch.from_numpy(truth.explore(20, (300.0,), seed=9))
+    far = near + 0.03 * torch.randn(near.shape, generator=generator, dtype=near.dtype)
+    assert np.median(learner.spread(far)) > 1.3 * np.median(learner.spread(near))
+
+
+def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
+    truth, out = Springs(), tmp_path / "w.safetensors"
+
+    class Stopped(Exception):
+        pass
+
+    def stop(line: str, share: float, metrics: dict[str, float]) -> None:
+        if metrics:
+            raise Stopped
+
+    config = replace(QUICK, validate_every_s=0.0)
+    with pytest.raises(Stopped):
+        learn_potential(truth, out, SMALL, config, progress=stop)
+    assert not out.exists() and samples_path(out).exists()
+    asked = truth.asked
+    learn_potential(truth, out, SMALL, config, resume=True)
+    assert out.exists()
+    # The first states are not asked for again.
+    assert truth.asked - asked < QUICK.most
+    assert not list(tmp_path.glob("*.train.safetensors"))
+
+
+def test_a_truth_without_answers_and_foreign_samples_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="no answer"):
+        learn_potential(Springs(silent=True), tmp_path / "w.safetensors", SMALL, QUICK)
+    Samples.none(3).save(tmp_path / "s.safetensors", "mine")
+    with pytest.raises(InputError, match="another molecule"):
+        Samples.load(tmp_path / "s.safetensors", "yours")
+    blob = bytearray((tmp_path / "s.safetensors").read_bytes())
+    (tmp_path / "s.safetensors").write_bytes(blob[:40])
+    with pytest.raises(InputError, match="resume"):
+        Samples.load(tmp_path / "s.safetensors", "mine")
+    for wrong in ({"first": 4}, {"batch": 0}, {"held_share": 0.0}, {"temperatures_k": ()}):
+        with pytest.raises(InputError):
+            replace(QUICK, **wrong)
