@@ -15,8 +15,8 @@ from systems.errors import InputError
 from systems.files.whole_file import create_whole
 
 Array = Any
-# So far above the lowest state, for each atom, that no rollout comes there: three times 2,000 K's share.
-_HIGHEST_KJ_MOL = 25.0
+# So far above the lowest state, for each atom, that no rollout comes there: the potential energy of 1,200 K.
+_HIGHEST_KJ_MOL = 15.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,8 +72,8 @@ class Truth(Protocol):
 
 @dataclass(frozen=True)
 class PotentialTraining:
-    """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the root mean
-    square error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned.
+    """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the mean
+    absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned.
     `temperatures_k`: of hot MD and own rollouts. `energy_weight`: of energies beside forces in the loss."""
 
     budget_s: float | None = None
@@ -166,7 +166,7 @@ class Learner:
         absolute force, and of energies (less their mean) in kJ/mol; how many states have been asked for."""
         held = self.samples.where(self.samples.held)
         found = self._measured(held)
-        self.error_kj_mol_nm = found["force_rms"]
+        self.error_kj_mol_nm = found["force_mae"]
         return {f"validation_{k}": v for k, v in found.items()} | {"evaluations": float(len(self.samples))}
 
     def _measured(self, samples: Samples) -> dict[str, float]:

@@ -1,0 +1,91 @@
+"""A learned potential behind OpenMM's and ASE's faces, and the weights that make its frames those of the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surrogate.data.weights import TrainingDomain, Weights
+from surrogate.models.painet.config import PainetConfig
+from surrogate.models.painet.model import Painet
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces, reweighting
+from systems.chemistry.matching import match_atoms
+from systems.chemistry.validity import geometry_from_frames
+from systems.errors import InputError, OutOfDomainError
+from systems.prepare.molecule import scene_from_smiles
+
+SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4)
+
+
+def weights(model: PainetPotential | Painet | None = None) -> Weights:
+    scene = scene_from_smiles("CO")
+    torch.manual_seed(0)
+    model = model or PainetPotential(SMALL)
+    frames = scene.positions_nm + 0.01 * np.random.default_rng(0).normal(size=(50, scene.n_atoms, 3))
+    domain = TrainingDomain(scene, 0.1, {"temperature_k": 300.0}, geometry_from_frames(scene, frames).to_dict())
+    return Weights(model.eval().requires_grad_(False), domain, {}, "0", Path("w.safetensors"))
+
+
+def test_forces_follow_the_scenes_own_order_of_atoms() -> None:
+    loaded = weights()
+    scene = loaded.domain.scene
+    energy, forces = LearnedForces(scene, loaded)(scene.positions_nm)
+    order = match_atoms(mixed := scene_from_smiles("OC"), scene)
+    placed = np.empty_like(scene.positions_nm)
+    placed[order] = scene.positions_nm
+    other, turned = LearnedForces(mixed, loaded)(placed)
+    assert mixed.elements != scene.elements
+    assert other == pytest.approx(energy)
+    np.testing.assert_allclose(turned[order], forces, atol=1e-3)
+    assert np.abs(forces).max() > 1.0
+
+
+def test_openmm_and_ase_see_the_same_energy_and_forces() -> None:
+    import openmm
+
+    loaded = weights()
+    scene = loaded.domain.scene
+    learned = LearnedForces(scene, loaded)
+    energy, forces = learned(scene.positions_nm)
+    system = openmm.System()
+    for mass in scene.masses_da.tolist():
+        system.addParticle(mass)
+    system.addForce(learned.openmm_force())
+    context = openmm.Context(system, openmm.VerletIntegrator(0.0005), openmm.Platform.getPlatform("Reference"))
+    context.setPositions(scene.positions_nm)
+    state = context.getState(energy=True, forces=True)
+    assert state.getPotentialEnergy()._value == pytest.approx(energy, abs=1e-6)
+    np.testing.assert_allclose(state.getForces(asNumpy=True)._value, forces, atol=1e-6)
+    ase = pytest.importorskip("ase")
+    atoms = ase.Atoms(list(scene.elements), positions=10.0 * scene.positions_nm, calculator=learned.ase_calculator())
+    assert atoms.get_potential_energy() == pytest.approx(energy / KJ_MOL_PER_EV, rel=1e-6)
+    np.testing.assert_allclose(atoms.get_forces(), 0.1 * forces / KJ_MOL_PER_EV, atol=1e-6)
+    others = ase.Atoms(list(scene.elements)[::-1], positions=10.0 * scene.positions_nm)
+    others.calc = learned.ase_calculator()
+    with pytest.raises(InputError, match="order"):
+        others.get_forces()
+
+
+def test_other_weights_and_other_molecules_are_refused() -> None:
+    with pytest.raises(InputError, match="frames, not forces"):
+        LearnedForces(scene_from_smiles("CO"), weights(Painet(PainetConfig(n_new=2, width=16))))
+    with pytest.raises(OutOfDomainError):
+        LearnedForces(scene_from_smiles("CCO"), weights())
+
+
+def test_frames_of_a_wrong_spring_are_reweighted_to_the_right_one() -> None:
+    rng, kt = np.random.default_rng(0), 8.31446261815324e-3 * 300.0
+    x = rng.normal(size=20_000) * np.sqrt(kt / 100.0)  # in a spring of 100 kJ/mol/nm^2, the truth's is 150
+    difference = 0.5 * 50.0 * x**2
+    weight, effective = reweighting(difference, 300.0)
+    assert weight.sum() == pytest.approx(1.0)
+    assert (weight * x**2).sum() == pytest.approx(kt / 150.0, rel=0.03)
+    # Negative control: as they are, the frames say otherwise.
+    assert np.mean(x**2) > 1.4 * kt / 150.0
+    assert 0.8 * len(x) < effective < 0.999 * len(x)
+    assert reweighting(np.zeros(10), 300.0)[1] == pytest.approx(10.0)
