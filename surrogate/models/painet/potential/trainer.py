@@ -294,10 +294,12 @@ def learn_potential(
     with _one_thread():
         spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
     errors = learner.errors()
-    domain, frames = domain_of(truth, learner.samples, model_config, config.seed)
+    domain = domain_of(truth, learner.samples, model_config, config.seed)
+    # No MD of the truth was made: what it answered is the reference.
+    origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
     found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in errors.items()}
     settings = {"seed": config.seed, "training_s": round(spent, 1), **found}
-    save_weights(out, model.eval(), domain, provenance_of(frames, settings))
+    save_weights(out, model.eval(), domain, provenance_of(origin, settings))
     state.unlink(missing_ok=True)
     return out
 
@@ -320,27 +322,24 @@ def _line(learner: Learner) -> str:
     return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
 
 
-def domain_of(
-    truth: Truth, samples: Samples, config: PotentialConfig, seed: int
-) -> tuple[TrainingDomain, TrainingFrames]:
-    """Return what the weights cover, and the frames behind it: the truth's quieter samples say what frames look like,
-    cheap MD of the molecule how far they move from one to the next."""
+def domain_of(truth: Truth, samples: Samples, config: PotentialConfig, seed: int) -> TrainingDomain:
+    """Return what the weights cover: the truth's quieter samples say what frames look like, cheap MD of the molecule
+    how far they move from one to the next."""
     moving = truth.motion(_MOVING_FRAMES, config.lag_ps, config.temperature_k, seed=seed)
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
         "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": False,
     }  # fmt: skip
-    sources = ({"file": "samples", "n_frames": len(samples)},)
     frames = TrainingFrames(truth.scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
-                            conditions, sources)  # fmt: skip
+                            conditions, ())  # fmt: skip
     quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
     looks = limits_from_frames(truth.scene, quiet, quiet)
     moves = training_domain(frames)
     assert moves.limits is not None
     limits = replace(looks, **{key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")})
     geometry = geometry_from_frames(truth.scene, quiet)
-    return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict()), frames
+    return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict())
 
 
 class PotentialTrainer(Trainer):
