@@ -46,7 +46,8 @@ def perceive(
     for i, j in bonds.tolist():
         neighbours[i].append(j)
         neighbours[j].append(i)
-    orders, charges, bad = _match(elements, bonds, neighbours)
+    found = _Kekule(elements, bonds, neighbours)
+    orders, charges, bad = found.orders, found.charges, found.bad
     valence = np.zeros(len(elements))
     np.add.at(valence, bonds.ravel(), np.repeat(orders, 2))
     doubtful = set(bad) | {
@@ -70,14 +71,14 @@ def perceive(
         rank = {i: k for k, i in enumerate(atoms)}
         rows = [k for k, (i, _) in enumerate(bonds.tolist()) if i in rank]
         own = np.array([[rank[i], rank[j]] for i, j in bonds[rows].tolist()], dtype=np.int64).reshape(-1, 2)
-        found = lewis_structure([elements[i] for i in atoms], own)
-        if found is None and positions_nm is not None:  # with every carbon flat, one of them may be an ion
-            found = lewis_structure([elements[i] for i in atoms], own, carbon_ions=True)
-        if found is None:
+        better = lewis_structure([elements[i] for i in atoms], own)
+        if better is None and positions_nm is not None:  # with every carbon flat, one of them may be an ion
+            better = lewis_structure([elements[i] for i in atoms], own, carbon_ions=True)
+        if better is None:
             raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
         if positions_nm is not None:
             _refuse_bent(elements, neighbours, molecule - set(trusted), positions_nm)
-        orders[rows], charges[atoms] = found
+        orders[rows], charges[atoms] = better
     return orders, charges
 
 
@@ -112,63 +113,102 @@ def _refuse_bent(
         raise ValenceError(bent)
 
 
-def _match(
-    elements: Sequence[str], bonds: npt.NDArray[np.int64], neighbours: list[list[int]]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], list[int]]:
-    """Orders and charges by matching, and the atoms that fit nothing."""
-    charges = np.zeros(len(elements), dtype=np.int64)
-    order = {(min(i, j), max(i, j)): 1 for i, j in bonds.tolist()}
-    open_valence = [_open_valence(elements, neighbours, i, charges) for i in range(len(elements))]
-    bad = [i for i, u in enumerate(open_valence) if u < 0]
-    if not bad:
-        _hypervalent(elements, neighbours, open_valence, order, charges)
-        _pair(elements, neighbours, open_valence, order)
-        _settle(elements, neighbours, open_valence, order, charges)
-        bad = [i for i, u in enumerate(open_valence) if u > 0]
-    orders = np.array([order[min(i, j), max(i, j)] for i, j in bonds.tolist()], dtype=np.float64)
-    return orders, charges, bad
+class _Kekule:
+    """One Kekulé structure by matching: `orders (n_bonds,)`, `charges (n_atoms,)`, `bad` atoms that fit nothing.
+
+    While it is made, `order` holds that of each bond (i, j), i < j, and `_open` what valence each atom has left, below
+    zero where it has too many bonds.
+    """
+
+    def __init__(self, elements: Sequence[str], bonds: npt.NDArray[np.int64], neighbours: list[list[int]]) -> None:
+        self._elements, self._neighbours = elements, neighbours
+        self.charges = np.zeros(len(elements), dtype=np.int64)
+        self.order = {(min(i, j), max(i, j)): 1 for i, j in bonds.tolist()}
+        self._open = [self._open_valence(i) for i in range(len(elements))]
+        self.bad = [i for i, u in enumerate(self._open) if u < 0]
+        if not self.bad:
+            self._oxidise()
+            self._pair()
+            self._settle()
+            self.bad = [i for i, u in enumerate(self._open) if u > 0]
+        self.orders = np.array([self.order[min(i, j), max(i, j)] for i, j in bonds.tolist()], dtype=np.float64)
+
+    def _strengthen(self, i: int, j: int) -> None:
+        self.order[min(i, j), max(i, j)] += 1
+
+    def _open_valence(self, i: int) -> int:
+        symbol, degree = self._elements[i], len(self._neighbours[i])
+        if degree == 0 and symbol in _IONS:
+            self.charges[i] = _IONS[symbol]
+            return 0
+        if symbol not in _VALENCE:
+            return -1
+        if symbol in ("P", "S", "Se") and degree >= 3:
+            return 0
+        if (symbol == "N" and degree == 4) or (symbol == "O" and degree == 3):
+            self.charges[i] = 1
+            return 0
+        if symbol == "B" and degree == 4:
+            self.charges[i] = -1
+            return 0
+        return _VALENCE[symbol] - degree
+
+    def _oxidise(self) -> None:
+        """Nitro groups and the oxides of P and S, whose centres have no open valence of their own."""
+        for i, symbol in enumerate(self._elements):
+            near = self._neighbours[i]
+            ends = [j for j in near if self._elements[j] in ("O", "S") and len(self._neighbours[j]) == 1]
+            degree = len(near)
+            room = 0
+            if symbol == "N" and degree == 3 and len(ends) >= 2:
+                room, self.charges[i] = 1, 1
+            elif (symbol, degree) in (("P", 4), ("S", 3), ("Se", 3)):
+                room = 1
+            elif symbol in ("S", "Se") and degree == 4:
+                room = 2
+            for j in ends[:room]:
+                self._strengthen(i, j)
+                self._open[j] -= 1
+            if not ends[:room] and ((symbol in ("S", "Se") and degree == 3) or (symbol == "P" and degree == 4)):
+                self.charges[i] = 1  # sulfonium, phosphonium
+
+    def _pair(self) -> None:
+        """Double bonds between open valences, then triple ones."""
+        while True:
+            graph = nx.Graph()
+            for i, j in self.order:
+                if self._open[i] > 0 and self._open[j] > 0:
+                    graph.add_edge(i, j, weight=_preference(self._elements[i], self._elements[j]))
+            pairs = nx.max_weight_matching(graph, maxcardinality=True)
+            if not pairs:
+                break
+            for a, b in pairs:
+                self._strengthen(a, b)
+                self._open[a] -= 1
+                self._open[b] -= 1
+
+    def _settle(self) -> None:
+        """Give charges to what no double bond took."""
+        for i, symbol in enumerate(self._elements):
+            near = self._neighbours[i]
+            if self._open[i] == 1 and symbol == "C":
+                donors = [j for j in near if self._is_donor(j)]
+                if donors:
+                    donor = max(donors, key=lambda j: sum(self._elements[k] == "H" for k in self._neighbours[j]))
+                    self._strengthen(i, donor)
+                    self._open[i] -= 1
+                    self.charges[donor] = 1
+            elif self._open[i] > 0 and symbol in ("O", "S", "N") and near:
+                self.charges[i] -= self._open[i]
+                self._open[i] = 0
+
+    def _is_donor(self, j: int) -> bool:
+        saturated = len(self._neighbours[j]) == 3 and self._open[j] == 0
+        return self._elements[j] == "N" and self.charges[j] == 0 and saturated
 
 
-def _pair(
-    elements: Sequence[str],
-    neighbours: list[list[int]],
-    open_valence: list[int],
-    order: dict[tuple[int, int], int],
-) -> None:
-    while True:  # a second round makes triple bonds
-        graph = nx.Graph()
-        for i, j in order:
-            if open_valence[i] > 0 and open_valence[j] > 0:
-                graph.add_edge(i, j, weight=_preference(elements, neighbours, i, j))
-        pairs = nx.max_weight_matching(graph, maxcardinality=True)
-        if not pairs:
-            break
-        for a, b in pairs:
-            order[min(a, b), max(a, b)] += 1
-            open_valence[a] -= 1
-            open_valence[b] -= 1
-
-
-def _open_valence(elements: Sequence[str], neighbours: list[list[int]], i: int, charges: npt.NDArray[np.int64]) -> int:
-    symbol, degree = elements[i], len(neighbours[i])
-    if degree == 0 and symbol in _IONS:
-        charges[i] = _IONS[symbol]
-        return 0
-    if symbol not in _VALENCE:
-        return -1
-    if symbol in ("P", "S", "Se") and degree >= 3:
-        return 0
-    if (symbol == "N" and degree == 4) or (symbol == "O" and degree == 3):
-        charges[i] = 1
-        return 0
-    if symbol == "B" and degree == 4:
-        charges[i] = -1
-        return 0
-    return _VALENCE[symbol] - degree
-
-
-def _preference(elements: Sequence[str], neighbours: list[list[int]], i: int, j: int) -> int:
-    pair = {elements[i], elements[j]}
+def _preference(one: str, other: str) -> int:
+    pair = {one, other}
     if pair == {"C", "O"}:
         return 9
     if "O" in pair:
@@ -178,57 +218,3 @@ def _preference(elements: Sequence[str], neighbours: list[list[int]], i: int, j:
     if pair == {"C", "S"}:
         return 4
     return 5
-
-
-def _hypervalent(
-    elements: Sequence[str],
-    neighbours: list[list[int]],
-    open_valence: list[int],
-    order: dict[tuple[int, int], int],
-    charges: npt.NDArray[np.int64],
-) -> None:
-    """Nitro groups and the oxides of P and S, whose centres have no open valence of their own."""
-    for i, symbol in enumerate(elements):
-        ends = [j for j in neighbours[i] if elements[j] in ("O", "S") and len(neighbours[j]) == 1]
-        degree = len(neighbours[i])
-        room = 0
-        if symbol == "N" and degree == 3 and len(ends) >= 2:
-            room, charges[i] = 1, 1
-        elif (symbol, degree) in (("P", 4), ("S", 3), ("Se", 3)):
-            room = 1
-        elif symbol in ("S", "Se") and degree == 4:
-            room = 2
-        made = 0
-        for j in ends[:room]:
-            order[min(i, j), max(i, j)] += 1
-            open_valence[j] -= 1
-            made += 1
-        if symbol in ("S", "Se") and degree == 3 and not made:
-            charges[i] = 1  # sulfonium
-        if symbol == "P" and degree == 4 and not made:
-            charges[i] = 1  # phosphonium
-
-
-def _settle(
-    elements: Sequence[str],
-    neighbours: list[list[int]],
-    open_valence: list[int],
-    order: dict[tuple[int, int], int],
-    charges: npt.NDArray[np.int64],
-) -> None:
-    """Give charges to what no double bond took."""
-    for i, symbol in enumerate(elements):
-        if open_valence[i] == 1 and symbol == "C":
-            donors = [
-                j
-                for j in neighbours[i]
-                if elements[j] == "N" and charges[j] == 0 and len(neighbours[j]) == 3 and open_valence[j] == 0
-            ]
-            if donors:
-                donor = max(donors, key=lambda j: sum(elements[k] == "H" for k in neighbours[j]))
-                order[min(i, donor), max(i, donor)] += 1
-                open_valence[i] -= 1
-                charges[donor] = 1
-        elif open_valence[i] > 0 and symbol in ("O", "S", "N") and neighbours[i]:
-            charges[i] -= open_valence[i]
-            open_valence[i] = 0

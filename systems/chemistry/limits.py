@@ -7,7 +7,7 @@ least that they change from one to the next, and a third of it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from systems.chemistry.frame_columns import column_blocks, cross, signed_volume, squared_distance
 from systems.chemistry.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
 from systems.errors import InputError
-from systems.files.schema import built
+from systems.files.schema import Recorded
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -36,7 +36,7 @@ _MOST_PAIRS = 2_000
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class Limits(Recorded):
     """How far frames of the reference go. Made by `limits_from_frames`.
 
     Angles: `angle_idx (k, 3)` rows (end, middle, end) within `angle_min_rad` and `angle_max_rad (k,)`. Flat centres:
@@ -61,19 +61,6 @@ class Limits:
         least = np.where(self.angle_max_rad < np.pi, np.cos(self.angle_max_rad), -2.0)
         greatest = np.where(self.angle_min_rad > 0.0, np.cos(self.angle_min_rad), 2.0)
         return least, greatest
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return lists and numbers that `from_dict` and JSON take back exactly."""
-        out: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self)}
-        return out
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> Limits:
-        """Rebuild limits. Raises InputError when an entry is missing, unknown or malformed."""
-        try:
-            return built(Limits, record)
-        except ValueError as error:
-            raise InputError(f"Limits record is malformed: {error}.") from error
 
 
 def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.ArrayLike) -> Limits:

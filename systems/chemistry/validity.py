@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -19,7 +19,7 @@ from systems.chemistry.geometry_rules import (
     n_pairs,
 )
 from systems.errors import InputError
-from systems.files.schema import built
+from systems.files.schema import Recorded
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -59,7 +59,7 @@ _NAMES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Geometry:
+class Geometry(Recorded):
     """What a valid frame keeps. Made by `geometry_from_scene` or `geometry_from_frames`.
 
     Atoms: `hydrogen (n_atoms,)` 1 for hydrogens. Bonds: `bond_idx (n_bonds, 2)`, `bond_mean_nm`, `bond_std_nm`
@@ -109,19 +109,6 @@ class Geometry:
     def near_keys(self) -> IntArray:
         """`near_idx` as sorted numbers i * n_atoms + j."""
         return np.unique(self.near_idx[:, 0] * self.n_atoms + self.near_idx[:, 1])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return lists and strings that `from_dict` and JSON take back exactly."""
-        out: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self)}
-        return out
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> Geometry:
-        """Rebuild a geometry. Raises InputError when an entry is missing, unknown or malformed."""
-        try:
-            return built(Geometry, record)
-        except ValueError as error:
-            raise InputError(f"Geometry record is malformed: {error}.") from error
 
 
 def geometry_from_scene(scene: Scene) -> Geometry:

@@ -8,11 +8,23 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    Self,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 import numpy as np
 
-from systems.errors import SurromdError, nearest
+from systems.errors import InputError, SurromdError, nearest
 
 T = TypeVar("T")
 _LARGEST = 2**63
@@ -46,6 +58,23 @@ def built(cls: type[T], record: Any, where: str = "") -> T:
         return cls(**values)
     except SurromdError as error:
         raise ValueError(str(error).rstrip(".")) from error
+
+
+class Recorded:
+    """Base of dataclasses of arrays, texts and numbers that are kept as JSON."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return lists, texts and numbers that `from_dict` and JSON take back exactly."""
+        out: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(cast(Any, self))}
+        return out
+
+    @classmethod
+    def from_dict(cls, record: dict[str, Any]) -> Self:
+        """Rebuild it. Raises InputError when an entry is missing, unknown or malformed."""
+        try:
+            return built(cls, record)
+        except ValueError as error:
+            raise InputError(f"{cls.__name__} record is malformed: {error}.") from error
 
 
 def parsed(text: Any, read: Callable[[Any], Any] = json.loads) -> Any:

@@ -30,3 +30,14 @@ def run(*arguments: str) -> Result:
     from surrogate.cli.main import app
 
     return CliRunner().invoke(app, list(arguments))
+
+
+def refused(result: Result, *, code: int = 1) -> str:
+    """Return the message of a refusal, after checking that it is one line on stderr and nothing else."""
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    assert "Traceback" not in result.stderr
+    return lines[0]

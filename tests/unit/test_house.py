@@ -25,9 +25,7 @@ WITHOUT_CONTRACT = {
     "surrogate.models.lam_slide": "the same",
 }
 MANY_PARAMETERS = {
-    "surrogate/models/lam_slide/losses.py:flow_loss": "the loss' tensors, by name",
     "surrogate/models/painet/trainer.py:train_painet": "the trainers' common signature",
-    "surrogate/sampling/openmm/simulation.py:__init__": "OpenMM's own signature, and ours",
     "surrogate/sampling/runner.py:rollout": "callbacks beside the settings",
 }
 

@@ -35,7 +35,7 @@ from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.config import ApproximatorConfig
-from surrogate.models.lam_slide.losses import draw_flow_times, flow_loss
+from surrogate.models.lam_slide.losses import FlowWindows, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.transformer import Approximator
 from surrogate.sampling.chunks import with_bf16_weights
@@ -106,7 +106,9 @@ def training_rate(model: LamSlide, n_atoms: int, precision: str, peak: float, ba
 
     def step() -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bf16"):
-            loss, _ = flow_loss(model, latents, n_atoms, draw_flow_times(model, batch, generator), generator)
+            loss, _ = flow_loss(
+                model, FlowWindows(latents, n_atoms), draw_flow_times(model, batch, generator), generator
+            )
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

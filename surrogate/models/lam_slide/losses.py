@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -66,36 +68,41 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
     return torch.sigmoid(draws).clamp(max=TAU_MAX)
 
 
-def flow_loss(
-    model: LamSlide,
-    latents: Tensor,
-    n_atoms: int,
-    tau: Tensor,
-    generator: torch.Generator,
-    *,
-    importance: Tensor | None = None,
-    kind: Tensor | None = None,
-    atoms: Atoms | None = None,
-    told: Told | None = None,
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Stage two on clean latents `(b, T, L, dim)`: eq. 9 on the predicted frames (with
-    `loss_on_given` on all), plus decoded position and distance.
+@dataclass(frozen=True, eq=False)
+class FlowWindows:
+    """A batch of windows of one molecule as stage two sees them: clean `latents (b, T, L, dim)` of `n_atoms` atoms.
 
-    `importance` (b,): what each window counts (data.rarity); None is one each. With the `kind` (b,) of each window it
-    counts in the cross entropy of the kinds alone: the network is told the kind, and within a kind draws are plain.
-    `atoms` and `told`: see `LamSlide.atoms_of` and `LamSlide.told`.
+    `atoms` and `told`: see `LamSlide.atoms_of` and `LamSlide.told`. `importance (b,)`: what each window counts
+    (data.rarity); None is one each. With the `kind (b,)` of each window it counts in the cross entropy of the kinds
+    alone: the network is told the kind, and within a kind draws are plain.
+    """
+
+    latents: Tensor
+    n_atoms: int
+    atoms: Atoms | None = None
+    told: Told | None = None
+    importance: Tensor | None = None
+    kind: Tensor | None = None
+
+
+def flow_loss(
+    model: LamSlide, windows: FlowWindows, tau: Tensor, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return stage two's loss at flow times `tau (b,)`, and its terms: eq. 9 on the predicted frames (with
+    `loss_on_given` on all), plus decoded position and distance.
 
     With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
     without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
     decoder's own error is not charged to the approximator.
     """
     c = model.config.approximator
+    latents, importance, kind = windows.latents, windows.importance, windows.kind
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
     noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, kind=kind, told=told)[:, first:]
+    prediction = model.approximator(noisy, tau, known, kind=kind, told=windows.told)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
@@ -111,12 +118,12 @@ def flow_loss(
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm
-        decoded = model.decode(prediction[:, pick], n_atoms, atoms) / scale
+        decoded = model.decode(prediction[:, pick], windows.n_atoms, windows.atoms) / scale
         with torch.no_grad():
-            clean = model.decode(target[:, pick], n_atoms, atoms) / scale
+            clean = model.decode(target[:, pick], windows.n_atoms, windows.atoms) / scale
         w = weight.reshape(-1, 1, 1, 1).sqrt()
         position = ((decoded - clean) * w).square().sum(-1).mean()
-        i, j = torch.triu_indices(n_atoms, n_atoms, 1)
+        i, j = torch.triu_indices(windows.n_atoms, windows.n_atoms, 1)
         span = lambda x: ((x[..., i, :] - x[..., j, :]).square().sum(-1) + 1e-12).sqrt()  # noqa: E731
         distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
         loss = loss + c.position_weight * position + c.distance_weight * distance

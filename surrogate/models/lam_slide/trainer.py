@@ -22,7 +22,7 @@ from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.heavy_trainer import on_heavy_atoms
-from surrogate.models.lam_slide.losses import autoencoder_loss, draw_flow_times, flow_loss
+from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.subjects import Subject, normalise_latents, pick
 from surrogate.models.precision import bf16_pays
@@ -301,7 +301,7 @@ def _stage_two(
         latents, atoms = subject.windows(model, idx, generator)
         lags = None if stride is None else (stride * subject.frames.lag_ps).to(device)
         told = model.told(atoms, lags, len(idx))
-        return flow_loss(model, latents, subject.n_atoms, tau, generator, atoms=atoms, told=told, **more)
+        return flow_loss(model, FlowWindows(latents, subject.n_atoms, atoms, told, **more), tau, generator)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         k = pick(subjects, generator)

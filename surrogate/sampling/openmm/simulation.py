@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -12,19 +13,34 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
+from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import fit_weights
 from surrogate.sampling.openmm.openmm_state import SurrogateState
 from systems.errors import InputError, SimulationError
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
+from systems.options import from_field
 from systems.scene import Scene
-from systems.units import Quantity, quantity
+from systems.takes import takes
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
 
 # positions (n_atoms, 3) nm -> potential energy in kJ/mol
 EnergyFn = Callable[[npt.NDArray[np.float64]], float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """What a Simulation can be told of what `rollout` can be told."""
+
+    seed: int = from_field(RolloutConfig, "seed")
+    lag_ps: float | None = from_field(RolloutConfig, "lag_ps")
+    stiff: str | None = from_field(RolloutConfig, "stiff")
+    force: bool = from_field(RolloutConfig, "force")
+    solver: str | None = from_field(RolloutConfig, "solver")
+    solver_steps: int = from_field(RolloutConfig, "solver_steps")
+    precision: str = from_field(RolloutConfig, "precision")
 
 
 class Simulation:
@@ -43,25 +59,20 @@ class Simulation:
     Raises OutOfDomainError, InputError, WeightsError.
     """
 
+    @takes(SimulationOptions)
     def __init__(
         self,
         scene: str | Path | Scene,
         weights: str | Path | Weights,
         *,
-        seed: int = 0,
-        solver_steps: int = 10,
-        solver: str | None = None,
-        precision: str = "auto",
         energy_fn: EnergyFn | None = None,
-        force: bool = False,
-        lag_ps: Quantity | None = None,
-        stiff: str | None = None,
+        options: SimulationOptions,
     ) -> None:
         import openmm
         from openmm import unit
 
         scene, weights = _given(scene, weights)
-        weights, match = fit_weights(scene, weights, force=force, lag_ps=quantity("lag_ps", lag_ps))
+        weights, match = fit_weights(scene, weights, force=options.force, lag_ps=options.lag_ps)
         self.scene, self.weights, self.deviations = scene, weights, match.deviations
         self.energy_fn = energy_fn
         self.topology = scene.to_openmm_topology()
@@ -71,9 +82,13 @@ class Simulation:
         self.reporters: list[Any] = []
         self.currentStep = 0
         self._sampler = ChunkSampler(
-            weights, solver_steps=solver_steps, solver=solver, precision=precision, stiff=stiff
+            weights,
+            solver_steps=options.solver_steps,
+            solver=options.solver,
+            precision=options.precision,
+            stiff=options.stiff,
         )
-        self._seed = seed
+        self._seed = options.seed
         self._order, self._back = match.order, np.argsort(match.order)
         self._last: npt.NDArray[np.float32]
         self._velocities: npt.NDArray[np.float32] | None

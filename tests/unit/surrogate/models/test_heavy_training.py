@@ -20,7 +20,7 @@ from surrogate.models.lam_slide.codes.residue_autoencoder import ResidueAutoenco
 from surrogate.models.lam_slide.codes.residue_code import RESIDUE_TYPES
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.heavy_atoms import HeavyLamSlide
-from surrogate.models.lam_slide.losses import autoencoder_loss, flow_loss
+from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.sampling.runner import RolloutConfig, rollout
@@ -188,7 +188,7 @@ def test_the_frame_loss_of_the_flow_is_weighed_like_its_other_terms(harmonic_fra
     x = torch.from_numpy(heavy.positions_nm(np.arange(32))).reshape(4, 8, n_atoms, 3)
     latents = model.encode(x, torch.full((n_atoms,), 6)).detach()
     tau = torch.tensor([0.1, 0.5, 0.7, 0.9])
-    loss, terms = flow_loss(model, latents, n_atoms, tau, torch.Generator().manual_seed(0))
+    loss, terms = flow_loss(model, FlowWindows(latents, n_atoms), tau, torch.Generator().manual_seed(0))
     c = model.config.approximator
     expected = (terms["flow"] + c.position_weight * terms["position"] + c.distance_weight * terms["distance"]
                 + c.frame_weight * terms["frame"])  # fmt: skip

@@ -16,7 +16,7 @@ from surrogate.data.weights import Weights, load_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
 from surrogate.models.lam_slide.kinds import Kind, kinds_of_windows
-from surrogate.models.lam_slide.losses import flow_loss
+from surrogate.models.lam_slide.losses import FlowWindows, flow_loss
 from surrogate.models.lam_slide.model import MAX_REDRAWS, LamSlide
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.lam_slide.transformer import Approximator
@@ -70,7 +70,7 @@ def test_importance_counts_in_the_odds_alone(small_model_config: LamSlideConfig)
     importance = torch.tensor([1.4, 0.01, 0.2, 1.4, 0.01, 1.4])
 
     def terms(**options: torch.Tensor) -> dict[str, torch.Tensor]:
-        return flow_loss(model, latents, 22, tau, torch.Generator().manual_seed(1), **options)[1]
+        return flow_loss(model, FlowWindows(latents, 22, **options), tau, torch.Generator().manual_seed(1))[1]
 
     weighted, plain = terms(importance=importance, kind=kind), terms(kind=kind)
     assert weighted["flow"] == plain["flow"] and weighted["position"] == plain["position"]

@@ -2,167 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from surrogate.data.weights import TrainingDomain, Weights
-from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.guards import CAUGHT, Guard
+from scripted_model import (
+    LAG_PS,
+    N_NEW,
+    Rolled,
+    Scripted,
+    invert,
+    roll,
+    scatter,
+    stretch,
+    weights_of,
+)
+from surrogate.data.weights import TrainingDomain
+from surrogate.models.interface import Surrogate
+from surrogate.sampling.guards import CAUGHT
 from surrogate.sampling.interventions import none_through
-from surrogate.sampling.openmm.coupling import Coupling
-from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Tally
+from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, REPAIRED, Tally
 from surrogate.sampling.runner import RolloutConfig, rollout
-from systems.chemistry.geometry import superpose
 from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import CHIRALITY, ENERGY, INVALID, geometry_from_frames
-from systems.errors import InputError, SimulationError, UnknownNameError
+from systems.chemistry.validity import CHIRALITY, INVALID
+from systems.errors import SimulationError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
-
-LAG_PS, N_NEW = 0.1, 8
-CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0, "friction_per_ps": 1.0,
-              "timestep_ps": 0.004, "hydrogen_mass_da": 3.0}  # fmt: skip
-# Fault: frames (n_new, n_atoms, 3) nm of one replica and its noise in, frames out.
-Fault = Callable[[Tensor, Tensor], Tensor]
-
-
-class Scripted(Surrogate):
-    """Trembles about the last frame by 0.0005 nm; what goes wrong is written in `fault`."""
-
-    arch: ClassVar[str] = "scripted"
-    canonical = True
-    n_conditioning = 1
-    n_new = N_NEW
-    largest_batch = 1000
-
-    def __init__(self, fault: Fault | None = None) -> None:
-        super().__init__()
-        self.fault = fault
-        self.rows: list[int] = []
-
-    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
-        return (N_NEW, n_atoms, 3)
-
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        if len(last_frames_nm) > self.largest_batch:
-            raise RuntimeError("[enforce fail] DefaultCPUAllocator: not enough memory: you tried to allocate a lot")
-        self.rows.append(len(last_frames_nm))
-        frames = last_frames_nm[:, -1:] + 0.0005 * noise
-        if self.fault is not None:
-            frames = torch.stack([self.fault(x.clone(), z) for x, z in zip(frames, noise, strict=True)])
-        return Chunk(frames)
-
-
-def unlucky(noise: Tensor) -> bool:
-    """True for half of all draws."""
-    return bool(noise[0, 0, 0] > 0)
-
-
-def stretch(frames: Tensor, noise: Tensor) -> Tensor:
-    """In half of all draws a carbonyl bond is 0.08 nm too long, in frame 5 alone."""
-    if unlucky(noise):
-        step = frames[5, 5] - frames[5, 4]
-        frames[5, 5] += 0.08 * step / step.norm()
-    return frames
-
-
-def invert(frames: Tensor, noise: Tensor) -> Tensor:
-    """In half of all draws CA and its hydrogen are reflected through the plane of the other three, in frame 5 alone."""
-    if unlucky(noise):
-        a, b, c = frames[5, 6], frames[5, 10], frames[5, 14]
-        normal = torch.linalg.cross(b - a, c - a)
-        normal = normal / normal.norm()
-        for atom in (8, 9):
-            frames[5, atom] -= 2 * ((frames[5, atom] - a) @ normal) * normal
-    return frames
-
-
-def twist(frames: Tensor, noise: Tensor) -> Tensor:
-    """Frame 2 is turned by 60 degrees about the first peptide bond: still trans, so that no geometry check minds."""
-    axis = frames[2, 6] - frames[2, 4]
-    x, y, z = (axis / axis.norm()).tolist()
-    k = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation = torch.eye(3) + np.sin(np.pi / 3) * k + (1 - np.cos(np.pi / 3)) * k @ k
-    frames[2, 6:] = frames[2, 6] + (frames[2, 6:] - frames[2, 6]) @ rotation.T
-    return frames
-
-
-def scatter(frames: Tensor, noise: Tensor) -> Tensor:
-    """Every frame is a cloud."""
-    return 0.3 * noise
-
-
-@pytest.fixture(scope="module")
-def md(alanine_dipeptide: Scene) -> Iterator[np.ndarray]:
-    """30 ps of MD, frames 0.1 ps apart, superposed: what the scripted model would have been trained on."""
-    from md_reference.forces.spec import ForceFieldSpec
-    from md_reference.run.config import Conditions
-    from md_reference.run.engine import Engine
-
-    with Engine(
-        alanine_dipeptide, Conditions(force=ForceFieldSpec("ff14SB", "obc2", 3.0), timestep_ps=0.002, seed=3)
-    ) as engine:
-        engine.minimise(max_iterations=100)
-        engine.thermalise()
-        engine.step(1000)
-        frames = []
-        for _ in range(300):
-            engine.step(50)
-            frames.append(engine.positions())
-    yield superpose(np.stack(frames), alanine_dipeptide.positions_nm, idx=alanine_dipeptide.heavy_idx)
-
-
-@pytest.fixture(scope="module")
-def scene(alanine_dipeptide: Scene, md: np.ndarray) -> Scene:
-    return alanine_dipeptide.with_positions(md[-1] + [3.0, 0.0, -2.0])
-
-
-@pytest.fixture(scope="module")
-def domain(alanine_dipeptide: Scene, md: np.ndarray) -> TrainingDomain:
-    geometry = geometry_from_frames(alanine_dipeptide, md)
-    # The scripted model trembles less than MD moves; what is to be caught of it is its faults.
-    limits = replace(limits_from_frames(alanine_dipeptide, md[:-1], md[1:]), jump_min_nm=1e-9)
-    return TrainingDomain(alanine_dipeptide, LAG_PS, CONDITIONS, geometry.to_dict(), limits.to_dict())
-
-
-@pytest.fixture
-def short_energy_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tenth of the MD that energies are otherwise measured against."""
-    from surrogate.sampling.openmm import coupling
-
-    monkeypatch.setattr(coupling, "_SETTLE_PS", 2.0)
-    monkeypatch.setattr(coupling, "_SAMPLES", 30)
-
-
-def weights_of(domain: TrainingDomain, fault: Fault | None = None) -> Weights:
-    return Weights(Scripted(fault), domain, {}, "scripted", Path("scripted.safetensors"))
-
-
-class Rolled:
-    """What a rollout left in its file."""
-
-    def __init__(self, path: Path) -> None:
-        with open_trajectory(path) as reader:
-            self.frames, self.flags, self.record = reader.read(), reader.flags, dict(reader.record)
-            self.marks, self.times = reader.scalars["intervention"], reader.time_ps
-            self.scalars, self.scene = dict(reader.scalars), reader.scene
-        self.account: dict[str, Any] = self.record["interventions"]
-
-
-def roll(out: Path, scene: Scene, weights: Weights, guard: str, n_chunks: int = 4, **settings: Any) -> Rolled:
-    config = RolloutConfig(time_ps=n_chunks * N_NEW * LAG_PS, guard=guard, precision="fp32", seed=4, **settings)
-    rollout(scene, weights, [out], config)
-    return Rolled(out)
 
 
 def test_a_sound_model_is_left_alone_under_every_guard(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
@@ -382,115 +253,3 @@ def test_a_batch_that_memory_does_not_hold_is_halved(tmp_path: Path, scene: Scen
     model.largest_batch = 0
     with pytest.raises(SimulationError, match="memory does not suffice for one replica"):
         rollout(scene, replace(cramped, model=model), [tmp_path / "one.h5"], config)
-
-
-def test_md_between_chunks_is_marked_and_takes_its_time(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
-    found = roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", n_chunks=5, md_between_ps=0.2)
-    assert np.allclose(found.times, LAG_PS * np.arange(1, 41))
-    assert found.marks.tolist() == ([0] * 8 + [MD_BETWEEN] * 2) * 4
-    assert not (found.flags & np.uint16(CAUGHT)).any()
-    assert found.account["seconds"]["md"] > 0
-    assert "mixture" in found.account["bias"][0]
-
-
-def test_energies_of_every_kth_frame_catch_what_geometry_does_not(
-    tmp_path: Path, scene: Scene, domain: TrainingDomain, short_energy_sample: None
-) -> None:
-    found = roll(tmp_path / "a.h5", scene, weights_of(domain), "flag", n_chunks=2, energy_every=3)
-    energies = found.scalars["relaxed_energy_kj_mol"]
-    assert np.array_equal(np.flatnonzero(np.isfinite(energies)), [2, 5, 8, 11, 14])
-    assert not (found.flags & np.uint16(ENERGY)).any()
-    assert found.account["seconds"]["energy limit"] > found.account["seconds"]["energy"] > 0
-    # A twisted peptide bond breaks no rule of geometry, once there are no limits; its energy shows it.
-    loose = weights_of(replace(domain, limits=None), twist)
-    twisted = roll(tmp_path / "b.h5", scene, loose, "flag", n_chunks=1, energy_every=3)
-    assert twisted.account["unchecked"] == [Guard(loose.domain).unchecked[0]]
-    assert twisted.flags.tolist() == [0, 0, ENERGY, 0, 0, 0, 0, 0]
-    drawn = [roll(tmp_path / f"{k}.h5", scene, loose, "flag", n_chunks=1, energy_every=k).flags[2] for k in (2, 4)]
-    assert drawn == [0, 0], "only every k-th frame is looked at"
-
-
-def test_md_depends_on_start_and_seed_alone(domain: TrainingDomain, md: np.ndarray, short_energy_sample: None) -> None:
-    coupling = Coupling(weights_of(domain))
-    first = coupling.simulate(md[0], 5, seed=1)
-    coupling.simulate(md[9], 3, seed=5)
-    again = coupling.simulate(md[0], 5, seed=1)
-    assert np.array_equal(first.frames_nm, again.frames_nm)
-    assert np.abs(coupling.simulate(md[0], 5, seed=2).frames_nm - first.frames_nm).max() > 0.01
-    # Velocities belong to the last frame in its pose: a short step along them is what MD does next.
-    longer = coupling.simulate(md[0], 5, seed=1)
-    kinetic = 0.5 * (domain.scene.masses_da[:, None] * longer.velocities_nm_ps**2).sum()
-    assert 20.0 < kinetic < 110.0, "kJ/mol; 51 degrees of freedom have 64 at 300 K, half of it right after relaxing"
-    assert np.abs(domain.scene.masses_da @ longer.velocities_nm_ps).max() < 1e-6
-    energies = [coupling.relax(x).potential_kj_mol for x in md[::10]]
-    assert max(energies) < coupling.energy_limit_kj_mol < max(energies) + 60.0
-    coupling.close()
-
-
-def test_help_has_flexible_bonds_where_the_reference_had(domain: TrainingDomain, md: np.ndarray) -> None:
-    flexible = {**CONDITIONS, "timestep_ps": 0.0005, "hydrogen_mass_da": None, "constrain_hydrogens": False}
-    spread = []
-    for conditions in (CONDITIONS, flexible):
-        coupling = Coupling(weights_of(replace(domain, conditions=conditions)))
-        frames = coupling.simulate(md[0], 8, seed=1).frames_nm
-        coupling.close()
-        to_hydrogen = [pair for pair in domain.scene.bonds.tolist() if "H" in (domain.scene.elements[k] for k in pair)]
-        spread.append(max(float(np.linalg.norm(frames[:, i] - frames[:, j], axis=-1).std()) for i, j in to_hydrogen))
-    assert spread[0] < 1e-5 < 1e-3 < spread[1]
-
-
-def test_weights_that_name_no_force_field_cannot_be_coupled(
-    tmp_path: Path, scene: Scene, domain: TrainingDomain
-) -> None:
-    for conditions, said in (({}, "which force_field"), ({**CONDITIONS, "force_field": "ff00"}, "ff00")):
-        weights = weights_of(replace(domain, conditions=conditions))
-        with pytest.raises(InputError, match=f"cannot be coupled to OpenMM.*{said}"):
-            roll(tmp_path / "a.h5", scene, weights, "repair")
-        assert list(tmp_path.iterdir()) == [], "refused before anything is written"
-
-
-def test_some_atoms_are_written_and_all_are_computed(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
-    whole = roll(tmp_path / "all.h5", scene, weights_of(domain), "flag")
-    heavy = roll(tmp_path / "heavy.h5", scene, weights_of(domain), "flag", atoms="heavy")
-    assert np.array_equal(heavy.frames, whole.frames[:, scene.heavy_idx])
-    assert heavy.scene is not None and "H" not in heavy.scene.elements and len(heavy.scene.bonds) == 9
-    backbone = roll(
-        tmp_path / "b.dcd", scene, weights_of(domain), "flag", select="resname ALA and (name CA or name HA)"
-    )
-    assert backbone.scene is not None and backbone.scene.atom_names == ("CA", "HA")
-    np.testing.assert_allclose(backbone.frames, whole.frames[:, [8, 9]], rtol=0, atol=1e-6)
-    assert backbone.record["selection"]["of_atoms"] == 22
-    for wrong, said in (("name CA and (", "cannot be read"), ("name XX", "means no atom")):
-        with pytest.raises(InputError, match=said):
-            roll(tmp_path / "c.h5", scene, weights_of(domain), "flag", select=wrong)
-    with pytest.raises(InputError, match="no atom"):
-        roll(tmp_path / "c.h5", scene, weights_of(domain), "flag", select="element H", atoms="heavy")
-    assert not (tmp_path / "c.h5").exists()
-
-
-def test_far_from_the_origin_nothing_is_lost(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
-    """A million nm away float32 resolves 0.06 nm: frames are written about the molecule, and the record says so."""
-    near = roll(tmp_path / "near.h5", scene, weights_of(domain), "flag")
-    far = roll(tmp_path / "far.h5", scene.with_positions(scene.positions_nm + 1e6), weights_of(domain), "flag")
-    centre = scene.positions_nm.mean(axis=0)
-    np.testing.assert_allclose(far.frames, near.frames - centre, rtol=0, atol=2e-6)
-    np.testing.assert_allclose(far.record["moved_nm"], -(centre + 1e6))
-    assert "moved_nm" not in near.record
-    sampler = ChunkSampler(weights_of(domain), precision="fp32")
-    drawn = [sampler.draw((x := scene.positions_nm + d)[None, None], [5]).frames_nm[0] - d for d in (0.0, 10.0, 1e6)]
-    assert drawn[0].dtype == np.float64 and x.dtype == np.float64
-    np.testing.assert_allclose(drawn[1], drawn[0], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(drawn[2], drawn[0], rtol=0, atol=1e-6)
-
-
-def test_settings_that_cannot_be_are_refused(domain: TrainingDomain) -> None:
-    for wrong, error, said in (
-        ({"guard": "repare"}, UnknownNameError, "Did you mean 'repair'"),
-        ({"atoms": "none"}, InputError, "all or heavy"),
-        ({"energy_every": -1}, InputError, "at least 0"),
-        ({"md_between_ps": -1.0}, InputError, "at least 0"),
-        ({"solver_steps": 0}, InputError, "at least 1"),
-    ):
-        with pytest.raises(error, match=said):
-            RolloutConfig(time_ps=1.0, **wrong)  # type: ignore[arg-type]
-    assert Guard(domain).unchecked == ()

@@ -14,7 +14,7 @@ from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, lo
 from surrogate.data.weights import Weights, load_weights, read_header, save_weights
 from surrogate.models.lam_slide.codes.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.losses import flow_loss
+from surrogate.models.lam_slide.losses import FlowWindows, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
@@ -231,7 +231,7 @@ def test_given_frames_count_in_the_loss_where_they_are_asked_to(small_model_conf
                             loss_on_given=on_given)  # fmt: skip
         model = LamSlide(replace(small_model_config, approximator=stage_two))
         model.approximator = Zeros()
-        loss, _ = flow_loss(model, latents, 22, tau, torch.Generator().manual_seed(1))
+        loss, _ = flow_loss(model, FlowWindows(latents, 22), tau, torch.Generator().manual_seed(1))
         torch.testing.assert_close(loss, counted.square().mean())
     with pytest.raises(InputError, match="clean_conditioning"):
         replace(stage_two, clean_conditioning=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from time import perf_counter
+from time import process_time
 
 import networkx as nx
 import numpy as np
@@ -189,9 +189,9 @@ def test_symmetric_molecules_match_fast_and_keep_hands(from_smiles: MAKE, reorde
     rng = np.random.default_rng(0)
     for seed in range(2, 5):
         scene = reordered(from_smiles(smiles, seed=seed), rng.permutation(template.n_atoms))
-        start = perf_counter()
+        start = process_time()
         order = match_atoms(scene, template)
-        assert perf_counter() - start < 2.0
+        assert process_time() - start < 2.0
         assert _is_isomorphism(scene, template, order)
         assert _inverted_groups(scene, template, order) == 0
 

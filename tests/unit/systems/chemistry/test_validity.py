@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from small_scenes import benzene, beyond, difluoroethene, rotated, scene_of, stretched
 from systems.chemistry.validity import (
     BOND_20_PERCENT,
     BOND_HALF_ANGSTROM,
@@ -22,73 +19,15 @@ from systems.chemistry.validity import (
     RING,
     Geometry,
     check_frames,
-    flag_names,
     geometry_from_frames,
     geometry_from_scene,
 )
-from systems.errors import InputError
 from systems.scene import Scene
 
 
 @pytest.fixture(scope="module")
 def geometry(alanine_dipeptide: Scene) -> Geometry:
     return geometry_from_scene(alanine_dipeptide)
-
-
-def scene_of(elements: str, bonds: list[tuple[int, int, float]], positions_nm: np.ndarray) -> Scene:
-    n = len(elements)
-    return Scene(
-        name="made",
-        atom_names=tuple(f"{e}{i + 1}" for i, e in enumerate(elements)),
-        elements=tuple(elements),
-        residue_of_atom=np.zeros(n, dtype=np.int64),
-        residue_names=("LIG",),
-        residue_ids=("1",),
-        chain_of_residue=("A",),
-        bonds=np.array([b[:2] for b in bonds], dtype=np.int64).reshape(-1, 2),
-        bond_orders=np.array([b[2] for b in bonds], dtype=np.float64),
-        formal_charges=np.zeros(n, dtype=np.int64),
-        masses_da=np.full(n, 12.0),
-        positions_nm=positions_nm,
-    )
-
-
-def benzene() -> Scene:
-    angles = np.arange(6) * np.pi / 3
-    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(6)], axis=1)
-    bonds = [(k, (k + 1) % 6, 1.5) for k in range(6)] + [(k, k + 6, 1.0) for k in range(6)]
-    ordered = [(min(i, j), max(i, j), o) for i, j, o in bonds]
-    return scene_of("CCCCCCHHHHHH", ordered, np.concatenate([0.14 * ring, 0.248 * ring]))
-
-
-def difluoroethene() -> Scene:
-    """Trans FHC=CHF, flat."""
-    positions = np.array(
-        [[-0.066, 0, 0], [0.066, 0, 0], [-0.135, 0.115, 0], [0.135, -0.115, 0], [-0.12, -0.094, 0], [0.12, 0.094, 0]]
-    )
-    bonds = [(0, 1, 2.0), (0, 2, 1.0), (1, 3, 1.0), (0, 4, 1.0), (1, 5, 1.0)]
-    return scene_of("CCFFHH", bonds, positions)
-
-
-def rotated(positions: np.ndarray, atoms: list[int], axis: tuple[int, int], angle: float) -> np.ndarray:
-    """Turn `atoms` about the bond `axis`."""
-    origin, end = positions[axis[0]], positions[axis[1]]
-    k = (end - origin) / np.linalg.norm(end - origin)
-    v = positions[atoms] - origin
-    out = positions.copy()
-    out[atoms] = origin + v * np.cos(angle) + np.cross(k, v) * np.sin(angle) + np.outer(v @ k, k) * (1 - np.cos(angle))
-    return out
-
-
-def beyond(scene: Scene, start: int, end: int) -> list[int]:
-    """Atoms on the side of `end` of the bond from `start` to `end`."""
-    from systems.chemistry.graph import bonded_graph
-
-    graph = bonded_graph(scene)
-    graph.remove_edge(start, end)
-    import networkx as nx
-
-    return sorted(nx.node_connected_component(graph, end))
 
 
 # ---- valid frames --------------------------------------------------------------------------------------------------
@@ -155,15 +94,6 @@ def test_not_finite(alanine_dipeptide: Scene, geometry: Geometry, bad: float) ->
     flags = check_frames(frames, geometry)
     assert flags[1] & NOT_FINITE
     assert flags[0] == flags[2] == 0
-
-
-def stretched(scene: Scene, by_nm: float) -> np.ndarray:
-    """The first bond that ends in one atom alone, longer by `by_nm`."""
-    i, j = next((i, j) for i, j in scene.bonds.tolist() if beyond(scene, i, j) == [j])
-    positions = scene.positions_nm.copy()
-    step = positions[j] - positions[i]
-    positions[j] += by_nm * step / np.linalg.norm(step)
-    return positions
 
 
 def test_bond_half_an_angstrom_off(alanine_dipeptide: Scene, geometry: Geometry) -> None:
@@ -268,162 +198,3 @@ def test_a_puckered_ring_is_not_held_flat() -> None:
     positions[:6, 2] = 0.025 * np.array([1, -1, 1, -1, 1, -1])
     chair = scene_of("CCCCCC", [(k, k + 1, 1.0) for k in range(5)] + [(0, 5, 1.0)], positions[:6])
     assert len(geometry_from_scene(chair).ring_idx) == 0
-
-
-# ---- the reference decides -----------------------------------------------------------------------------------------
-
-
-def wobbling(scene: Scene, n: int, sigma_nm: float = 0.002) -> np.ndarray:
-    noise = np.random.default_rng(3).normal(scale=sigma_nm, size=(n, scene.n_atoms, 3))
-    return (scene.positions_nm + noise).astype(np.float32)
-
-
-def test_means_and_spreads_come_from_the_frames(alanine_dipeptide: Scene) -> None:
-    frames = wobbling(alanine_dipeptide, 400)
-    frames[7] = np.nan  # is not used
-    geometry = geometry_from_frames(alanine_dipeptide, frames)
-    good = np.delete(frames, 7, axis=0).astype(np.float64)
-    i, j = alanine_dipeptide.bonds.T
-    length = np.linalg.norm(good[:, i] - good[:, j], axis=2)
-    np.testing.assert_allclose(geometry.bond_mean_nm, length.mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(geometry.bond_std_nm, length.std(axis=0), rtol=1e-2)
-    assert check_frames(frames, geometry).nonzero()[0].tolist() == [7]
-
-
-def test_what_the_reference_changes_is_left_out_and_named(alanine_dipeptide: Scene) -> None:
-    frames = wobbling(alanine_dipeptide, 1000)
-    start = alanine_dipeptide.positions_nm
-    plain = geometry_from_frames(alanine_dipeptide, frames)
-    assert plain.excluded == ()
-    _, carbon, nitrogen, _ = plain.omega_idx[0].tolist()
-    frames[:100] = rotated(start, beyond(alanine_dipeptide, carbon, nitrogen), (carbon, nitrogen), np.pi)
-    frames[100:150] *= np.array([1.0, 1.0, -1.0], dtype=np.float32)
-    frames[150:160] = stretched(alanine_dipeptide, 0.1)
-    geometry = geometry_from_frames(alanine_dipeptide, frames)
-    assert len(geometry.stereo_idx) == 0
-    assert len(geometry.omega_idx) == 1
-    assert len(geometry.bond_idx) == 20
-    assert len(geometry.excluded) == 3
-    assert any("stereocentre CA" in line and "5 %" in line for line in geometry.excluded)
-    assert any(line.startswith("bond ") and "1 %" in line for line in geometry.excluded)
-    assert any("torsion" in line and "10 %" in line for line in geometry.excluded)
-    flags = check_frames(frames, geometry)
-    assert not (flags & (CHIRALITY | OMEGA | BOND_HALF_ANGSTROM)).any()
-
-
-def test_one_stray_frame_in_a_thousand_changes_no_rule(alanine_dipeptide: Scene) -> None:
-    frames = wobbling(alanine_dipeptide, 2000)
-    frames[5] *= np.array([1.0, 1.0, -1.0], dtype=np.float32)
-    geometry = geometry_from_frames(alanine_dipeptide, frames)
-    assert geometry.excluded == ()
-    assert check_frames(frames, geometry).nonzero()[0].tolist() == [5]
-
-
-def test_clash_distances_from_frames(alanine_dipeptide: Scene) -> None:
-    frames = wobbling(alanine_dipeptide, 50)
-    geometry = geometry_from_frames(alanine_dipeptide, frames)
-    assert (geometry.clash_min_nm <= [0.14, 0.14, 0.24]).all()
-    assert (geometry.clash_min_nm > [0.1, 0.1, 0.18]).all()
-    i, j = geometry.clash_idx.T
-    distance = np.linalg.norm(frames[:, i] - frames[:, j], axis=2)
-    assert (distance.min(axis=0) >= geometry.clash_pair_min_nm / 0.8 - 1e-6).all()
-
-
-def test_a_mirrored_reference_is_the_new_truth(alanine_dipeptide: Scene) -> None:
-    """Handedness is the reference's, not the scene's."""
-    mirrored = wobbling(alanine_dipeptide, 20) * np.array([1.0, 1.0, -1.0], dtype=np.float32)
-    geometry = geometry_from_frames(alanine_dipeptide, mirrored)
-    assert not check_frames(mirrored, geometry).any()
-    assert check_frames(alanine_dipeptide.positions_nm, geometry).tolist() == [CHIRALITY]
-
-
-# ---- the rest ------------------------------------------------------------------------------------------------------
-
-
-def test_json_round_trip(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    measured = geometry_from_frames(alanine_dipeptide, wobbling(alanine_dipeptide, 30))
-    frames = wobbling(alanine_dipeptide, 200, 0.03)
-    for before in (geometry, measured, geometry_from_scene(benzene())):
-        after = Geometry.from_dict(json.loads(json.dumps(before.to_dict())))
-        assert after.to_dict() == before.to_dict()
-    np.testing.assert_array_equal(
-        check_frames(frames, measured), check_frames(frames, Geometry.from_dict(measured.to_dict()))
-    )
-    for record in ({}, measured.to_dict() | {"more": 1}, measured.to_dict() | {"bond_idx": [1, 2, 3]}):
-        with pytest.raises(InputError):
-            Geometry.from_dict(record)
-
-
-def test_frames_that_do_not_fit(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    with pytest.raises(InputError, match="22"):
-        check_frames(np.zeros((3, 21, 3)), geometry)
-    with pytest.raises(InputError, match="22"):
-        geometry_from_frames(alanine_dipeptide, np.zeros((3, 21, 3)))
-    with pytest.raises(InputError, match="finite"):
-        geometry_from_frames(alanine_dipeptide, np.full((3, 22, 3), np.nan))
-
-
-def test_scenes_with_little_in_them() -> None:
-    one = scene_of("C", [], np.zeros((1, 3)))
-    two = scene_of("HF", [(0, 1, 1.0)], np.array([[0.0, 0, 0], [0.092, 0, 0]]))
-    for scene in (one, two):
-        for geometry in (geometry_from_scene(scene), geometry_from_frames(scene, scene.positions_nm[None])):
-            assert check_frames(scene.positions_nm, geometry).tolist() == [0]
-    assert check_frames(np.array([[0.0, 0, 0], [0.15, 0, 0]]), geometry_from_scene(two))[0] & BOND_HALF_ANGSTROM
-
-
-def test_names_of_flags() -> None:
-    assert flag_names(0) == []
-    assert flag_names(CLASH | OMEGA) == ["clash", "peptide or double bond turned over"]
-    bits = [NOT_FINITE, BOND_HALF_ANGSTROM, BOND_20_PERCENT, CLASH, CHIRALITY, OMEGA, RING]
-    assert bits == [1 << k for k in range(7)]
-    assert sum(bits) & ~BOND_20_PERCENT == INVALID
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40), sigma=st.floats(0.0, 0.1))
-def test_blocks_and_order_make_no_difference(
-    alanine_dipeptide: Scene, geometry: Geometry, seed: int, n: int, sigma: float
-) -> None:
-    noise = np.random.default_rng(seed).normal(scale=sigma, size=(n, 22, 3))
-    frames = alanine_dipeptide.positions_nm + noise
-    together = check_frames(frames, geometry)
-    np.testing.assert_array_equal(together, [check_frames(f, geometry)[0] for f in frames])
-    np.testing.assert_array_equal(together[::-1], check_frames(frames[::-1], geometry))
-
-
-def test_large_scenes_give_the_same_clashes() -> None:
-    """Above the limit neighbours are searched with a tree; below, all pairs are listed. Both agree."""
-    from systems.chemistry import validity
-
-    generator = np.random.default_rng(5)
-    n = 300
-    positions = generator.uniform(size=(n, 3)) * 2.0
-    elements = "".join(generator.choice(["C", "H"], size=n))
-    scene = scene_of(elements, [(k, k + 1, 1.0) for k in range(0, n, 2)], positions)
-    geometry = geometry_from_scene(scene)
-    frames = generator.uniform(size=(40, n, 3)) * generator.uniform(1.0, 8.0, size=(40, 1, 1))
-    frames[3, 7] = np.nan
-    tree = check_frames(frames, geometry) & CLASH
-    limit = validity.MAX_PAIRS
-    try:
-        validity.MAX_PAIRS = n * n  # type: ignore[misc]
-        listed = check_frames(frames, geometry) & CLASH
-    finally:
-        validity.MAX_PAIRS = limit  # type: ignore[misc]
-    np.testing.assert_array_equal(tree, listed)
-    assert 0 < (tree > 0).mean() < 1
-
-
-def test_fast_enough(alanine_dipeptide: Scene, geometry: Geometry) -> None:
-    """A check must cost at most 5 % of a rollout (about 0.5 ms a frame): 20 µs is asked, 2 µs are usual."""
-    frames = wobbling(alanine_dipeptide, 5000)
-    check_frames(frames[:100], geometry)
-    best = min(_timed(frames, geometry) for _ in range(3))
-    assert best / len(frames) < 20e-6
-
-
-def _timed(frames: np.ndarray, geometry: Geometry) -> float:
-    start = time.perf_counter()
-    check_frames(frames, geometry)
-    return time.perf_counter() - start

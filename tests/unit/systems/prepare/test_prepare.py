@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from systems.chemistry.geometry import signed_volumes, superpose, torsion
-from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key, stereocentres
+from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key
 from systems.errors import InputError, OutOfDomainError, PreparationError, SurromdError, UnknownNameError
 from systems.library import named_scenes
-from systems.prepare.peptide import parse_sequence
 from systems.scene import Scene
 from systems.source import prepare
 from systems.trajectory.topology_file import pdb_text
@@ -330,83 +329,10 @@ def test_structures_beyond_repair_are_refused(tmp_path: Path) -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(InputError, match="pH"):
+    with pytest.raises(InputError, match="ph 20"):
         prepare("alanine-dipeptide", ph=20)
     with pytest.raises(InputError, match="SMILES"):
         prepare("smiles:")
-
-
-# ---- sequences ----------------------------------------------------------------------------------------------------
-
-
-def test_sequence_gives_the_library_molecule() -> None:
-    scene = prepare("sequence:ACE-ALA-NME")
-    assert scene.name == "ACE-ALA-NME"
-    assert molecule_key(scene) == molecule_key(ALA2)
-    assert match_atoms(scene, ALA2).shape == (22,)
-    assert prepare("sequence:ace-ala-nme").positions_nm == pytest.approx(scene.positions_nm)
-
-
-@pytest.mark.parametrize("text", ["SDFS", "ACE-PRO-HIS-TRP-NME", "ACDEFGHIKLMNPQRSTVWY"])
-def test_sequences_are_l_and_trans(text: str) -> None:
-    scene = prepare(f"sequence:{text}")
-    omega = torsion(scene.positions_nm, backbone_torsions(scene)["omega"])
-    assert np.abs(omega).min() > np.radians(160)
-    index = {(r, n): i for i, (r, n) in enumerate(zip(scene.residue_of_atom.tolist(), scene.atom_names, strict=True))}
-    rows = [
-        [index[r, a] for a in ("CA", "N", "C", "CB")] for r in range(len(scene.residue_names)) if (r, "CB") in index
-    ]
-    assert (signed_volumes(scene.positions_nm, rows) > 0).all()
-    side_chain_centres = sum(n in ("THR", "ILE") for n in scene.residue_names)
-    assert len(stereocentres(scene)) == len(rows) + side_chain_centres
-
-
-def test_sequence_protonation_follows_names_and_ph() -> None:
-    charge = {
-        text: int(prepare(f"sequence:{text}", ph=ph).formal_charges.sum())
-        for text, ph in (("ACE-HIP-NME", 7), ("ACE-HIE-NME", 7), ("ACE-GLU-NME", 7), ("ACE-GLH-NME", 7))
-    }
-    assert charge == {"ACE-HIP-NME": 1, "ACE-HIE-NME": 0, "ACE-GLU-NME": -1, "ACE-GLH-NME": 0}
-    assert int(prepare("sequence:ACE-GLU-NME", ph=2).formal_charges.sum()) == 0
-
-
-def test_a_peptide_bond_built_cis_is_refused() -> None:
-    from systems.prepare.peptide import _verify
-
-    x = ALA2.positions_nm.copy()
-    axis = (x[16] - x[14]) / np.linalg.norm(x[16] - x[14])
-    tail = list(range(17, 22))
-    arm = x[tail] - x[16]
-    x[tail] = x[16] + 2 * (arm @ axis)[:, None] * axis - arm  # half a turn about C-N
-    cis = ALA2.with_positions(x)
-    assert np.abs(torsion(x, backbone_torsions(cis)["omega"]))[1] < np.radians(10)
-    with pytest.raises(PreparationError, match="not built trans"):
-        _verify(cis)
-    with pytest.raises(PreparationError, match="not built as L"):
-        _verify(ALA2.with_positions(ALA2.positions_nm * [1, 1, -1]))
-    _verify(ALA2)
-    assert molecule_key(cis) == molecule_key(ALA2)  # a conformation, not another molecule
-
-
-def test_sequence_text_is_parsed_or_refused_in_one_line() -> None:
-    assert parse_sequence("SDFS") == ["SER", "ASP", "PHE", "SER"]
-    assert parse_sequence("ALA") == ["ALA"]
-    assert parse_sequence("ace-ALA-nma") == ["ACE", "ALA", "NME"]
-    for text, expected in (
-        ("ACE-ALX-NME", "unknown residue 'ALX'"),
-        ("SDBS", "'B'"),
-        ("ALA-ACE-ALA", "inside"),
-        ("", "empty"),
-        ("ACE", "cap alone"),
-        ("A" * 500, "up to 200"),
-        ("ALA--ALA", "unknown residue ''"),
-    ):
-        with pytest.raises(PreparationError, match=expected) as caught:
-            prepare(f"sequence:{text}")
-        assert "\n" not in str(caught.value)
-
-
-# ---- other people's files -----------------------------------------------------------------------------------------
 
 
 def test_other_peoples_alanine_dipeptide(shared_data: Path) -> None:
