@@ -141,6 +141,16 @@ class Surrogate(nn.Module, ABC):
         for that; most models have one spacing, that of their weights."""
         raise InputError(f"{self.arch} was trained for one spacing of frames and takes no lag.")
 
+    # Whether it integrates forces, in a bath that a rollout may choose (`in_bath`).
+    integrates: ClassVar[bool] = False
+
+    def in_bath(self, changes: dict[str, Any]) -> Surrogate:
+        """Return this model, its weights shared, integrating under other settings: `temperature_k`, `friction_per_ps`,
+        `timestep_ps`, `ensemble`. Raises InputError for a model that learned frames, and their bath with them."""
+        raise InputError(
+            f"{self.arch} learned its bath with its frames; leave {', '.join(f'`{k}`' for k in changes)} out."
+        )
+
     @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         """Shape of one replica's noise; (0,) of a model without any."""

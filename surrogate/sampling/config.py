@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from systems.options import check_options, option
 
@@ -39,7 +40,10 @@ class RolloutConfig:
     select: str | None = option("Atoms to write, in MDTraj's words: backbone.", None)
     atoms: str = option("Write all atoms or no hydrogens.", "all", choices=("all", "heavy"))
     force: bool = option("Roll a scene that leaves the training domain, marked.", False)
-    temperature_k: float | None = option("Refused if it is not that of the weights.", None)
+    temperature_k: float | None = option("Refused if it is not that of weights that learned frames.", None)
+    friction_per_ps: float | None = option("Of the bath, of a learned potential.", None, within=(0.0, None))
+    timestep_ps: float | None = option("Integration step, of a learned potential.", None)
+    ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
     solver: str | None = option(
         "multistep, fitted (for 2 to 10 steps), euler or dopri5.", None, unset="the one that suits", section="sampling"
     )
@@ -52,6 +56,12 @@ class RolloutConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+
+    @property
+    def bath(self) -> dict[str, Any]:
+        """What is asked for of the integration, by the names of a potential's settings."""
+        names = ("temperature_k", "friction_per_ps", "timestep_ps", "ensemble")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
     def needs_openmm(self) -> bool:

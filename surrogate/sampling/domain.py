@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -107,6 +107,18 @@ def fit_weights(
     """
     match = match_domain(scene, weights, temperature_k=temperature_k, force=force)
     return at_lag(weights, match.domain, choose_lag(weights, lag_ps, save_every_ps)), match
+
+
+def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
+    """Return weights that integrate as asked (`RolloutConfig.bath`), where they are a potential; a temperature asked
+    of others is compared with theirs (`match_domain`). Raises InputError for anything else asked of these."""
+    if not weights.model.integrates:
+        asked = {name: value for name, value in asked.items() if name != "temperature_k"}
+    if not asked:
+        return weights
+    model, domain = weights.model.in_bath(asked), weights.domain
+    told = {name: value for name, value in asked.items() if name in domain.conditions}
+    return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **told}))
 
 
 def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:

@@ -74,8 +74,8 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    for key in ("lag_ps", "compile", "stiff"):
-        if not settings[key]:
+    for key in ("lag_ps", "compile", "stiff", "friction_per_ps", "timestep_ps", "ensemble"):
+        if settings[key] in (None, False):
             del settings[key]  # as checkpoints of earlier versions have it
     return Plan(
         scene=scene,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.config import GUARDS, RolloutConfig
-from surrogate.sampling.domain import fit_weights
+from surrogate.sampling.domain import fit_weights, in_bath
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk, Interventions, none_through
 from surrogate.sampling.openmm.coupling import Coupling
@@ -77,7 +77,7 @@ def rollout(
     """
     weights, match = fit_weights(
         scene,
-        weights,
+        in_bath(weights, config.bath),
         temperature_k=config.temperature_k,
         force=config.force,
         lag_ps=config.lag_ps,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -40,6 +41,7 @@ class PainetPotential(Surrogate):
 
     arch: ClassVar[str] = "painet-potential"
     carries_velocities: ClassVar[bool] = True
+    integrates: ClassVar[bool] = True
     bf16_by_default: ClassVar[bool] = False
     canonical: ClassVar[bool] = False
     n_conditioning: ClassVar[int] = 1
@@ -58,6 +60,13 @@ class PainetPotential(Surrogate):
     @property
     def n_new(self) -> int:
         return self.config.n_new
+
+    def in_bath(self, changes: dict[str, Any]) -> PainetPotential:
+        """See `Surrogate.in_bath`. Raises InputError and UnitError for settings that do not go together."""
+        model = copy.copy(self)
+        model.config, model._known = replace(self.config, **changes), None
+        _ = model.steps_per_frame
+        return model
 
     @property
     def steps_per_frame(self) -> int:

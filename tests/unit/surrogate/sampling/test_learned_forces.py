@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.sampling.domain import in_bath
 from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces, reweighting
 from systems.chemistry.matching import match_atoms
 from systems.chemistry.validity import geometry_from_frames
-from systems.errors import InputError, OutOfDomainError
+from systems.errors import InputError, OutOfDomainError, SurromdError
 from systems.prepare.molecule import scene_from_smiles
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4)
@@ -89,3 +91,36 @@ def test_frames_of_a_wrong_spring_are_reweighted_to_the_right_one() -> None:
     assert np.mean(x**2) > 1.4 * kt / 150.0
     assert 0.8 * len(x) < effective < 0.999 * len(x)
     assert reweighting(np.zeros(10), 300.0)[1] == pytest.approx(10.0)
+
+
+def test_a_potential_is_rolled_in_the_bath_that_is_asked_for(tmp_path: Path) -> None:
+    from surrogate.sampling.runner import RolloutConfig, rollout
+    from systems.trajectory.codec import open_trajectory
+
+    potential = PainetPotential(replace(SMALL, n_new=2, lag_ps=0.002))
+    loaded = weights(potential)
+    loaded = replace(loaded, domain=replace(loaded.domain, lag_ps=0.002))
+    frames = {}
+    for name, asked in {
+        "cold": {"temperature_k": 10.0},
+        "hot": {"temperature_k": 600.0, "friction_per_ps": 2.0},
+        "free": {"ensemble": "nve", "timestep_ps": 0.0005},
+    }.items():
+        out = tmp_path / f"{name}.h5"
+        rollout(loaded.domain.scene, loaded, [out], RolloutConfig(time_ps=0.02, guard="off", **asked))
+        with open_trajectory(out) as reader:
+            frames[name] = np.asarray(reader.read())
+    moved = {name: np.abs(x - x[0]).max() for name, x in frames.items()}
+    assert moved["hot"] > 2.0 * moved["cold"]
+    assert not np.allclose(frames["free"][1:], frames["hot"][1:], atol=1e-4)
+    assert potential.config.temperature_k == 300.0
+
+
+def test_models_of_frames_take_no_other_bath() -> None:
+    loaded = weights(Painet(PainetConfig(n_new=2, width=16)))
+    # A temperature is compared with theirs, later.
+    assert in_bath(loaded, {"temperature_k": 500.0}) is loaded
+    with pytest.raises(InputError, match="`friction_per_ps`"):
+        in_bath(loaded, {"friction_per_ps": 2.0})
+    with pytest.raises(SurromdError, match="time steps"):
+        in_bath(weights(), {"timestep_ps": 0.003})
