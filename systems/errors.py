@@ -60,5 +60,5 @@ def first_line(error: BaseException) -> str:
 
 
 def listed(things: Sequence[str], most: int = 6) -> str:
-    """`A1, A2 and 5 more`, for messages."""
+    """Return names as a message lists them: `A1, A2 and 5 more`."""
     return ", ".join(things[:most]) + (f" and {len(things) - most} more" if len(things) > most else "")

@@ -42,7 +42,7 @@ class State:
 
 
 def one_line(error: Exception) -> str:
-    """OpenMM's own words, without its advice and its address."""
+    """Return the first line of an OpenMM error, without the advice and the web address behind it."""
     return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
 
 
@@ -148,7 +148,7 @@ class Engine:
         self._context.setVelocities(velocities)
 
     def take_over(self, state: State) -> None:
-        """Go on from where another engine of this scene was, clock apart: cell, positions and velocities."""
+        """Take over cell, positions and velocities of another engine of this scene; the clock stays as it is."""
         if state.cell_nm is not None:
             self.set_cell(state.cell_nm)
         self.set_positions(state.positions_nm)

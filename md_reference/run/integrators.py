@@ -32,7 +32,7 @@ def check_ensemble(name: str, scene: Scene) -> str:
 
 
 def integrator_name(ensemble: str, scene: Scene) -> str:
-    """Return how records name it."""
+    """Return the name that records have for the integrator of an ensemble."""
     if ensemble != "nve":
         return "LangevinMiddle"
     if scene.interactions is None:

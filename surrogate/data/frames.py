@@ -57,17 +57,17 @@ class _Header:
         starts: npt.NDArray[np.int64],
         velocities: npt.NDArray[np.float32] | None,
     ) -> TrainingFrames:
-        """Return the frames with what is said of them."""
+        """Return the frames in `coordinates` (n_frames, n_atoms, 3) int16, with this header."""
         said = {f.name: getattr(self, f.name) for f in fields(_Header) if f.name != "quantum_nm"}
         return TrainingFrames(**said, coordinates=coordinates, starts=starts, velocities=velocities)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
+        """Return the header as JSON has it."""
         plain = {"scene": self.scene.to_dict(), "sources": list(self.sources), "split": self.split.to_dict()}
         return {f.name: getattr(self, f.name) for f in fields(_Header)} | plain
 
     def enter(self, handle: h5py.File, starts: npt.NDArray[np.int64]) -> None:
-        """Write it into a windows file whose frames are there."""
+        """Write header and `starts` into a windows file that holds the frames already."""
         handle.attrs["surromd_windows"] = json.dumps(self.to_dict())
         handle.create_dataset("starts", data=starts)
 

@@ -31,8 +31,8 @@ class StrideSampler:
 
     @staticmethod
     def of(frames: TrainingFrames, length: int, strides: Sequence[int], *, validation: bool = False) -> StrideSampler:
-        """Of windows of `length` frames. Raises InputError where one of the longest does not fit into a training
-        stretch; validation takes those that fit."""
+        """Return the sampler of windows of `length` frames. Raises InputError where one of the longest does not fit
+        into a training stretch; validation takes those that fit."""
         found: list[tuple[int, Tensor]] = []
         for stride in strides:
             span = (length - 1) * stride + 1

@@ -48,11 +48,11 @@ class Deviation:
 def cover(scene: Scene, domain: TrainingDomain) -> tuple[TrainingDomain, tuple[Deviation, ...]]:
     """Return the domain of one molecule that a scene is rolled in, and how the scene leaves all that was trained on.
 
-    Of weights for one molecule it is theirs. Else it is that of the molecule trained on that the scene is; of an unseen
-    molecule it is made of the scene itself: its positions in their standard pose are the template, its atoms in their
-    order along the longest axis, so that their numbering plays no part, and its bonds and handedness, not a reference,
-    say what a valid frame is. Such a molecule must be no larger than those trained on, and have no element, bond type,
-    atom environment, charge, stereocentre or torsion environment that they do not have.
+    Weights for one molecule have one domain, and it is returned. Of weights for several, a molecule that was trained on
+    has its own; that of an unseen molecule is made of the scene itself: its positions in their standard pose are the
+    template, its atoms in their order along the longest axis, so that their numbering plays no part, and its bonds and
+    handedness, not a reference, say what a valid frame is. Such a molecule must be no larger than those trained on, and
+    have no element, bond type, atom environment, charge, stereocentre or torsion environment that they do not have.
     """
     if not domain.transferable:
         return domain, ()

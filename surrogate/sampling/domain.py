@@ -33,9 +33,9 @@ TEMPERATURE_TOLERANCE_K = 0.5
 
 @dataclass(frozen=True, eq=False)
 class DomainMatch:
-    """Model atom k is scene atom `order[k]`, `(n_atoms,)`; `deviations` are those that were overruled. `domain`: of the
-    one molecule that the scene is rolled as; `seen` whether that was trained on; `nearness`: of an unseen peptide, how
-    near training comes."""
+    """How a scene fits weights. `order (n_atoms,)`: model atom k is scene atom `order[k]`; `domain`: training domain of
+    the scene's molecule; `deviations`: those that `force` overruled; `seen`: whether the molecule was trained on;
+    `nearness`: of an unseen peptide, how near to it training comes, in words."""
 
     order: npt.NDArray[np.int64]
     domain: TrainingDomain

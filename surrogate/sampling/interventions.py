@@ -56,9 +56,10 @@ class Chunk:
 def none_through(
     tallies: Sequence[Tally], n_new: int, *, at_end: bool, may_jump: bool = False
 ) -> tuple[int, str] | None:
-    """Return the worst replica and what is wrong with a model that has got no chunk of `n_new` frames through.
+    """Return the worst replica and what is wrong, where a model has drawn no chunk of `n_new` frames that passes.
 
-    None as long as it has, or may yet: `at_end` says that no chunk follows. Jumps count unless the model `may_jump`.
+    None as long as one has passed, or may yet: `at_end` says that no chunk follows. Jumps count unless the model
+    `may_jump`.
     """
     chunks, frames = sum(t.chunks for t in tallies), sum(t.frames_caught for t in tallies)
     if may_jump:
@@ -81,7 +82,7 @@ def none_through(
 
 @dataclass(frozen=True, eq=False)
 class Interventions:
-    """Draws chunks and does about caught frames what `guard` says (settings.GUARDS).
+    """Draws chunks and treats frames that the checks caught as `guard` says (`surrogate.sampling.config.GUARDS`).
 
     `coupling` is needed by 'repair', 'fallback', `energy_every` (every k-th frame's energy is checked) and `n_between`
     (frames of MD after each chunk).
@@ -149,7 +150,7 @@ class _Advance:
                 tally.note_caught(self.chunk.flags[row, bad], self.step + 1 + int(bad[0]))
 
     def help_rows(self) -> None:
-        """Bring every row through, or say why not."""
+        """Replace caught frames by further draws, repair or MD; `chunk.failure` says which row could not be helped."""
         pending = self._caught_rows()
         none_passed = {row for row in pending if self._none_passes(row)}
         for attempt in range(MOST_DRAWS + 1):
@@ -169,7 +170,7 @@ class _Advance:
         self.chunk.failure = (first, what)
 
     def judge(self) -> None:
-        """Stop where there is nothing to go on from."""
+        """Enter in `chunk.failure` the row whose last frame is not finite, or which has no valid frame under 'flag'."""
         if self.chunk.failure is not None:
             return
         for row in range(len(self.last)):

@@ -19,7 +19,7 @@ _ROUNDING = 1e-6
 
 def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | None) -> float:
     """Return the lag of a rollout: the one asked for, else the longest that the save interval is a multiple of, so that
-    no frame is computed that nobody keeps; without either the shortest, of weights without a choice theirs.
+    no frame is computed that nobody keeps; without either the shortest. Weights for one lag have that one.
 
     Raises InputError for a lag that the weights were not trained for.
     """
@@ -42,7 +42,8 @@ def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | No
 
 
 def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
-    """Return weights that step `lag_ps` in this domain of theirs, with the guards' limits of jumps at that lag."""
+    """Return the weights with a model that steps `lag_ps`, for one molecule's `domain`, with limits of jumps at that
+    lag."""
     if not domain.jumps:
         return weights if domain is weights.domain else replace(weights, domain=domain)
     limits = domain.limits

@@ -17,7 +17,7 @@ _KEPT_BYTES, _LARGEST_BYTES = 512 * 2**20, 32 * 2**20
 
 @cache
 def keep_freed_memory() -> bool:
-    """Let this process keep up to 512 MB that it frees; return whether it could be said."""
+    """Let this process keep up to 512 MB that it frees; return whether the C library took the setting."""
     if not sys.platform.startswith("linux"):
         return False
     try:

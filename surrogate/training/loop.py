@@ -85,7 +85,7 @@ class Ema:
 
     @contextmanager
     def swapped(self, module: nn.Module) -> Iterator[None]:
-        """Inside, the module holds the averaged parameters."""
+        """Put the averaged parameters into the module while the block runs, and its own back afterwards."""
         parameters = dict(module.named_parameters())
         kept = {name: p.detach().clone() for name, p in parameters.items()}
         self.copy_to(module)

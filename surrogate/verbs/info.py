@@ -111,7 +111,7 @@ def precision_lines(record: dict[str, Any]) -> list[str]:
 
 
 def training_lines(record: dict[str, Any]) -> list[str]:
-    """Return how the molecule of a rollout stands to what its weights were trained on, where it is not of it."""
+    """Return how a rollout's molecule differs from what its weights were trained on, line by line; nothing if not."""
     lines = [UNSEEN] if record.get("unseen_molecule") else []
     beyond = record.get("out_of_domain") or []
     return [*lines, *(f"outside the training domain (`force=True`): {d['what']}: {d['reason']}" for d in beyond)]

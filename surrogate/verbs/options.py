@@ -29,42 +29,42 @@ def _parse_lag_ps(text: str, what: str) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
-    """Of verbs that draw random numbers."""
+    """Options of verbs that draw random numbers."""
 
     seed: int = option("Of every random number.", 0, within=(0, None))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replicated:
-    """Of verbs that run a scene several times."""
+    """Options of verbs that run a scene several times."""
 
     replicas: int = option("Independent runs; NAME.h5 becomes NAME_r0.h5, ...", 1, within=(1, None))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quiet:
-    """Of verbs that show their progress."""
+    """Options of verbs that show their progress."""
 
     quiet: bool = option("No progress bar, no account.", False, words=("quiet", "q"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overwriting:
-    """Of verbs that write a file."""
+    """Options of verbs that write a file."""
 
     overwrite: bool = option("Replace existing output.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resuming:
-    """Of verbs that can go on where they were stopped."""
+    """Options of verbs that can go on where they were stopped."""
 
     resume: bool = option("Go on where an earlier run of the same settings stopped.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Validated:
-    """Of verbs that hold frames out of a training."""
+    """Options of verbs that hold frames out of a training."""
 
     validation: Trajectories | None = option(
         "Trajectory held out whole; repeatable.", None, unset="the last 5 % of each"

@@ -112,7 +112,7 @@ def write_verdict(path: Path, verdict: TrainingVerdict) -> Path:
 
 
 def word_of(percent_valid: float, stopped: str = "") -> str:
-    """Return what weights are whose rollout has so many valid frames, and `stopped` or not."""
+    """Return a verdict on weights in a word: by how many frames of a rollout are valid, and whether it `stopped`."""
     if stopped or percent_valid < WITH_HELP:
         return "not usable"
     return "usable" if percent_valid >= USABLE else "usable with help"

@@ -39,7 +39,8 @@ def box_vectors(lengths_nm: npt.ArrayLike, angles_deg: npt.ArrayLike) -> Float64
 
 
 def read_cells(lengths_nm: npt.ArrayLike, angles_deg: npt.ArrayLike) -> Float64Array | None:
-    """Return the box vectors of what a file says of its cells, None where lengths of zero say that it has none."""
+    """Return the box vectors `(n, 3, 3)` nm of the lengths and angles `(n, 3)` in a file; None where a length is zero,
+    as files without a cell have it."""
     lengths = np.asarray(lengths_nm, dtype=np.float64)
     return None if (lengths == 0.0).any() else box_vectors(lengths, angles_deg)
 

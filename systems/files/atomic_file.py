@@ -141,7 +141,7 @@ class AtomicFile:
         return self._size
 
     def flush(self) -> None:
-        """Nothing: a transaction ends with `commit`, not when HDF5 flushes."""
+        """Do nothing: a transaction ends with `commit`, not when HDF5 flushes."""
 
     # ---- transactions ----------------------------------------------------------------------------------------------
 

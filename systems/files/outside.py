@@ -123,5 +123,5 @@ def check_density(tree: cKDTree, radius: float, what: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return text for a terminal: what would steer it is shown in the way of Python's strings."""
+    """Return text for a terminal: control characters, which could steer it, are written as Python's escapes."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)

@@ -33,7 +33,7 @@ def write_whole(descriptor: int, data: bytes | memoryview, offset: int) -> None:
 
 
 def force_out(path: Path) -> None:
-    """Return when a file, or the names in a folder, are on the medium. Raises OSError."""
+    """Wait until a file's contents, or a folder's list of names, are on the medium (fsync). Raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -134,7 +134,7 @@ class LamSlideConfig:
 
     @property
     def latents_are_atoms(self) -> bool:
-        """Whether every atom is a latent of its own; without the graph, atoms are nothing to the flow."""
+        """Whether every atom is a latent of its own; only models that know atoms by the graph can have it so."""
         return self.graph and self.atoms.latents == "atoms"
 
     @property

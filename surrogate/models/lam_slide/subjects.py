@@ -66,7 +66,7 @@ class Subject:
         return model.encode(x, self.molecule.elements, atoms)
 
     def keep_latents(self, model: LamSlide) -> None:
-        """Encode every frame once."""
+        """Encode every frame once and keep the latents."""
         parts = [
             self.encode(model, np.arange(start, min(start + _BLOCK, self.frames.n_frames))).cpu()
             for start in range(0, self.frames.n_frames, _BLOCK)

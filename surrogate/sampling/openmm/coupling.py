@@ -36,7 +36,9 @@ class Segment:
 
 
 class Coupling:
-    """The truth that a surrogate was trained on, ready to help it. Atoms in the model's order. Close when done.
+    """OpenMM with the force field that a surrogate was trained on: relaxes its frames and runs MD from them.
+
+    Atoms are in the model's order. Call `close` when done.
 
     Raises InputError when the weights do not say which force field they were trained with, or OpenMM cannot build it.
     """

@@ -197,7 +197,7 @@ def _perceive(
 
 
 def missing_hydrogens(found: Mol2) -> PreparationError:
-    """The refusal of a molecule that has no Lewis structure, with the atoms whose geometry says why, if any."""
+    """Return the error for a molecule without a Lewis structure, naming the atoms whose geometry says why, if any."""
     graph = nx.Graph(found.bonds.tolist())
     graph.add_nodes_from(range(len(found.elements)))
     neighbours = [sorted(graph[i]) for i in range(len(found.elements))]
