@@ -16,6 +16,7 @@ from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, evenly
 from surrogate.judge.measure.statistics import Estimate, estimate, excess_p
 from surrogate.judge.measure.structure import Residue
 from surrogate.judge.rows.block_means import block_means, shift_row
+from surrogate.judge.rows.rare_states import free_energy_row, rare_residues, without_positive_phi
 from surrogate.judge.rows.rows import Group, Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
@@ -140,16 +141,19 @@ def are_many(trio: Trio) -> bool:
 
 
 def population_rows(trio: Trio) -> list[Row]:
-    """Return the populations of the psi basins and of phi > 0, in percent of all frames; of many residues only the one
-    that is furthest off."""
+    """Return the populations of the psi basins and of phi > 0, in percent of all frames, where that is rare its free
+    energy; of many residues only the one that is furthest off."""
     if are_many(trio):
         return [_largest_population_shift(trio)]
-    rows = []
+    rows, rare = [], rare_residues(trio)
     for k, label in enumerate(trio.torsions.psi_labels):
         for name, member in (("β", distributions.is_beta), ("α", distributions.is_alpha)):
             rows.append(_population_row(trio, "psi", k, member, f"ψ in the {name} basin", label))
     for k, label in enumerate(trio.torsions.phi_labels):
-        rows.append(_population_row(trio, "phi", k, distributions.is_positive, "φ > 0", label))
+        if k in rare:
+            rows.append(free_energy_row(trio, k, label))
+        else:
+            rows.append(_population_row(trio, "phi", k, distributions.is_positive, "φ > 0", label))
     return rows
 
 
@@ -221,13 +225,16 @@ def _population_row(
 
 def torsion_rows(trio: Trio) -> list[Row]:
     """Return Jensen-Shannon distances: jointly per residue (50 x 50 bins), then phi and psi alone (100 bins); of many
-    residues their means."""
+    residues their means. Where phi > 0 is rare it is left out of the map and of phi."""
     if are_many(trio):
         return _mean_torsion_rows(trio)
-    rows = []
+    rows, rare = [], rare_residues(trio)
     for residue in trio.torsions.residues:
         counts = [_joint_counts(s, residue) for s in trio.samples]
-        rows.append(_jsd_row(trio, counts, "joint_jsd", "Joint φ/ψ", residue.label, "distributions"))
+        what = "Joint φ/ψ"
+        if residue.phi in rare:
+            counts, what = [without_positive_phi(c, RAMACHANDRAN_BINS.n) for c in counts], f"{what} at φ < 0"
+        rows.append(_jsd_row(trio, counts, "joint_jsd", what, residue.label, "distributions"))
     for symbol, labels, pick in (
         ("φ", trio.torsions.phi_labels, lambda s: s.features.phi),
         ("ψ", trio.torsions.psi_labels, lambda s: s.features.psi),
@@ -236,8 +243,10 @@ def torsion_rows(trio: Trio) -> list[Row]:
             counts = [
                 distributions.block_counts([x[:, k] for x in pick(s)], TORSION_BINS, s.blocks) for s in trio.samples
             ]
-            key = "phi_jsd" if symbol == "φ" else "psi_jsd"
-            rows.append(_jsd_row(trio, counts, key, symbol, label, "distributions"))
+            key, what = "phi_jsd" if symbol == "φ" else "psi_jsd", symbol
+            if symbol == "φ" and k in rare:
+                counts, what = [without_positive_phi(c, TORSION_BINS.n) for c in counts], f"{symbol} at φ < 0"
+            rows.append(_jsd_row(trio, counts, key, what, label, "distributions"))
     return rows
 
 

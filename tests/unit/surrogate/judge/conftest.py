@@ -47,9 +47,11 @@ def pose(scene: Scene, phi: np.ndarray, psi: np.ndarray, rng: np.random.Generato
     return (x + 0.002 * rng.standard_normal(x.shape)).astype(np.float32)
 
 
-def torsion_path(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def torsion_path(
+    n: int, rng: np.random.Generator, transitions: np.ndarray = TRANSITIONS
+) -> tuple[np.ndarray, np.ndarray]:
     """Phi and psi `(n,)` of the Markov chain, with correlated fluctuation inside a state."""
-    cumulative = TRANSITIONS.cumsum(1)
+    cumulative = transitions.cumsum(1)
     draws = rng.random(n)
     state = np.empty(n, dtype=int)
     current = 0
@@ -66,11 +68,14 @@ def torsion_path(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
 
 @pytest.fixture(scope="session")
 def simulate(alanine_dipeptide: Scene) -> Callable[..., Ensemble]:
-    """`simulate(seed, n_frames, n_segments=1)` -> an ensemble of the toy dipeptide at 1 ps."""
+    """`simulate(seed, n_frames, n_segments=1, transitions=...)` -> an ensemble of the toy dipeptide at 1 ps."""
 
-    def run(seed: int, n_frames: int = 12_000, n_segments: int = 1) -> Ensemble:
+    def run(seed: int, n_frames: int = 12_000, n_segments: int = 1, transitions: np.ndarray = TRANSITIONS) -> Ensemble:
         rng = np.random.default_rng(seed)
-        segments = [pose(alanine_dipeptide, *torsion_path(n_frames // n_segments, rng), rng) for _ in range(n_segments)]
+        segments = [
+            pose(alanine_dipeptide, *torsion_path(n_frames // n_segments, rng, transitions), rng)
+            for _ in range(n_segments)
+        ]
         return Ensemble(f"toy {seed}", segments, 1.0, alanine_dipeptide, record={"temperature_k": 300.0})
 
     return run
