@@ -2,6 +2,9 @@
 
     python docs/studies/judge/judge_cases.py FOLDER [-o docs/judge_cases.md]
 
+`--temperatures` reads instead the temperature of MD made here at 300 and at 350 K, against those runs and against our
+own at 300 K.
+
 FOLDER holds ala2.pdb and trajectory-1.dcd to trajectory-4.dcd, runs of 10 ns of alanine dipeptide at 1 ps. The first is
 the reference, the third the replicate; every case is made of the second, but where it says otherwise. One is simulated
 anew with OpenMM as those runs were, but too hot.
@@ -136,6 +139,23 @@ def run_cases(folder: Path, cases: Sequence[Case] = CASES) -> list[Outcome]:
     return [_outcome(case, judgement, found) for case, judgement in zip(cases, found.judgements, strict=True)]
 
 
+def temperatures(folder: Path) -> str:
+    """Return the table of what the temperature row reads of MD made here, by two references."""
+    from surrogate.judge.comparison import compare
+    from surrogate.judge.rows.rows import Options
+
+    runs = load_runs(folder)
+    cold, hot = (replace(runs[0], label=f"ours, {t:.0f} K", segments=[simulate(folder, t)]) for t in (300.0, 350.0))
+    lines = ["| reference | candidate | reads |", "|---|---|---|"]
+    for reference, candidates in ((runs[0], [cold, hot]), (cold, [hot])):
+        found = compare(reference, candidates, runs[2], options=Options(peptide_recipe=False))
+        for judgement in found.judgements:
+            read = judgement.row("temperature").candidate
+            words = f"{read.value:.0f} K [{read.low:.0f}, {read.high:.0f}]"
+            lines.append(f"| {reference.label} | {judgement.account.label} | {words} |")
+    return "\n".join(lines)
+
+
 def _outcome(case: Case, judgement: Judgement, found: Comparison) -> Outcome:
     notes = [n for n in (*judgement.notes, *found.notes) if n.startswith(case.name)]
     parts = re.split(r"; |(?<=[a-z)])\. ", judgement.verdict)
@@ -159,7 +179,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--out", type=Path, default=None, help="write the table between its markers in this page")
+    parser.add_argument("--temperatures", action="store_true", help="what MD at 300 and 350 K is read as")
     args = parser.parse_args(arguments)
+    if args.temperatures:
+        sys.stdout.write(temperatures(args.folder) + "\n")
+        return
     text = table(run_cases(args.folder))
     if args.out is None:
         sys.stdout.write(text + "\n")

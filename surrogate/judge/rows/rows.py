@@ -23,6 +23,7 @@ from surrogate.judge.measure.statistics import (
 from surrogate.judge.measure.structure import Backbone, Features
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
 Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
@@ -31,6 +32,8 @@ Word = Literal["agrees", "close", "differs", "fails", "undecided", "imposed"]
 
 # A replicate this unlikely to be of one simulation with the reference does not speak for it.
 UNLIKE_BELOW = 1e-3
+# Of a lag, to tell anything at it.
+LEAST_LAGS = 10
 # Histograms drawn at a time, as numbers: a hundred MB or so.
 _DRAWN_VALUES = 4e6
 
@@ -174,6 +177,17 @@ def make_sample(
     weights = bootstrap_weights(blocks.n_blocks, options.n_bootstrap, rng)
     equal = weights if n == blocks.n_blocks else bootstrap_weights(n, options.n_bootstrap, rng)
     return Sample(features, blocks, weights, n, equal)
+
+
+def too_short(trajectories: Sequence[Features], lag_frames: float) -> str:
+    """Return why nothing is estimated at this lag, in words: a trajectory has no unbroken stretch of `LEAST_LAGS` lags.
+    Empty where all have one."""
+    longest = min(max(f.segment_lengths) for f in trajectories)
+    if longest >= LEAST_LAGS * lag_frames:
+        return ""
+    lag_ps = trajectories[0].lag_ps
+    needed, held = (format_time_ps(float(f"{n * lag_ps:.3g}")) for n in (LEAST_LAGS * lag_frames, longest))
+    return f"it takes {needed} without a break, {LEAST_LAGS} lags, and one of the trajectories holds {held}"
 
 
 def by_group(rows: Sequence[Row]) -> list[Row]:

@@ -15,7 +15,7 @@ from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import estimate
 from surrogate.judge.rows.charts import BarChart, Chart, Landscape, Line, LineChart, Role
 from surrogate.judge.rows.motion.relaxation_rows import speed_words
-from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, too_short
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,8 +52,8 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     features = [tica_features(s.features) for s in trio.samples]
     if not features[0][0].shape[1]:
         return [], [], [(name, "the scene has no torsion to turn about")]
-    if min(max(s.features.segment_lengths) for s in trio.samples) < 10 * lag:
-        return [], [], [(name, "the segments are shorter than ten lags")]
+    if short := too_short([s.features for s in trio.samples], lag):
+        return [], [], [(name, short)]
     projection = msm.fit_projection(features[0], lag)
     if projection is None:
         return [], [], [(name, WITHOUT_TICA)]

@@ -22,7 +22,7 @@ from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import Blocks
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.rows.charts import BarChart, Chart, Line, LineChart
-from surrogate.judge.rows.rows import Row, Trio
+from surrogate.judge.rows.rows import Row, Trio, too_short
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -161,8 +161,8 @@ def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, 
     lag = LAG_PS / reference.lag_ps
     if abs(lag - round(lag)) > 1e-6 or lag < 1:
         return [], [], [(name, f"frames every {format_time_ps(reference.lag_ps)} do not divide the lag")]
-    if min(max(f.segment_lengths) for f in (reference, candidate, replicate)) < 10 * lag:
-        return [], [], [(name, "the segments are shorter than ten lags")]
+    if short := too_short((reference, candidate, replicate), lag):
+        return [], [], [(name, short)]
     if not all(np.isfinite(x).any() for f in (candidate, replicate) for x in (*f.phi, *f.psi)):
         return [], [], [(name, "a segment holds no finite frame")]
     fit = fit_recipe(reference)

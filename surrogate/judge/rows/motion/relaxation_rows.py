@@ -14,7 +14,7 @@ from surrogate.judge.measure.slow_motion import SLOW_KINDS, tica_features
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, widening
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.rows import curves
-from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row
+from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, too_short
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -95,7 +95,7 @@ def correlation_rows(trio: Trio) -> tuple[list[Row], list[curves.CorrelationCurv
                 rows.append(_value_row(trio, results, lag, what, label))
             else:
                 name = f"C({format_time_ps(lag * lag_ps)}) of {what}, {label}"
-                skipped.append((name, "the segments are shorter than that"))
+                skipped.append((name, f"a trajectory holds {format_time_ps(longest * lag_ps)} without a break"))
         rows.append(_time_row(trio, results, what, label))
         (ref_low, ref_high), (cand_low, cand_high) = results[0].band(), results[1].band()
         reference, candidate, replicate = (r.curve[kept] for r in results)
@@ -213,8 +213,8 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
     features = [tica_features(s.features) for s in trio.samples]
     if not features[0][0].shape[1]:
         return [], [], [(name, "the scene has no torsion to turn about")]
-    if min(max(s.features.segment_lengths) for s in trio.samples) < 10 * lag:
-        return [], [], [(name, "the segments are shorter than ten lags")]
+    if short := too_short([s.features for s in trio.samples], lag):
+        return [], [], [(name, short)]
     model = kinetics.fit_tica(features[0], lag)
     if model is None:
         return [], [], [(name, kinetics.WITHOUT_TICA)]
