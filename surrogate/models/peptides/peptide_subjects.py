@@ -21,6 +21,8 @@ from systems.errors import InputError
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
 _EVEN_SHARE = 0.5
+# Share of batches whose windows are as long as a chunk; others are shorter, as chunks at long lags are.
+_WHOLE_SHARE = 0.5
 # Share of windows whose later frames are drawn from equilibrium, at a time when the given one is forgotten.
 _FORGOTTEN_SHARE = 0.1
 _MARKOV_LAG_PS = 50.0
@@ -85,9 +87,11 @@ class PeptideSubject:
         return torch.cat(found).double().numpy()
 
     def windows(
-        self, n: int, config: PeptideConfig, generator: torch.Generator, *, validation: bool = False
-    ) -> tuple[Tensor, Tensor]:
-        """Draw windows: frames `(n, 1 + chunk_frames)` and the times `(n, chunk_frames)` ps after the first.
+        self, n: int, config: PeptideConfig, generator: torch.Generator, *, later: int | None = None,
+        validation: bool = False,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Draw windows: frames `(n, 1 + later)` and the times `(n, later)` ps after the first; `later` is
+        `chunk_frames` where it is not given.
 
         Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
         longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
@@ -100,7 +104,7 @@ class PeptideSubject:
             raise InputError(
                 f"{self.frames.scene.name}: runs hold no window of {config.chunk_frames} frames; run longer."
             )
-        t = config.chunk_frames
+        t = later or config.chunk_frames
         even = torch.rand(n, 1, generator=generator) < _EVEN_SHARE
         top = float(np.log(longest / t))
         stride = torch.exp(torch.rand(n, 1, generator=generator) * top).round().clamp(1, longest // t)
@@ -156,6 +160,13 @@ class PeptideSubject:
     def _cumulative(self) -> npt.NDArray[np.float64]:
         assert self.weights is not None
         return np.cumsum(self.weights)
+
+    def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw windows as training sees them: half of the batches of whole chunks, the others of fewer frames."""
+        later = config.chunk_frames
+        if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
+            later = int(torch.randint(1, later + 1, (1,), generator=generator))
+        return self.windows(n, config, generator, later=later)
 
     def numbers(self, model: PeptideSlide, idx: Tensor) -> Tensor:
         """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames."""

@@ -95,7 +95,7 @@ def train_peptides(
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
-        idx, times = subject.windows(training.batch, config, generator)
+        idx, times = subject.batch(training.batch, config, generator)
         return peptide_loss(model, subject.chain, subject.numbers(model, idx), times.to(device), generator)
 
     @torch.no_grad()

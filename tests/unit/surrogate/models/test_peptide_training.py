@@ -80,6 +80,15 @@ def test_windows_read_backwards_came_from_where_equilibrium_is(frames: TrainingF
     assert len((idx[~backwards, 0] // 200).unique()) == 4, "forwards they start anywhere"
 
 
+def test_batches_are_of_every_length_that_a_chunk_has(frames: TrainingFrames, config: PeptideConfig) -> None:
+    subject = PeptideSubject(frames, chain_features(frames.scene, config))
+    generator = torch.Generator().manual_seed(0)
+    lengths = np.bincount([subject.batch(2, config, generator)[1].shape[1] for _ in range(200)], minlength=5)
+    assert lengths[0] == 0 and (lengths[1:4] > 10).all() and 100 < lengths[4] < 150
+    idx, times = subject.windows(300, config, generator, later=1)
+    assert idx.shape == (300, 2) and times.max() == 40, "a single frame lies as far as the longest time"
+
+
 def test_positive_phi_weighs_what_metadynamics_says() -> None:
     """Two runs at either sign of phi of both residues: each of the four patterns weighs what its residues' odds say."""
     scene = build_peptide("ACE-ALA-VAL-NME")
