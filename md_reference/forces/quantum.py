@@ -6,6 +6,7 @@ GFN2-xTB: Bannwarth, Ehlert and Grimme, J. Chem. Theory Comput. 15, 1652 (2019).
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,17 +50,7 @@ def build_quantum_system(
     for mass_da in _masses_da(scene, hydrogen_mass_da).tolist():
         system.addParticle(mass_da)
 
-    def compute(state: Any) -> tuple[float, FloatArray]:
-        positions_nm = np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64)
-        try:
-            return potential(positions_nm)
-        except PreparationError:
-            if state.getStepCount() > 0:
-                raise
-            # A minimiser's first trial moves all atoms by 1 nm in sum; it must learn that this is uphill.
-            return _UPHILL_KJ_MOL, np.zeros_like(positions_nm)
-
-    force = openmm.PythonForce(compute)
+    force = openmm.PythonForce(_Compute(potential))
     force.setName("GFN2-xTB")
     system.addForce(force)
     if constrain_hydrogens and (bonds := _hydrogen_bonds(scene)):
@@ -67,6 +58,23 @@ def build_quantum_system(
         for hydrogen, other in bonds:
             system.addConstraint(hydrogen, other, float(np.linalg.norm(rest_nm[hydrogen] - rest_nm[other])))
     return system
+
+
+@dataclass(frozen=True, eq=False)
+class _Compute:
+    """The potential as OpenMM calls it; a copy of the System takes it along, pickled."""
+
+    potential: Potential
+
+    def __call__(self, state: Any) -> tuple[float, FloatArray]:
+        positions_nm = np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64)
+        try:
+            return self.potential(positions_nm)
+        except PreparationError:
+            if state.getStepCount() > 0:
+                raise
+            # A minimiser's first trial moves all atoms by 1 nm in sum; it must learn that this is uphill.
+            return _UPHILL_KJ_MOL, np.zeros_like(positions_nm)
 
 
 def _hydrogen_bonds(scene: Scene) -> list[tuple[int, int]]:
@@ -135,15 +143,19 @@ class Potential:
             "GFN2-xTB", numbers, scene.positions_nm / NM_PER_BOHR, charge=charge, uhf=unpaired
         )
         self._calculator.set("verbosity", 0)
-        self._name = scene.name
+        self._scene = scene
+
+    def __reduce__(self) -> tuple[type[Potential], tuple[Scene]]:
+        return Potential, (self._scene,)
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         try:
             self._calculator.update(positions=positions_nm / NM_PER_BOHR)
             result = self._calculator.singlepoint()
         except (RuntimeError, ValueError) as error:
+            name, reason = self._scene.name, str(error).splitlines()[0]
             raise PreparationError(
-                f"GFN2-xTB finds no electronic ground state for scene {self._name!r} ({str(error).splitlines()[0]})."
+                f"GFN2-xTB finds no electronic ground state for scene {name!r} ({reason})."
             ) from error
         energy = float(result.get("energy")) * KJ_MOL_PER_HARTREE
         gradient = np.asarray(result.get("gradient"), dtype=np.float64)

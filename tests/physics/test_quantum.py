@@ -11,6 +11,7 @@ from md_reference.forces.spec import ForceFieldSpec, at_level
 from md_reference.run.config import Conditions
 from md_reference.run.defaults import settle
 from md_reference.run.engine import Engine
+from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import InputError, PreparationError, UnknownNameError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
@@ -153,3 +154,15 @@ def test_impossible_electrons_are_refused() -> None:
     wrong = replace(scene, provenance=scene.provenance | {"multiplicity": 2})
     with pytest.raises(PreparationError, match="unpaired"):
         build_quantum_system(wrong)
+
+
+def test_stiff_bonds_of_a_frame_relax_on_a_copy_of_the_system() -> None:
+    """As the guards of rollouts do it: the copy takes the quantum program along."""
+    scene = scene_from_smiles("O")
+    stretched = scene.positions_nm.copy()
+    stretched[1] += 0.2 * (stretched[1] - stretched[0])
+    potential = Potential(scene)
+    with Relaxer(scene, build_quantum_system(scene), platform="Reference", born=False) as relaxer:
+        found = relaxer.relax(stretched)
+    assert found.potential_kj_mol == pytest.approx(potential(found.positions_nm)[0], abs=1e-4)
+    assert found.potential_kj_mol < potential(stretched)[0] - 10.0
