@@ -116,7 +116,7 @@ class Ensemble(InSegments):
             chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
             changed=None if self.changed is None else [c[::stride] for c in self.changed],
             lag_ps=self.lag_ps * stride,
-            notes=(*self.notes, f"{self.label}: every {stride}th frame used, for equal save intervals."),
+            notes=(*self.notes, f"{self.label}: one frame in {stride} is used, for equal save intervals."),
         )
 
     def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
