@@ -74,16 +74,18 @@ def leap_scene(
     return scene, prmtop.createSystem(nonbondedMethod=app.NoCutoff, constraints=None, removeCMMotion=False)
 
 
+def ours_and_theirs(scene: Scene, theirs: Any) -> tuple[dict[str, float], dict[str, float]]:
+    """The energy terms in vacuum of the force field that we choose, which is ff14SB, and of tleap's System."""
+    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
+    assert spec.force_field == "ff14SB"
+    return energy_terms(build_system(scene, spec), scene.positions_nm), energy_terms(theirs, scene.positions_nm)
+
+
 @needs_ambertools
 @pytest.mark.parametrize("name", ["SEP", "S1P", "TPO", "T1P", "PTR", "Y1P", "H1D", "H2D", "H1E", "H2E"])
 def test_phosphorylated_residues_have_tleaps_energies(name: str, tmp_path: Path) -> None:
     scene, theirs = leap_scene(f"ACE ALA {name} GLY NME", tmp_path, ("protein.ff14SB", "phosaa14SB"))
-    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
-    assert spec.force_field == "ff14SB"
-    ours, expected = (
-        energy_terms(build_system(scene, spec), scene.positions_nm),
-        energy_terms(theirs, scene.positions_nm),
-    )
+    ours, expected = ours_and_theirs(scene, theirs)
     for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
         assert ours[force] == pytest.approx(expected[force], abs=0.02), force
     # Impropers of rings depend on the order of their atoms (`regrouping`): two of 4.6 kJ/mol in a tyrosine.
@@ -215,12 +217,7 @@ def test_the_amide_that_ends_a_chain_is_a_residue_and_asparagines_is_not() -> No
 @pytest.mark.parametrize(("sequence", "source"), [("DA5 DT DG3", "DNA.OL15"), ("A5 U G C3", "RNA.OL3")])
 def test_nucleic_acids_have_tleaps_energies(sequence: str, source: str, tmp_path: Path) -> None:
     scene, theirs = leap_scene(sequence, tmp_path, (source,))
-    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
-    assert spec.force_field == "ff14SB"
-    ours, expected = (
-        energy_terms(build_system(scene, spec), scene.positions_nm),
-        energy_terms(theirs, scene.positions_nm),
-    )
+    ours, expected = ours_and_theirs(scene, theirs)
     for force, energy in expected.items():
         if force in ours:
             assert ours[force] == pytest.approx(energy, rel=2e-4, abs=0.3), force
@@ -247,12 +244,7 @@ def glycopeptide(folder: Path, names: dict[str, str]) -> tuple[Scene, Any]:
 @pytest.mark.parametrize("names", [{}, _PDB_NAMES], ids=["glycam", "pdb"])
 def test_a_glycopeptide_has_tleaps_energies(names: dict[str, str], tmp_path: Path) -> None:
     scene, theirs = glycopeptide(tmp_path, names)
-    spec = resolve(scene, ForceFieldSpec("auto", "vacuum", None, False))
-    assert spec.force_field == "ff14SB"
-    ours, expected = (
-        energy_terms(build_system(scene, spec), scene.positions_nm),
-        energy_terms(theirs, scene.positions_nm),
-    )
+    ours, expected = ours_and_theirs(scene, theirs)
     for force in ("HarmonicBondForce", "HarmonicAngleForce", "NonbondedForce"):
         assert ours[force] == pytest.approx(expected[force], rel=1e-5, abs=0.05), force
     assert ours["PeriodicTorsionForce"] == pytest.approx(expected["PeriodicTorsionForce"], abs=0.3)

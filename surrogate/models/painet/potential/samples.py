@@ -12,6 +12,7 @@ import torch
 
 from surrogate.data.tensor_checksums import tensor_checksum
 from systems.errors import InputError
+from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 
 Array = Any
@@ -72,7 +73,7 @@ class Samples:
                 tensors = {f.name: handle.get_tensor(f.name) for f in fields(Samples)}
             text = metadata["surromd_samples"]
             whole = metadata["sha256"] == tensor_checksum(text, tensors)
-            whose = json.loads(text)["molecule"]
+            whose = parsed(text)["molecule"]
         except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"samples {path} cannot be read ({error}); train again without `resume`.") from error
         if not whole:
