@@ -269,7 +269,8 @@ def worth_charts(found: Sequence[Worth]) -> list[LineChart]:
     """Return one chart a measure: the error of MD against its length, and the candidate's error as a level line."""
     charts = []
     for w in found:
-        x = np.asarray(w.lengths_ps) * 1e-3
+        unit, scale = ("ns", 1e-3) if w.lengths_ps[-1] >= 1e3 else ("ps", 1.0)
+        x = np.asarray(w.lengths_ps) * scale
         level = np.full(len(x), w.candidate_error)
         charts.append(
             LineChart(
@@ -277,7 +278,7 @@ def worth_charts(found: Sequence[Worth]) -> list[LineChart]:
                 title=f"Worth by {w.measure}: {w.in_words()} of MD",
                 caption="Distance to the truth of reference MD of each length (typical piece; band: 10 to 90 % of "
                 "the pieces) and of the candidate. Where the lines cross, MD is as good as the candidate.",
-                x_label="length of MD / ns",
+                x_label=f"length of MD / {unit}",
                 y_label="distance to the truth",
                 lines=(
                     Line(

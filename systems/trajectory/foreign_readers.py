@@ -169,8 +169,10 @@ class MdanalysisReader(TrajectoryReader):
                 self.n_frames, self.n_atoms = int(self._reader.n_frames), int(self._reader.n_atoms)
                 self.time_ps, self.times_known = self._times()
         except (ValueError, TypeError) as error:
+            # Of a format that it does not know it lists all others in the lines that follow.
+            why = first_line(error).partition(". The FORMATs")[0]
             raise TrajectoryError(
-                f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {first_line(error)}."
+                f"{path} cannot be read by MDTraj or MDAnalysis {MDAnalysis.__version__}: {why}."
             ) from error
         except Exception as error:  # each of its readers raises its own kinds
             raise TrajectoryError(f"{path} cannot be read: {first_line(error)}.") from error

@@ -145,3 +145,9 @@ def test_big_endian_dcd_with_cell(tmp_path: Path) -> None:
     path.write_bytes(whole)
     with open_trajectory(path) as reader:
         np.testing.assert_allclose(reader.read_cells(), [np.diag([3.0, 4.0, 5.0])] * 3)
+
+
+def test_an_unknown_format_is_refused_in_one_whole_sentence(tmp_path: Path) -> None:
+    (tmp_path / "bad.xyzz").write_text("x")
+    with pytest.raises(TrajectoryError, match=r"cannot be read by MDTraj or MDAnalysis.*'\.$"):
+        open_trajectory(tmp_path / "bad.xyzz")

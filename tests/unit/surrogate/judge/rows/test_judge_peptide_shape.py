@@ -12,7 +12,7 @@ from surrogate.judge.measure.probes import _ends
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.charts import LineChart
 from surrogate.judge.rows.rows import Options
-from surrogate.judge.worth import Worth
+from surrogate.judge.worth import Worth, worth_charts
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +57,6 @@ def test_both_ends_of_an_interval_share_a_unit() -> None:
     assert worth.in_words() == "3.4 ns [0.38 ns, > 10 ns]"
     assert replace(worth, high_ps=23_997.0).in_words() == "3.4 ns [0.38 ns, 24 ns]"
     assert replace(worth, worth_ps=690.0, low_ps=41.0, high_ps=820.0).in_words() == "690 ps [41 ps, 820 ps]"
+    assert worth_charts([worth])[0].x_label == "length of MD / ns"
+    short = replace(worth, lengths_ps=(0.04, 5.0))
+    assert worth_charts([short])[0].x_label == "length of MD / ps", "no row of noughts below the axis"
