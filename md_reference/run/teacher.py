@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -158,6 +159,10 @@ def _turned(x: FloatArray, torsion: Any, graph: nx.Graph, angle: float) -> Float
 def _start(scene: dict[str, Any]) -> None:
     global _worker
     os.environ["OMP_NUM_THREADS"] = "1"
+    # Ctrl-C is the parent's to answer: a worker that it ends while it takes a task leaves the pool's queue locked.
+    for name in ("SIGINT", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
     _worker = Potential(Scene.from_dict(scene))
 

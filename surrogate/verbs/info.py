@@ -25,6 +25,9 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
     """
     named = Path(path) if Path(path).exists() else shipped_weights().get(str(path), Path(path))
     if scene is not None:
+        if not named.exists():
+            known = ", ".join(shipped_weights())
+            raise InputError(f"{path}: no such file, nor shipped weights of that name ({known}).")
         if named.suffix.lower() != ".safetensors":
             raise InputError(f"{path} is no weights file; what covers {scene} can be asked of weights alone.")
         return _coverage(named, scene)

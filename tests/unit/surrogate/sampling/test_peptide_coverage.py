@@ -111,6 +111,8 @@ def test_info_says_how_near_training_comes(weights: Weights) -> None:
     longer = api.info(weights.path, "sequence:ACE-SER-ALA-SER-NME")
     assert longer["covered"] == "only with force" and "3 amino acids" in longer["reason"]
     assert api.info(weights.path, "sequence:ACE-GLY-NME")["covered"] == "no"
+    with pytest.raises(InputError, match="nor shipped weights of that name"):
+        api.info("alanine", "sequence:ACE-GLY-NME")
     with pytest.raises(InputError, match="no weights file"):
         api.info(Path(__file__), "sequence:ACE-GLY-NME")
 
