@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -31,15 +32,15 @@ _LEAST_FRAMES = 10
 _SAMPLED_VALUES = 20_000_000
 
 
-class InSegments:
+class InSegments(ABC):
     """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
 
     lag_ps: float
 
     @property
+    @abstractmethod
     def segment_lengths(self) -> list[int]:
         """Frames in each segment."""
-        raise NotImplementedError
 
     @property
     def n_frames(self) -> int:

@@ -7,6 +7,8 @@ with these weights is a descent step of `pair_energy`.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -62,6 +64,24 @@ def largest_step(weights: Tensor, smoothness: float) -> float:
     return bound / (1.0 + bound)
 
 
+class AttentionSettings(Protocol):
+    """What a model's configuration says of its attention. `step`: eta of the descent; `psi_limit`: largest Psi / Phi;
+    `attention`: 'dense', or in the factored form."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def n_heads(self) -> int: ...
+    @property
+    def head_dim(self) -> int: ...
+    @property
+    def step(self) -> float: ...
+    @property
+    def psi_limit(self) -> float: ...
+    @property
+    def attention(self) -> str: ...
+
+
 class EnergyAttention(nn.Module):
     """One latent step: h <- (1 - eta) h + eta W concat_heads(mean of values), with learned Q, K, V.
 
@@ -69,15 +89,14 @@ class EnergyAttention(nn.Module):
     type and head: Phi >= Psi keeps every weight positive. (A common factor of Phi and Psi, s_1 in the paper, cancels.)
     """
 
-    def __init__(
-        self, width: int, n_heads: int, head_dim: int, n_types: int, *, step: float, psi_limit: float, dense: bool
-    ) -> None:
+    def __init__(self, config: AttentionSettings, n_types: int) -> None:
         super().__init__()
-        self.n_heads, self.step, self.psi_limit, self.dense = n_heads, step, psi_limit, dense
-        self.qkv = nn.Linear(width, 3 * n_heads * head_dim)
-        self.out = nn.Linear(n_heads * head_dim, width)
-        self.e_phi = nn.Parameter(torch.zeros(n_heads, n_types, n_types))
-        self.e_psi = nn.Parameter(torch.zeros(n_heads, n_types, n_types))
+        self.n_heads, self.step, self.psi_limit = config.n_heads, config.step, config.psi_limit
+        self.dense = config.attention == "dense"
+        self.qkv = nn.Linear(config.width, 3 * config.n_heads * config.head_dim)
+        self.out = nn.Linear(config.n_heads * config.head_dim, config.width)
+        self.e_phi = nn.Parameter(torch.zeros(config.n_heads, n_types, n_types))
+        self.e_psi = nn.Parameter(torch.zeros(config.n_heads, n_types, n_types))
 
     def type_matrices(self) -> tuple[Tensor, Tensor]:
         """Return Phi and Psi `(n_heads, n_types, n_types)`."""

@@ -66,18 +66,7 @@ class Painet(Surrogate):
         self.embed_state = nn.Sequential(nn.Linear(3, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
         self.embed_frame = nn.Parameter(torch.randn(c.n_new, c.width) * 0.1)
         n_attention = 0 if c.attention == "none" else c.n_new
-        self.steps = nn.ModuleList(
-            EnergyAttention(
-                c.width,
-                c.n_heads,
-                c.head_dim,
-                N_TYPES,
-                step=c.step,
-                psi_limit=c.psi_limit,
-                dense=c.attention == "dense",
-            )
-            for _ in range(n_attention)
-        )
+        self.steps = nn.ModuleList(EnergyAttention(c, N_TYPES) for _ in range(n_attention))
         if c.n_modes:
             self.surroundings = Surroundings(c.width)
             self.modes = Modes(c.width, c.n_modes, c.n_new)

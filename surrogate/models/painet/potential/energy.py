@@ -129,18 +129,7 @@ class EnergyNetwork(nn.Module):
         self.of_shell = nn.Embedding(N_SHELLS, c.width)
         self.of_pair = nn.Sequential(nn.Linear(2 * c.width, c.width), nn.SiLU(), nn.Linear(c.width, c.width), nn.SiLU())
         self.looks = nn.ModuleList(Look(c, 0 if k == 0 else c.n_heads, first=k == 0) for k in range(c.n_steps))
-        self.steps = nn.ModuleList(
-            EnergyAttention(
-                c.width,
-                c.n_heads,
-                c.head_dim,
-                N_TYPES,
-                step=c.step,
-                psi_limit=c.psi_limit,
-                dense=c.attention == "dense",
-            )
-            for _ in range(c.n_steps)
-        )
+        self.steps = nn.ModuleList(EnergyAttention(c, N_TYPES) for _ in range(c.n_steps))
         self.site = nn.Sequential(nn.Linear(c.width, c.width), nn.SiLU(), nn.Linear(c.width, c.n_members))
         self.table = nn.Linear(c.width, c.n_radial * c.n_members)
         self.latent = nn.Parameter(torch.zeros(c.n_heads, c.n_members))

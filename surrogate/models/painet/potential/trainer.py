@@ -346,10 +346,7 @@ class PotentialTrainer(Trainer):
     """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its truth."""
 
     def check(self, request: TrainingRequest) -> None:
-        raise InputError(
-            f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
-            "`level='gfn2-xtb'`."
-        )
+        raise _no_trajectories(request)
 
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""
@@ -358,8 +355,7 @@ class PotentialTrainer(Trainer):
         return Settings(PotentialConfig.from_dict(request.model), training, frozenset(asked))
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
-        self.check(request)
-        raise AssertionError("refused above")
+        raise _no_trajectories(request)
 
     def learn(self, truth: Truth, request: TrainingRequest, advance: Callable[[str, float], None]) -> Path:
         """Learn a molecule from its truth, as the request has it, and return the weights."""
@@ -368,3 +364,10 @@ class PotentialTrainer(Trainer):
             truth, request.out, settings.model, settings.training, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share),
         )  # fmt: skip
+
+
+def _no_trajectories(request: TrainingRequest) -> InputError:
+    return InputError(
+        f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
+        "`level='gfn2-xtb'`."
+    )
