@@ -194,10 +194,15 @@ def _said_when_stopped(out: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        kept = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
-        if not kept:
+        states = sorted(out.parent.glob(f"{out.stem}.*.train.safetensors"))
+        samples = out.with_name(f"{out.stem}.samples.safetensors")
+        if states:
+            kept = f"the state is in {states[-1]}"
+        elif samples.exists():
+            kept = f"the samples are in {samples}"
+        else:
             raise KeyboardInterrupt("no training state had been saved yet") from None
-        raise KeyboardInterrupt(f"the state is in {kept[-1]}; the same again with `resume=True` goes on") from None
+        raise KeyboardInterrupt(f"{kept}; the same again with `resume=True` goes on") from None
 
 
 def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:

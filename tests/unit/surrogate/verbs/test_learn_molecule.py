@@ -34,3 +34,19 @@ def test_what_means_nothing_for_a_potential_is_refused(tmp_path: Path) -> None:
 def test_trajectories_say_too_little_about_forces(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"level='gfn2-xtb'"):
         api.train("reference.h5", tmp_path / "w.safetensors", arch="painet-potential", steps=5)
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_an_interrupted_training_says_that_its_samples_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answered: bool
+) -> None:
+    def stopped(*_: object) -> Path:
+        if answered:
+            (tmp_path / "w.samples.safetensors").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surrogate.verbs.train.learn_molecule", stopped)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        api.train("smiles:O", tmp_path / "w.safetensors", level="gfn2-xtb", steps=5, quiet=True)
+    assert ("w.samples.safetensors" in str(caught.value)) is answered
+    assert ("`resume=True`" in str(caught.value)) is answered
