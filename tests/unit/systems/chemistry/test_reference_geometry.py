@@ -30,11 +30,6 @@ from systems.errors import InputError
 from systems.scene import Scene
 
 
-@pytest.fixture(scope="module")
-def geometry(alanine_dipeptide: Scene) -> Geometry:
-    return geometry_from_scene(alanine_dipeptide)
-
-
 def wobbling(scene: Scene, n: int, sigma_nm: float = 0.002) -> np.ndarray:
     noise = np.random.default_rng(3).normal(scale=sigma_nm, size=(n, scene.n_atoms, 3))
     return (scene.positions_nm + noise).astype(np.float32)

@@ -24,12 +24,6 @@ from systems.chemistry.validity import (
 )
 from systems.scene import Scene
 
-
-@pytest.fixture(scope="module")
-def geometry(alanine_dipeptide: Scene) -> Geometry:
-    return geometry_from_scene(alanine_dipeptide)
-
-
 # ---- valid frames --------------------------------------------------------------------------------------------------
 
 
