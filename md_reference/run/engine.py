@@ -41,6 +41,13 @@ class State:
     cell_nm: FloatArray | None = None
 
 
+def hottest_k(bath_k: float, n_dof: int) -> float:
+    """Return the kinetic temperature that chance exceeds in one frame of 10^21: 1 + 2 sqrt(x/n) + 2 x/n times the
+    bath's, n degrees of freedom, x = 50 (Laurent and Massart, Ann. Statist. 28, 1302 (2000), lemma 1)."""
+    x = _UNLIKELINESS / n_dof
+    return bath_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x)
+
+
 def one_line(error: Exception) -> str:
     """Return the first line of an OpenMM error, without the advice and the web address behind it."""
     return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
@@ -228,9 +235,8 @@ class Engine:
         1 - exp(-2 friction timestep) too much: 5 K of 300 at 91/ps and 2 fs. It is projected out here, which changes
         no trajectory but in its rounding.
 
-        Raises SimulationError for a state that is not finite, or hotter than the bath can make it: 1 + 2 sqrt(x/n) +
-        2 x/n times, n degrees of freedom, x = 50, which chance exceeds in one frame of 10^21 (Laurent and Massart,
-        Ann. Statist. 28, 1302 (2000), lemma 1). A model system without a bath may be as hot as it likes.
+        Raises SimulationError for a state that is not finite, or hotter than the bath can make it (`hottest_k`). A
+        model system without a bath may be as hot as it likes.
         """
         if self.n_constraints and self.ensemble != "nve":
             self._context.applyVelocityConstraints(_VELOCITY_TOLERANCE)
@@ -251,8 +257,7 @@ class Engine:
             raise SimulationError("coordinates or energy are no longer finite")
         if self.ensemble == "nve" and self.scene.interactions is not None:
             return state
-        x = _UNLIKELINESS / self._n_dof
-        if not state.temperature_k <= self._temperature_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x):
+        if not state.temperature_k <= hottest_k(self._temperature_k, self._n_dof):
             raise SimulationError(f"the system blew up (kinetic temperature {state.temperature_k:.3g} K)")
         return state
 

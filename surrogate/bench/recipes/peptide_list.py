@@ -15,6 +15,7 @@ TEST_PAIRS = (("LEU", "SER"), ("VAL", "ASN"), ("PHE", "GLY"), ("LYS", "GLU"), ("
 TEST_MONOMERS = ("ALA", "ASN", "PHE")
 TEST_CHAINS = (("ALA", "SER", "VAL", "LEU"), ("GLY", "TYR", "GLU", "LYS"))
 TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"),)
+_TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
 _FREE_PAIRS = 12
@@ -23,7 +24,7 @@ _SEED = 15
 
 @dataclass(frozen=True)
 class Peptide:
-    """One training molecule: residues without caps, whether it is capped (ACE, NME), how many starts and how long."""
+    """One molecule: residues without caps, whether it is capped (ACE, NME), how many starts and how long."""
 
     residues: tuple[str, ...]
     capped: bool
@@ -53,15 +54,25 @@ def training_peptides() -> tuple[Peptide, ...]:
     for _ in range(_PAIR_ROUNDS):
         drawn = _matching(rng, taken)
         taken.update(drawn)
-        pairs += [Peptide(pair, True, 20, 1600.0) for pair in drawn]
+        pairs += [Peptide(pair, True, 32, 1600.0) for pair in drawn]
     chains = [
-        Peptide(residues, True, 20, 1600.0)
+        Peptide(residues, True, 32, 1600.0)
         for residues in _chains(rng, {*TEST_CHAINS, *TEST_FREE_CHAINS}, lengths=(3, 4), n=_CHAINS)
     ]
     free = [
-        Peptide(residues, False, 20, 1600.0) for residues in _chains(rng, set(TEST_PAIRS), lengths=(2,), n=_FREE_PAIRS)
+        Peptide(residues, False, 32, 1600.0) for residues in _chains(rng, set(TEST_PAIRS), lengths=(2,), n=_FREE_PAIRS)
     ]
     return (*monomers, *pairs, *(peptide for both in zip(chains, free, strict=True) for peptide in both))
+
+
+def held_out_peptides() -> tuple[Peptide, ...]:
+    """Return what is never trained on, sixteen runs of each; monomers are tested on runs of their own."""
+    return (
+        *(Peptide(pair, True, _TEST_STARTS, 30_000.0) for pair in TEST_PAIRS),
+        *(Peptide((residue,), True, _TEST_STARTS, 50_000.0) for residue in TEST_MONOMERS),
+        *(Peptide(residues, True, _TEST_STARTS, 30_000.0) for residues in TEST_CHAINS),
+        *(Peptide(residues, False, _TEST_STARTS, 30_000.0) for residues in TEST_FREE_CHAINS),
+    )
 
 
 def _matching(rng: random.Random, taken: set[tuple[str, str]]) -> list[tuple[str, str]]:

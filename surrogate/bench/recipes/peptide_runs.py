@@ -1,9 +1,11 @@
-"""Short runs of many peptides from diverse starts: `python -m surrogate.bench.recipes.peptide_runs FOLDER --budget 3h`.
+"""Runs of many peptides from diverse starts: `python -m surrogate.bench.recipes.peptide_runs FOLDER --budget 3h`.
 
-What the weights `peptides` learn from. Each molecule gets a folder: `seeds.npz` (starting structures chosen from
-metadynamics) and `run_000.h5`, ...: ff14SB, OBC2, 300 K, 4 fs, frames 1 ps apart, the first 20 ps after each start
-discarded. What is there is left alone, so that the same command goes on after an interruption; a run that was under
-way is begun again. One process a core, at low priority.
+What the weights `peptides` learn from (`FOLDER/train`) and are tested on (`FOLDER/test`). Each molecule gets a folder
+with `run_000.h5`, ...: ff14SB, OBC2, 300 K, 4 fs, frames 1 ps apart, sixteen runs at once (`md_reference.run.lanes`,
+checked against OpenMM for each molecule). Runs for training start from structures chosen from metadynamics
+(`seeds.npz`), 20 ps after each start discarded; those for testing from the built structure, 1 ns discarded. What is
+there is left alone, so that the same command goes on after an interruption; a batch of sixteen that was under way is
+begun again. One process a core, at low priority.
 """
 
 from __future__ import annotations
@@ -17,21 +19,23 @@ import sys
 import time
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import openmm
 
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import Conditions, MDConfig, settings_of
+from md_reference.run.config import MDConfig, settings_of
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import integrator_name
+from md_reference.run.lanes import Lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
-from md_reference.run.platforms import PlatformChoice, measured_platform
-from surrogate.bench.recipes.peptide_list import Peptide, training_peptides
+from surrogate.bench.recipes.peptide_list import Peptide, held_out_peptides, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
 from systems.prepare.peptide import build_peptide
@@ -40,67 +44,91 @@ from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.topology_file import topology_path
 from systems.units import parse_wall_s
 
-DISCARD_PS = 20.0
+DISCARD_PS, TEST_DISCARD_PS = 20.0, 1000.0
 _SPEC = ForceFieldSpec("ff14SB", "obc2")
-# What of a molecule's runs is made before any other molecule's rest: a sweep through all shows early what is wrong.
-_SWEEPS = (0.25, 1.0)
+# Frames of a batch are written so often.
+_BLOCK_PS = 100
+# Metadynamics needs OpenMM; of tiny molecules its Reference platform is the fastest.
+_PLATFORM = "Reference"
 
 
-def simulate_peptide(folder: Path, peptide: Peptide, share: float, deadline: float) -> bool:
-    """Make the first `share` of a peptide's runs as far as they are missing; False when the deadline came first."""
+def simulate_peptide(folder: Path, peptide: Peptide, deadline: float, *, seeded: bool = True) -> None:
+    """Make a peptide's missing runs, until the deadline; `seeded` as for training, otherwise as for testing.
+
+    Raises SimulationError.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "lock", "a") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            return True
-        wanted = [folder / f"run_{k:03d}.h5" for k in range(round(share * peptide.n_starts))]
-        missing = [(k, path) for k, path in enumerate(wanted) if not path.exists()]
-        if not missing:
-            return True
+            return
+        missing = [k for k in range(peptide.n_starts) if not run_path(folder, k).exists()]
+        if not missing or time.time() > deadline:
+            return
         scene = build_peptide(peptide.sequence)
-        choice = measured_platform(scene, Conditions(force=_SPEC, timestep_ps=0.004), side_by_side=available_cores())
-        if time.time() > deadline:
-            return False
-        seeds = _seeds(folder / "seeds.npz", scene, peptide, choice.name)
-        for k, path in missing:
-            if time.time() > deadline:
-                return False
-            run(scene, seeds, k, path, peptide, choice)
-    return True
+        seeds = _seeds(folder / "seeds.npz", scene, peptide) if seeded else _built(scene, peptide)
+        while missing and time.time() < deadline:
+            missing = missing[
+                simulate(scene, seeds, missing, folder, peptide, TEST_DISCARD_PS if not seeded else DISCARD_PS) :
+            ]
+
+
+def run_path(folder: Path, k: int) -> Path:
+    return folder / f"run_{k:03d}.h5"
 
 
 def _seed_of(peptide: Peptide, k: int) -> int:
     return zlib.crc32(f"{peptide.name}:{k}".encode()) % (2**31 - 2)
 
 
-def _seeds(path: Path, scene: Scene, peptide: Peptide, platform: str) -> Seeds:
+def _built(scene: Scene, peptide: Peptide) -> Seeds:
+    """Return the built structure, its energy minimised, as often as there are runs."""
+    with Engine(scene, MDConfig(force=_SPEC, platform=_PLATFORM)) as engine:
+        engine.minimise()
+        positions = engine.positions()
+    return Seeds(np.repeat(positions[None], peptide.n_starts, axis=0), ("built",) * peptide.n_starts)
+
+
+def _seeds(path: Path, scene: Scene, peptide: Peptide) -> Seeds:
     if path.exists():
         with np.load(path) as stored:
             return Seeds(stored["positions_nm"], tuple(str(g) for g in stored["groups"]))
-    seeds = choose_seeds(scene, peptide.n_starts, seed=_seed_of(peptide, -1), platform=platform)
+    seeds = choose_seeds(scene, peptide.n_starts, seed=_seed_of(peptide, -1), platform=_PLATFORM)
     part = path.with_suffix(".part.npz")
     np.savez_compressed(part, positions_nm=seeds.positions_nm, groups=np.array(seeds.groups))
     os.replace(part, path)
     return seeds
 
 
-def run(scene: Scene, seeds: Seeds, k: int, out: Path, peptide: Peptide, choice: PlatformChoice) -> None:
-    """Simulate from the k-th start and write `out` when all frames are there. Raises SimulationError."""
-    import openmm
+def simulate(
+    scene: Scene, seeds: Seeds, wanted: Sequence[int], folder: Path, peptide: Peptide, discard_ps: float
+) -> int:
+    """Simulate from the first of the `wanted` starts, as many as go at once; return how many.
 
-    config = MDConfig(time_ps=peptide.time_ps, equilibrate_ps=DISCARD_PS, seed=_seed_of(peptide, k), force=_SPEC)
+    Their files are written when all frames are there. Raises SimulationError.
+    """
+    system = build_system(scene, _SPEC)
+    config = MDConfig(
+        time_ps=peptide.time_ps, equilibrate_ps=discard_ps, seed=_seed_of(peptide, wanted[0]), force=_SPEC
+    )
+    lanes = Lanes(
+        system,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=config.timestep_ps,
+        seed=config.seed,
+    )
+    wanted = list(wanted[: lanes.n_lanes])
+    # Lanes left over repeat the last start; they cost nothing and are not kept.
+    starts = [*wanted, *[wanted[-1]] * (lanes.n_lanes - len(wanted))]
     began = time.monotonic()
-    states = []
-    with Engine(scene, replace(config, platform=choice.name), threads=1) as engine:
-        engine.set_positions(seeds.positions_nm[k])
-        engine.thermalise()
-        engine.step(round(DISCARD_PS / config.timestep_ps))
-        engine.reset_clock()
-        for _ in range(config.n_frames):
-            engine.step(config.steps_per_frame)
-            states.append(engine.state())
-    wall_s = time.monotonic() - began
+    lanes.check(system, seeds.positions_nm[wanted[0]])
+    lanes.set_positions(seeds.positions_nm[starts])
+    lanes.thermalise()
+    for _ in range(round(discard_ps / config.save_every_ps)):
+        lanes.step(config.steps_per_frame)
+    parts = [folder / f".{run_path(folder, k).stem}.part.h5" for k in wanted]
     record: dict[str, Any] = {
         "kind": "reference",
         "integrator": integrator_name(config.ensemble, scene),
@@ -108,43 +136,74 @@ def run(scene: Scene, seeds: Seeds, k: int, out: Path, peptide: Peptide, choice:
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": True,
         **settings_of(config),
-        "platform": choice.name,
+        "platform": "lanes",
         "threads": 1,
-        "platform_reason": choice.reason,
-        "start": {"group": seeds.groups[k], "index": k, "discarded_ps": DISCARD_PS},
-        "cost": {
+        "platform_reason": f"{lanes.n_lanes} copies at once, forces checked against OpenMM's",
+    }
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(
+                open_writer(
+                    part,
+                    scene,
+                    {**record, "start": {"group": seeds.groups[k], "index": k, "discarded_ps": discard_ps}},
+                    overwrite=True,
+                )
+            )
+            for k, part in zip(wanted, parts, strict=True)
+        ]
+        for first in range(0, config.n_frames, _BLOCK_PS):
+            states = []
+            for _ in range(min(_BLOCK_PS, config.n_frames - first)):
+                lanes.step(config.steps_per_frame)
+                states.append((lanes.positions_nm.astype(np.float32), lanes.energies(), lanes.temperatures_k()))
+            positions, energies, temperatures = (np.stack(values, axis=1) for values in zip(*states, strict=True))
+            times = (first + 1 + np.arange(len(states))) * config.save_every_ps
+            for k, writer in enumerate(writers):
+                scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+                writer.append(positions[k], times, scalars=scalars)
+        wall_s = (time.monotonic() - began) / lanes.n_lanes
+        cost = {
             "wall_s": wall_s,
             "energy_evaluations": config.n_frames * config.steps_per_frame,
             "ns_per_day": config.time_ps * 1e-3 / wall_s * 86400.0,
-        },
-    }
-    part = out.with_name(f".{out.stem}.part.h5")
-    with open_writer(part, scene, record, overwrite=True) as writer:
-        writer.append(
-            np.array([s.positions_nm for s in states], dtype=np.float32),
-            (1 + np.arange(config.n_frames)) * config.save_every_ps,
-            scalars={
-                "potential_kj_mol": np.array([s.potential_kj_mol for s in states]),
-                "temperature_k": np.array([s.temperature_k for s in states]),
-            },
-        )
-    os.replace(topology_path(part), topology_path(out))
-    os.replace(part, out)
+        }
+        for writer in writers:
+            writer.update_record({"cost": cost})
+    for k, part in zip(wanted, parts, strict=True):
+        os.replace(topology_path(part), topology_path(run_path(folder, k)))
+        os.replace(part, run_path(folder, k))
+    return len(wanted)
+
+
+def _order() -> list[tuple[Peptide, bool]]:
+    """Return all molecules and whether each is for training: monomers, what is tested, pairs, chains."""
+    training, tested = training_peptides(), held_out_peptides()
+    monomers = [p for p in training if len(p.residues) == 1]
+    short = [p for p in tested if len(p.residues) <= 2]
+    rest = [p for p in training if len(p.residues) > 1]
+    return [
+        *((p, True) for p in monomers),
+        *((p, False) for p in short),
+        *((p, True) for p in rest),
+        *((p, False) for p in tested if p not in short),
+    ]
 
 
 def _work(folder: str, todo: Any, deadline: float) -> None:
     end_with_parent()
-    os.environ["OPENMM_CPU_THREADS"] = "1"
-    peptides = training_peptides()
+    order = _order()
     while time.time() < deadline:
         with todo.get_lock():
             place = todo.value
             todo.value += 1
-        if place >= len(peptides) * len(_SWEEPS):
+        if place >= len(order):
             return
-        peptide, share = peptides[place % len(peptides)], _SWEEPS[place // len(peptides)]
+        peptide, training = order[place]
         try:
-            simulate_peptide(Path(folder) / peptide.name, peptide, share, deadline)
+            simulate_peptide(
+                Path(folder) / ("train" if training else "test") / peptide.name, peptide, deadline, seeded=training
+            )
         except SimulationError as error:
             print(f"{peptide.name}: {error}", file=sys.stderr, flush=True)  # noqa: T201
 
@@ -152,18 +211,19 @@ def _work(folder: str, todo: Any, deadline: float) -> None:
 def account(folder: Path) -> dict[str, Any]:
     """Return what is there: runs and simulated ns of each molecule, and in all."""
     rows = {}
-    for peptide in training_peptides():
-        done = sorted((folder / peptide.name).glob("run_*.h5"))
+    for peptide, training in _order():
+        name = f"{'train' if training else 'test'}/{peptide.name}"
+        done = sorted((folder / name).glob("run_*.h5"))
         if done:
-            rows[peptide.name] = {"runs": len(done), "of": peptide.n_starts, "ns": len(done) * peptide.time_ps * 1e-3}
+            rows[name] = {"runs": len(done), "of": peptide.n_starts, "ns": len(done) * peptide.time_ps * 1e-3}
     return {"molecules": rows, "ns": sum(row["ns"] for row in rows.values())}
 
 
 def check(folder: Path) -> list[str]:
     """Read every run and return what is wrong: files that cannot be opened, frames that are missing."""
     wrong = []
-    for peptide in training_peptides():
-        for path in sorted((folder / peptide.name).glob("run_*.h5")):
+    for peptide, training in _order():
+        for path in sorted((folder / ("train" if training else "test") / peptide.name).glob("run_*.h5")):
             with open_trajectory(path) as reader:
                 if reader.n_frames != round(peptide.time_ps):
                     wrong.append(f"{path}: {reader.n_frames} frames")

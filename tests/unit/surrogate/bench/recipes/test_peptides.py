@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from md_reference.run.platforms import PlatformChoice
 from surrogate.bench.recipes import peptide_runs, peptide_seeds
 from surrogate.bench.recipes.peptide_list import (
     RESIDUES,
     TEST_CHAINS,
     TEST_FREE_CHAINS,
     TEST_PAIRS,
+    held_out_peptides,
     training_peptides,
 )
 from systems.chemistry.geometry import torsion
@@ -79,17 +80,30 @@ def test_frames_are_drawn_evenly_over_cells() -> None:
     assert 10 <= sum(k >= 950 for k in drawn) <= 30
 
 
-@pytest.fixture
-def alanine() -> peptide_runs.Peptide:
-    return replace(training_peptides()[0], n_starts=2, time_ps=3.0)
-
-
-def test_runs_start_at_their_seeds_and_are_made_once(tmp_path: Path, alanine: peptide_runs.Peptide) -> None:
+def test_runs_start_at_their_seeds_and_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alanine = replace(training_peptides()[0], n_starts=18, time_ps=3.0)
     scene = build_peptide(alanine.sequence)
-    seeds = peptide_seeds.Seeds(np.stack([scene.positions_nm] * 2), ("basin", "phi>0"))
-    peptide_runs.run(scene, seeds, 1, tmp_path / "run_001.h5", alanine, PlatformChoice("Reference", 1, "told"))
-    with open_trajectory(tmp_path / "run_001.h5") as reader:
-        assert reader.n_frames == 3
-        assert reader.record["start"] == {"group": "phi>0", "index": 1, "discarded_ps": 20.0}
-        assert reader.record["force_field"] == "ff14SB"
+    seeds = peptide_seeds.Seeds(np.stack([scene.positions_nm] * 18), ("basin",) * 17 + ("phi>0",))
+    monkeypatch.setattr(peptide_runs, "_seeds", lambda *_: seeds)
+    kept = peptide_runs.run_path(tmp_path, 4)
+    kept.write_bytes(b"there")
+    peptide_runs.simulate_peptide(tmp_path, alanine, math.inf)
+    assert sorted(p.name for p in tmp_path.glob("*.h5")) == [f"run_{k:03d}.h5" for k in range(18)]
+    assert kept.read_bytes() == b"there"
+    with (
+        open_trajectory(peptide_runs.run_path(tmp_path, 17)) as last,
+        open_trajectory(tmp_path / "run_000.h5") as first,
+    ):
+        assert last.n_frames == first.n_frames == 3
+        assert last.record["start"] == {"group": "phi>0", "index": 17, "discarded_ps": 20.0}
+        assert last.record["force_field"] == "ff14SB"
+        assert not np.allclose(last.read(), first.read())
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_what_is_tested_is_never_made_for_training(tmp_path: Path) -> None:
+    order = peptide_runs._order()
+    assert len(order) == len(training_peptides()) + len(held_out_peptides())
+    assert not {p.residues for p, training in order if training and len(p.residues) > 1} & {
+        p.residues for p, training in order if not training
+    }
