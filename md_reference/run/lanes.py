@@ -149,7 +149,7 @@ class Lanes:
         """
         import openmm
 
-        given = np.asarray(positions_nm) - np.mean(positions_nm, axis=0)
+        given = self._centred(np.asarray(positions_nm, dtype=np.float64))
         disturbed = given + self._rng.normal(0.0, _CHECKED_AT, (self.n_lanes, *given.shape))
         energies, forces = self.energies_and_forces(disturbed)
         context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
@@ -176,8 +176,8 @@ class Lanes:
         return energies, _outwards(forces)
 
     def set_positions(self, positions_nm: npt.ArrayLike) -> None:
-        """Place the atoms `(n_lanes, n_atoms, 3)` nm; constrained bonds are taken to have their lengths."""
-        self._positions = _inwards(positions_nm)
+        """Place the atoms `(n_lanes, n_atoms, 3)` nm, each copy's centre of mass at the origin."""
+        self._positions = _inwards(self._centred(np.asarray(positions_nm, dtype=np.float64)))
 
     def set_velocities(self, velocities_nm_ps: npt.ArrayLike) -> None:
         """Set velocities `(n_lanes, n_atoms, 3)` nm/ps."""
@@ -200,8 +200,11 @@ class Lanes:
             self.temperature_k, self.n_dof
         ):
             raise SimulationError("a copy of the molecule blew up: it is hotter than the bath can make it")
-        # The copies wander; far from the origin single precision is coarse.
-        self._positions -= np.average(self._positions, axis=0, weights=self.masses_da)[None].astype(np.float32)
+        self.set_positions(self.positions_nm)
+
+    def _centred(self, positions_nm: FloatArray) -> FloatArray:
+        """Far from the origin, where copies wander, single precision is too coarse for constraints."""
+        return positions_nm - np.average(positions_nm, axis=-2, weights=self.masses_da)[..., None, :]
 
     @property
     def positions_nm(self) -> FloatArray:
@@ -274,8 +277,8 @@ def _terms(system: Any) -> dict[str, Any]:
             raise LanesUnavailableError(f"molecular dynamics in lanes knows no {kind}")
     constraints = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     terms["torsions"], terms["torsion_terms"] = list(torsions), list(torsions.values())
-    terms["constraints"] = [(i, j) for i, j, _ in constraints]
-    terms["lengths"] = [length._value for *_, length in constraints]
+    terms["constraints"] = [(c[0], c[1]) for c in constraints]
+    terms["lengths"] = [c[2]._value for c in constraints]
     # Bonds between atoms whose distance is a constraint exert no force.
     rigid = {frozenset(pair) for pair in terms["constraints"]}
     kept = [k for k, pair in enumerate(terms["bonds"]) if frozenset(pair) not in rigid]
