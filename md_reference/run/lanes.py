@@ -44,19 +44,21 @@ class LanesUnavailableError(SimulationError):
     """This machine cannot compile the program, or it does not know a term of the System."""
 
 
+_COUNTS = ("n_atoms", "n_bonds", "n_angles", "n_torsions", "n_constraints", "born")
+_ARRAYS = (
+    "bonds", "bond_terms", "angles", "angle_terms", "torsions", "torsion_terms", "pairs", "atoms", "constraints",
+    "lengths",
+)  # fmt: skip
+_NUMBERS = ("surface", "timestep", "keep", "noise")
+
+
 class _System(ctypes.Structure):
     _fields_ = [
-        *((name, ctypes.c_int32) for name in ("n_atoms", "n_bonds", "n_angles", "n_torsions", "n_constraints", "born")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in (
-                "bonds", "bond_terms", "angles", "angle_terms", "torsions", "torsion_terms", "pairs", "atoms",
-                "constraints", "lengths",
-            )
-        ),
-        *((name, ctypes.c_float) for name in ("surface", "timestep", "keep", "noise")),
+        *((name, ctypes.c_int32) for name in _COUNTS),
+        *((name, ctypes.c_void_p) for name in _ARRAYS),
+        *((name, ctypes.c_float) for name in _NUMBERS),
         ("work", ctypes.c_void_p),
-    ]  # fmt: skip
+    ]
 
 
 @lru_cache(maxsize=1)
@@ -116,7 +118,7 @@ class Lanes:
         terms["atoms"][:, 0] = 1.0 / self.masses_da
         terms["atoms"][:, 1] = np.sqrt(GAS_CONSTANT_KJ_MOL_K * temperature_k / self.masses_da)
         # The program reads these arrays in place.
-        self._kept = {name: np.ascontiguousarray(values) for name, values in terms.items()}
+        self._kept = {name: np.ascontiguousarray(terms[name]) for name in _ARRAYS}
         self._work = np.zeros(int(self._program.work_floats(self.n_atoms)), dtype=np.float32)
         self._system = _System(
             n_atoms=self.n_atoms,
@@ -130,11 +132,7 @@ class Lanes:
             keep=keep,
             noise=math.sqrt(1.0 - keep * keep),
             work=self._work.ctypes.data,
-            **{
-                name: self._kept[name].ctypes.data
-                for name, kind in _System._fields_
-                if kind is ctypes.c_void_p and name != "work"
-            },
+            **{name: self._kept[name].ctypes.data for name in _ARRAYS},
         )
         self.n_dof = 3 * self.n_atoms - len(terms["constraints"])
         self._rng = np.random.default_rng(seed)
