@@ -34,7 +34,8 @@ _TRIES = 20
 class PeptideSubject:
     """One sequence's frames, its input features, and the stretches that windows may be taken from.
 
-    `weights` (n_frames,): of frames in equilibrium; zero in what is held out. Without them no window is read backwards.
+    `weights` (n_frames,): of frames in equilibrium, of mean 1 where they are kept, zero in what is held out. Without
+    them no window is read backwards.
     """
 
     frames: TrainingFrames
@@ -96,6 +97,11 @@ class PeptideSubject:
         Times are evenly spaced at a lag drawn evenly in its logarithm, or drawn one by one in the same way; none is
         longer than the configuration's, and all frames of a window are of one stretch. With weights half of them are
         read backwards, and in some the later frames are any of equilibrium, `forgotten_ps` after the first.
+
+        Runs from chosen starts tell well what happens to states that they hold more often than equilibrium does, and
+        detailed balance tells the rest: windows start from the former as they are read forwards, from the latter
+        backwards. (From a common state, runs forwards show rare ones hardly entered; averaged with windows that do
+        enter them, they would halve the rate.)
         """
         lag = self.frames.lag_ps
         ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=validation))
@@ -117,8 +123,13 @@ class PeptideSubject:
         times = ahead.float() * lag
         if self.weights is None or validation:
             return idx, times
+        often = torch.from_numpy(self.weights < 1.0)
+        for _ in range(_TRIES):
+            again = ~often[first]
+            first = torch.where(again, self._starts(span, ranges, generator), first)
         starts, found = self._likely_starts(span, ranges, generator)
         backwards = found & (torch.rand(n, generator=generator) < 0.5)
+        idx = torch.cat([first[:, None], first[:, None] + ahead], dim=1)
         turned = starts[:, None] + ahead[:, -1:] - torch.cat([torch.zeros_like(ahead[:, :1]), ahead], dim=1)
         idx = torch.where(backwards[:, None], turned, idx)
         forgotten = torch.rand(n, 1, generator=generator) < _FORGOTTEN_SHARE
@@ -128,28 +139,51 @@ class PeptideSubject:
 
     def _starts(self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator) -> Tensor:
         """Draw first frames `(n,)` of windows that reach `span` (n,) frames further, each as likely as any other."""
-        first = torch.empty(len(span), dtype=torch.int64)
+        rooms = np.maximum(np.diff(ranges, axis=1) - span, 0).cumsum(axis=0)
         place = torch.rand(len(span), generator=generator, dtype=torch.float64).numpy()
-        for k, reach in enumerate(span.tolist()):
-            rooms = np.maximum(ranges[:, 1] - ranges[:, 0] - reach, 0)
-            at = int(place[k] * rooms.sum())
-            which = int(np.searchsorted(np.cumsum(rooms), at, side="right"))
-            first[k] = int(ranges[which, 0]) + at - int(rooms[:which].sum())
-        return first
+        at = (place * rooms[-1]).astype(np.int64)
+        which = (rooms <= at).sum(axis=0)
+        before = np.where(which > 0, rooms[which - 1, np.arange(len(span))], 0)
+        return torch.from_numpy(ranges[which, 0] + at - before)
 
     def _likely_starts(
         self, span: npt.NDArray[np.int64], ranges: npt.NDArray[np.int64], generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Draw first frames `(n,)` by their weights; False `(n,)` where none was met that lies so far from an end."""
+        """Draw first frames `(n,)` by their weights, of windows that end where runs are less often than equilibrium;
+        False `(n,)` where none was met."""
+        assert self.weights is not None
+        totals, members, rooms = self._likely_from
         first = np.zeros(len(span), dtype=np.int64)
         found = np.zeros(len(span), dtype=bool)
         for _ in range(_TRIES):
-            drawn = self._likely(len(span), generator).numpy()
-            end = ranges[np.searchsorted(ranges[:, 0], drawn, side="right") - 1, 1]
-            fits = ~found & (drawn + span < end)
-            first[fits] = drawn[fits]
-            found |= fits
+            rows = np.flatnonzero(~found)
+            place = torch.rand(2, len(rows), generator=generator, dtype=torch.float64).numpy()
+            for row, group, share in zip(rows, np.searchsorted(totals, place[0] * totals[-1]), place[1], strict=True):
+                n = int(np.searchsorted(-rooms[group], -span[row]))
+                if n:
+                    first[row] = members[group][int(share * n)]
+                    found[row] = self.weights[first[row] + span[row]] >= 1.0
         return torch.from_numpy(first), torch.from_numpy(found)
+
+    @cached_property
+    def _likely_from(
+        self,
+    ) -> tuple[npt.NDArray[np.float64], list[npt.NDArray[np.int64]], list[npt.NDArray[np.int64]]]:
+        """Return the sums of weights of groups of frames alike, each group's frames, and how many follow each in its
+        run, the most first.
+
+        Rare states lie early in runs that start there, so frames with long runs behind them are no fair sample of all;
+        within a group of one weight, which is one cell of the Markov model, they are.
+        """
+        assert self.weights is not None
+        room = np.zeros(len(self.weights), dtype=np.int64)
+        for low, high in self.frames.split.ranges(self.frames.starts, validation=False):
+            room[low:high] = high - np.arange(low, high)
+        values, group = np.unique(self.weights, return_inverse=True)
+        kept = [np.flatnonzero(group == k) for k in range(len(values)) if values[k] > 0]
+        members = [frames[np.argsort(-room[frames], kind="stable")] for frames in kept]
+        sums = np.array([self.weights[frames].sum() for frames in members])
+        return np.cumsum(sums), members, [room[frames] for frames in members]
 
     def _likely(self, n: int, generator: torch.Generator) -> Tensor:
         """Draw frames `(n,)` by their weights."""
