@@ -26,6 +26,9 @@ def with_compiled_parts(model: _Model) -> _Model:
     copied = copy.deepcopy(model)
     # A model that wraps another one (such as heavy atoms with hydrogens placed): the inner one's networks.
     within = next((child for child in copied.children() if isinstance(child, Surrogate)), copied)
+    if isinstance(within, Surrogate) and within.integrates:
+        within.compile_forces()
+        return copied
     lists = [child for child in within.children() if isinstance(child, nn.ModuleList)]
     parents: list[nn.Module] = [within, *lists]
     for parent in parents:

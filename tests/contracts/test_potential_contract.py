@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.conformance import SurrogateContract, branched_chain, orthogonal
 from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.painet.attention import pair_energy
@@ -81,6 +83,32 @@ def test_forces_are_the_exact_gradient_of_the_energy() -> None:
             ends.append(evaluated(model, moved, molecule)[0])
         torch.testing.assert_close(forces[:, atom, axis], -(ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3)
     assert forces.abs().mean() > 10.0
+
+
+def test_compiled_forces_are_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = []
+
+    def count(graph: Any, **settings: Any) -> Any:
+        compiled.append(graph)
+        return graph
+
+    monkeypatch.setattr(torch, "compile", count)
+    molecule, plain = branched_chain(9), lively()
+    fast = with_compiled_parts(plain)
+    for rows in (2, 2, 3):
+        x = walks(9, rows)
+        torch.testing.assert_close(fast.forces(x, molecule), plain.forces(x, molecule), rtol=1e-5, atol=1e-4)
+    assert len(compiled) == 1, "for two rows; others go the plain way"
+    moved = walks(9, 2) * 1.01
+    assert (fast.forces(moved, molecule) - plain.forces(walks(9, 2), molecule)).abs().max() > 1.0, "nothing is baked in"
+    torch.testing.assert_close(fast.forces(moved, molecule), plain.forces(moved, molecule), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_forces_compiled_in_earnest_are_the_plain_ones_to_rounding() -> None:
+    molecule, plain, x = branched_chain(9), lively(), walks(9)
+    fast = with_compiled_parts(plain)
+    torch.testing.assert_close(fast.forces(x, molecule), plain.forces(x, molecule), rtol=1e-4, atol=1e-2)
 
 
 def test_energy_is_a_scalar_and_momentum_and_angular_momentum_are_kept() -> None:

@@ -11,6 +11,7 @@ import torch
 
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
+from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import GAS_CONSTANT_KJ_MOL_K, PainetPotential
 from surrogate.sampling.domain import match_scene
@@ -29,21 +30,23 @@ KJ_MOL_PER_EV = 96.48533212331
 class LearnedForces:
     """Energies and forces of a scene by a learned potential, atoms in the scene's order.
 
-    `weights`: a file, or loaded ones. Raises InputError for weights that are no potential, OutOfDomainError for a
-    molecule that they do not cover.
+    `weights`: a file, or loaded ones. `compile`: the network is compiled for as many frames as are asked about first,
+    which takes a minute. Raises InputError for weights that are no potential and where there is nothing to compile
+    with, OutOfDomainError for a molecule that they do not cover.
     """
 
-    def __init__(self, scene: Scene, weights: str | Path | Weights) -> None:
+    def __init__(self, scene: Scene, weights: str | Path | Weights, *, compile: bool = False) -> None:
         loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
         if not isinstance(loaded.model, PainetPotential):
             raise InputError(
                 f"{loaded.path.name} makes frames, not forces ({loaded.model.arch}); train a potential with "
                 "`level='gfn2-xtb'`."
             )
-        self.scene, self.weights, self._model = scene, loaded, loaded.model.eval()
+        model = loaded.model.eval()
+        self.scene, self.weights, self._model = scene, loaded, with_compiled_parts(model) if compile else model
         self._order = match_scene(scene, loaded)
         self._back = np.argsort(self._order)
-        self._fabric = self._model.fabric(Molecule.of(loaded.domain.scene))
+        self._molecule = Molecule.of(loaded.domain.scene)
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         """Positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm."""
@@ -54,11 +57,11 @@ class LearnedForces:
         """Frames `(n, n_atoms, 3)` nm -> energies `(n,)`, forces, and the members' spread of energies `(n,)`, root mean
         square, all in kJ/mol and kJ/mol/nm. Raises SimulationError where they are not finite."""
         x = torch.from_numpy(np.ascontiguousarray(np.asarray(frames_nm, dtype=np.float64)[:, self._order]))
-        found = self._model.evaluate(x, self._fabric)
-        energies, forces = found.energy_kj_mol.numpy(), found.forces_kj_mol_nm.numpy()[:, self._back]
+        members, gradient = self._model.gradient(x, self._molecule)(x)
+        energies, forces = members.mean(-1).numpy(), -gradient.numpy()[:, self._back]
         if not (np.isfinite(energies).all() and np.isfinite(forces).all()):
             raise SimulationError(f"{self.weights.path.name}: the learned energy of {self.scene.name!r} is not finite.")
-        return energies, forces, found.members_kj_mol.std(-1, correction=0).numpy()
+        return energies, forces, members.std(-1, correction=0).numpy()
 
     def openmm_force(self) -> Any:
         """Return an `openmm.PythonForce`, to be added to a System of the scene's particles."""

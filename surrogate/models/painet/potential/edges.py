@@ -24,37 +24,51 @@ HALF_WIDTH = 2.5
 # Up to so many atoms all pairs are listed once and for all: those beyond the cutoff add exactly nothing.
 FEW_ATOMS = 64
 _SOFTENING_NM2 = 1e-8
+_FAR_NM2 = 1e6
 _ROOT_TWO = 2.0**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """`receiver`, `sender`, `shell` (n_edges,): each pair from either end, sorted by the receiver. `degree`: how many
-    each atom has, where all have as many, else None."""
+    """`receiver`, `sender`, `shell` (n_edges,): each pair from either end, sorted by the receiver. `dense`: every atom
+    is paired with every one in turn, itself included, so that sums and differences need no lists."""
 
     receiver: Tensor
     sender: Tensor
     shell: Tensor
     n_atoms: int
-    degree: int | None
+    dense: bool
+
+    def sent(self, values: Tensor) -> Tensor:
+        """`values` of atoms (n_atoms, ...) -> of each edge's sender (n_edges, ...)."""
+        return self._square(values[None]) if self.dense else values[self.sender]
+
+    def apart_nm(self, positions_nm: Tensor) -> Tensor:
+        """Positions `(n_atoms, rows, 3)` nm -> the way from sender to receiver `(n_edges, rows, 3)`."""
+        if self.dense:
+            return (positions_nm[:, None] - positions_nm[None]).flatten(0, 1)
+        return positions_nm[self.receiver] - positions_nm[self.sender]
 
     def sum(self, values: Tensor) -> Tensor:
         """`values` (n_edges, ...) summed by receiver: (n_atoms, ...)."""
-        if self.degree is not None:
-            return values.unflatten(0, (self.n_atoms, self.degree)).sum(1)
+        if self.dense:
+            return values.unflatten(0, (self.n_atoms, self.n_atoms)).sum(1)
         return values.new_zeros(self.n_atoms, *values.shape[1:]).index_add(0, self.receiver, values)
 
     def by_atom(self, shapes: Tensor) -> Tensor:
         """`shapes` (n_edges, rows, k), laid out as `sum_of_products` takes them."""
-        if self.degree is None:
+        if not self.dense:
             return shapes
-        return shapes.unflatten(0, (self.n_atoms, self.degree)).permute(0, 2, 3, 1).contiguous()
+        return shapes.unflatten(0, (self.n_atoms, self.n_atoms)).permute(0, 2, 3, 1).contiguous()
 
     def sum_of_products(self, laid: Tensor, values: Tensor) -> Tensor:
         """Shapes laid `by_atom` times `values` (n_edges, rows, c), summed by receiver: (n_atoms, rows, k, c)."""
-        if self.degree is None:
+        if not self.dense:
             return self.sum(laid[..., None] * values[..., None, :])
-        return laid @ values.unflatten(0, (self.n_atoms, self.degree)).transpose(1, 2)
+        return laid @ values.unflatten(0, (self.n_atoms, self.n_atoms)).transpose(1, 2)
+
+    def _square(self, values: Tensor) -> Tensor:
+        return values.expand(self.n_atoms, self.n_atoms, *values.shape[2:]).flatten(0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +103,11 @@ def find_edges(
             near: np.ndarray = cKDTree(frame).query_pairs(cutoff_nm, output_type="ndarray")
             pairs |= {(int(i), int(j)): N_SHELLS - 1 for i, j in near}
     pairs |= shells
-    both = sorted([(i, j, s) for (i, j), s in pairs.items()] + [(j, i, s) for (i, j), s in pairs.items()])
+    dense = n_atoms <= few
+    own = [(i, i, N_SHELLS - 1) for i in range(n_atoms)] if dense else []
+    both = sorted([(i, j, s) for (i, j), s in pairs.items()] + [(j, i, s) for (i, j), s in pairs.items()] + own)
     receiver, sender, shell = torch.tensor(both, dtype=torch.int64, device=positions_nm.device).reshape(-1, 3).T
-    return Edges(receiver, sender, shell, n_atoms, n_atoms - 1 if n_atoms <= few else None)
+    return Edges(receiver, sender, shell, n_atoms, dense)
 
 
 def measure_edges(
@@ -102,8 +118,10 @@ def measure_edges(
     Radial functions are bumps (1 - (u - k)^2 / HALF_WIDTH^2)^3, zero outside, with u = log d in units of their spacing;
     without exponentials, whose tails would be denormal numbers. Distances are softened by 0.1 pm: finite at zero.
     """
-    apart = (positions_nm[edges.receiver] - positions_nm[edges.sender]).to(dtype)
-    distance = (apart.square().sum(-1) + _SOFTENING_NM2).sqrt()
+    apart = edges.apart_nm(positions_nm).to(dtype)
+    # An atom is to itself as one far beyond the cutoff.
+    alone = torch.where(edges.receiver == edges.sender, _FAR_NM2, _SOFTENING_NM2).to(dtype)
+    distance = (apart.square().sum(-1) + alone[:, None]).sqrt()
     ranges = torch.tensor([*SHELL_RANGES_NM, (LAST_SHELL_FROM_NM, cutoff_nm)], dtype=dtype, device=apart.device).log()
     spacing = ((ranges[:, 1] - ranges[:, 0]) / (n_radial - 1))[edges.shell, None]
     u = ((distance.log() - ranges[edges.shell, :1]) / spacing)[..., None]

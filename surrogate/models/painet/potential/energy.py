@@ -45,11 +45,13 @@ NO_WALL_NM = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Fabric:
-    """What of a molecule does not change while it moves: the shells of its bonds, each type's atoms."""
+    """What of a molecule does not change while it moves: the shells of its bonds, the types that are `present`, each
+    type's atoms."""
 
     molecule: Molecule
     shells: dict[tuple[int, int], int]
     bonds: Tensor
+    present: Tensor
     groups: TypeGroups
     one_hot: Tensor
 
@@ -59,7 +61,7 @@ class Fabric:
         groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
         bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
         one_hot = (present[:, None] == molecule.elements).to(torch.get_default_dtype())
-        return Fabric(molecule, bonded_shells(molecule), bonds, groups, one_hot)
+        return Fabric(molecule, bonded_shells(molecule), bonds, present, groups, one_hot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +103,7 @@ class Look(nn.Module):
         found = torch.bmm(seen.radial, weights)
         n_seen = c.n_scalars + c.n_vectors
         if self.send is not None:
-            sent = 1.0 + self.send(h)[edges.sender]
+            sent = 1.0 + edges.sent(self.send(h))
             found = torch.cat([found[..., :n_seen] * sent, found[..., n_seen:]], dim=-1)
         felt = edges.sum(found[..., : c.n_scalars])
         shaped = edges.sum_of_products(seen.shapes, found[..., c.n_scalars :])
@@ -170,13 +172,15 @@ class EnergyNetwork(nn.Module):
         z = self.surroundings(self.embed_type(elements), fabric.bonds)
         of_edge = self.of_pair(torch.cat([z[edges.receiver] + self.of_shell(edges.shell), z[edges.sender]], dim=-1))
         types = edges.shell, elements[edges.receiver], elements[edges.sender]
+        # An atom is as far from itself as no wall stands.
+        farthest = torch.where(edges.receiver == edges.sender, torch.inf, self.farthest_nm[types])
         return Prepared(
             edges,
             z,
             tuple(look.weights(of_edge) for look in cast(Iterable[Look], self.looks)),
             self.table(of_edge).unflatten(-1, (self.config.n_radial, -1)),
             self.nearest_nm[types][:, None],
-            self.farthest_nm[types][:, None],
+            farthest[:, None],
         )
 
     def forward(self, positions_nm: Tensor, fabric: Fabric, made: Prepared) -> Tensor:
@@ -216,8 +220,7 @@ def latent_energy(q: Tensor, phi: Tensor, psi: Tensor, fabric: Fabric) -> Tensor
     `q` (rows, n_heads, n, d) of unit length, so that s = 2 - 2 q_i.q_j; `phi` = a - 4 b and `psi` = 4 b (n_heads,
     n_types, n_types). Sums over pairs of types need sums of q and of q q^T over each type alone.
     """
-    present = torch.stack([fabric.molecule.elements[group[0]] for group in fabric.groups])
-    phi, psi = (m[:, present][:, :, present] for m in (phi, psi))
+    phi, psi = (m[:, fabric.present][:, :, fabric.present] for m in (phi, psi))
     b = 0.25 * psi
     a = phi + psi
     z = fabric.one_hot.to(q.dtype)

@@ -14,6 +14,7 @@ from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
+from surrogate.models.painet.potential.gradient import CompiledGradient, GradientFn, gradient_of
 from systems.errors import InputError
 from systems.units import whole_steps
 
@@ -55,7 +56,8 @@ class PainetPotential(Surrogate):
         self.network = EnergyNetwork(config)
         self.register_buffer("energy_offset_kj_mol", torch.zeros(()))
         self.register_buffer("energy_scale_kj_mol", torch.full((), 100.0))
-        self._known: tuple[Molecule, Fabric, Prepared] | None = None
+        self._compiles = False
+        self._known: tuple[Molecule, GradientFn] | None = None
 
     @property
     def n_new(self) -> int:
@@ -67,6 +69,10 @@ class PainetPotential(Surrogate):
         model.config, model._known = replace(self.config, **changes), None
         _ = model.steps_per_frame
         return model
+
+    def compile_forces(self) -> None:
+        """See `Surrogate.compile_forces`."""
+        self._compiles, self._known = True, None
 
     @property
     def steps_per_frame(self) -> int:
@@ -97,13 +103,8 @@ class PainetPotential(Surrogate):
 
     def evaluate(self, positions_nm: Tensor, fabric: Fabric, made: Prepared | None = None) -> Evaluation:
         """Frames `(rows, n_atoms, 3)` nm, in double precision for forces to the last digit -> energies and forces."""
-        # In bf16 energies would be steps, and their gradient heat.
-        with torch.inference_mode(False), torch.enable_grad(), torch.autocast(positions_nm.device.type, enabled=False):
-            x = positions_nm.detach().clone().requires_grad_(True)
-            members = self.members(x, fabric, made)
-            energy = members.mean(-1)
-            (gradient,) = torch.autograd.grad(energy.sum(), x)
-        return Evaluation(energy.detach(), -gradient, members.detach())
+        members, gradient = gradient_of(lambda x: self.members(x, fabric, made))(positions_nm)
+        return Evaluation(members.mean(-1), -gradient, members)
 
     def member_forces(self, positions_nm: Tensor, fabric: Fabric) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> each member's forces `(n_members, rows, n_atoms, 3)` kJ/mol/nm."""
@@ -145,13 +146,21 @@ class PainetPotential(Surrogate):
 
     def forces(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> forces, with what depends on the molecule alone kept from call to call."""
+        return -self.gradient(positions_nm, molecule)(positions_nm)[1]
+
+    def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
+        """Return what computes the members' energies and their mean's gradient at frames like these, compiled where
+        that is asked for."""
         known = self._known
         if known is None or known[0] is not molecule or molecule.n_atoms > FEW_ATOMS or self.training:
             fabric = self.fabric(molecule)
-            with torch.no_grad():
-                known = (molecule, fabric, self.network.prepare(fabric, positions_nm))
+            with torch.inference_mode(False), torch.no_grad():
+                made = self.network.prepare(fabric, positions_nm)
+            # Above so many atoms pairs change from frame to frame.
+            kind = CompiledGradient if self._compiles and molecule.n_atoms <= FEW_ATOMS else gradient_of
+            known = molecule, kind(lambda x: self.members(x, fabric, made))
             self._known = known
-        return self.evaluate(positions_nm, known[1], known[2]).forces_kj_mol_nm
+        return known[1]
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
