@@ -13,6 +13,7 @@ from surrogate.verbs.demo import demo
 from surrogate.verbs.info import info
 from surrogate.verbs.reference import plan, reference
 from surrogate.verbs.rollout import rollout
+from surrogate.verbs.run.run_scenes import run
 from surrogate.verbs.scene_listing import systems
 from surrogate.verbs.train import explain_training, train
 from surrogate.verbs.windows import windows
@@ -27,6 +28,7 @@ __all__ = [
     "plan",
     "reference",
     "rollout",
+    "run",
     "systems",
     "train",
     "windows",

@@ -22,7 +22,7 @@ from surrogate.cli.parameters import (
     usage_error,
     with_options,
 )
-from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_written
+from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_run, print_written
 from surrogate.cli.reproduce_verb import reproduce
 from surrogate.verbs.options import (
     CampaignOptions,
@@ -32,6 +32,7 @@ from surrogate.verbs.options import (
     Quiet,
     ReferenceOptions,
     RolloutOptions,
+    RunOptions,
     TrainOptions,
     WindowsOptions,
 )
@@ -139,6 +140,23 @@ def demo(
 
     result = api.demo(out, options=options)
     print_comparison(result, out / "report.html", as_json=False, quiet=options.quiet)
+
+
+@app.command()
+@with_options
+def run(
+    scene: SceneArg,
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for trajectory, report and record.")] = None,
+    options: RunOptions,
+    as_json: JsonOpt = False,
+) -> None:
+    """SCENE and a budget in, a judged trajectory out, by what pays best on this machine."""
+    from surrogate import api
+
+    if out is None and not options.dry_run:
+        raise usage_error("run needs --out: Folder for trajectory, report and record.")
+    print_run(api.run(scene, out, options=options), as_json=as_json)
 
 
 @app.command()

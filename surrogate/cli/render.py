@@ -85,6 +85,18 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
                 _say(f"  {line}")
 
 
+def print_run(record: dict[str, Any], *, as_json: bool) -> None:
+    """Print what came of a run: its first line, the verdict, where the report is; of a dry run the decision."""
+    if as_json:
+        print_json(record)
+    elif (outcome := record.get("outcome")) is None:
+        print_pairs(record["decision_table"])
+    else:
+        for line in (outcome["headline"], outcome["verdict"], *outcome["notes"]):
+            _say(line)
+        _say(f"report: {Path(record['file']) / 'report.html'}")
+
+
 def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool, show_all: bool = False) -> None:
     """Print each candidate's verdict, what is wrong with it and what it is worth; with `show_all` every row between
     reference and replicate."""

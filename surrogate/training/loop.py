@@ -23,6 +23,7 @@ from surrogate.training.health import Watch, first_not_finite
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
+from systems.interrupts import stop_if_asked
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -156,6 +157,7 @@ def run_stage(
     sums: dict[str, Tensor] = {}
     n_summed = 0
     while (share := config.share_done(step, spent_s)) < 1.0:
+        stop_if_asked()
         factor = learning_rate_factor(step, share, config.warmup_steps)
         for group in optimiser.param_groups:
             group["lr"] = config.learning_rate * factor

@@ -12,6 +12,7 @@ from surrogate.progress import progress_bar
 from surrogate.verbs.options import BurstOptions, Trajectories
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError
+from systems.interrupts import stop_if_asked
 from systems.takes import takes
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ def bursts(rollout: Trajectories, *, options: BurstOptions) -> BurstCheck:
         progress_bar(f"bursts of {candidate.scene.name}", quiet=options.quiet) as progress,
     ):
         for k, start in enumerate(starts):
+            stop_if_asked()
             frame = np.asarray(candidate.segments[start.segment][start.frame : start.frame + 1], dtype=np.float64)[0]
             engine.set_positions(relaxer.relax(frame).positions_nm)
             engine.thermalise()

@@ -188,6 +188,23 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
     training: dict[str, Any] | None = option("Settings of its training, as explained.", None, words=None)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(MDSettings, Preparation, Seeded, Resuming, Overwriting, Quiet):
+    """What `run` can be told."""
+
+    budget_s: float = option("Wall time to spend in all, such as 1h.")
+    way: str = option("MD, a surrogate, or what pays best here.", "auto", choices=("auto", "md", "surrogate"))
+    weights: str | Path | None = option(
+        "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"
+    )
+    save_every_ps: float | None = option(
+        "Interval between saved frames.", None, unset="what the judge can read in time"
+    )
+    format: str = option("Of the trajectory.", "h5", choices=("h5", "dcd"))
+    cores: int | None = option("To use at most.", None, within=(1, None), unset="all")
+    dry_run: bool = option("Measure and decide, and print that alone.", False)
+
+
 # By the verb's name in Python.
 VERB_OPTIONS: dict[str, type] = {
     "demo": DemoOptions,
@@ -198,6 +215,7 @@ VERB_OPTIONS: dict[str, type] = {
     "train": TrainOptions,
     "rollout": RolloutOptions,
     "compare": CompareOptions,
+    "run": RunOptions,
 }
 
 

@@ -28,7 +28,7 @@ def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     from md_reference.run.plan import make_plan
 
     molecule = prepare_scene(scene, options, quiet=False)
-    molecule, config, protocol = _settle(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
+    molecule, config, protocol = settle_run(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
     found = make_plan(molecule, config, replicas=options.replicas).to_dict()
     return found | ({"protocol": protocol} if protocol else {})
 
@@ -57,7 +57,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     outs = replica_paths(Path(out), options.replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
-    molecule, config, protocol = _settle(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
+    molecule, config, protocol = settle_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
     if protocol and not options.quiet:
         tell(molecule.name, protocol)
@@ -77,7 +77,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
         )
 
 
-def _settle(
+def settle_run(
     scene: Scene, options: PlanOptions | ReferenceOptions, length: dict[str, float], *, quiet: bool
 ) -> tuple[Scene, MDConfig, str]:
     """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.

@@ -18,7 +18,7 @@ from command_line import refused, run
 from surrogate import api
 from systems.errors import SurromdError
 
-COMMANDS = ["demo", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
+COMMANDS = ["demo", "run", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
 HEAVY = ["numpy", "torch", "openmm", "h5py", "mdtraj", "rdkit", "scipy", "matplotlib", "lightning_fabric"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -44,10 +45,13 @@ class Written(NamedTuple):
     markdown: Path
 
 
-def write_report(comparison: Comparison, path: str | Path, *, command: str | None = None) -> Written:
+def write_report(
+    comparison: Comparison, path: str | Path, *, command: str | None = None, foreword: Sequence[str] = ()
+) -> Written:
     """Write `path` (HTML), and the JSON and the Markdown beside it; return the three paths.
 
-    `command` is printed as the way to reproduce the report (by default one is put together from the file names).
+    `command` is printed as the way to reproduce the report (by default one is put together from the file names);
+    `foreword`: lines of whoever had the trajectories made, which stand before everything else.
     All files appear whole or not at all. Raises InputError for a name that does not end in .html, StorageError when
     they cannot be written.
     """
@@ -58,14 +62,13 @@ def write_report(comparison: Comparison, path: str | Path, *, command: str | Non
     _check_place(*written)
     said = command or _command(comparison, target)
     text = json.dumps(comparison.to_dict(), indent=1, allow_nan=False, ensure_ascii=False)
-    page = render(comparison, command=said)
-    _write_together(
-        {written.json: text + "\n", written.markdown: to_markdown(comparison, command=said), written.html: page}
-    )
+    page = render(comparison, command=said, foreword=foreword)
+    prose = to_markdown(comparison, command=said, foreword=foreword)
+    _write_together({written.json: text + "\n", written.markdown: prose, written.html: page})
     return written
 
 
-def render(comparison: Comparison, *, command: str) -> str:
+def render(comparison: Comparison, *, command: str, foreword: Sequence[str] = ()) -> str:
     """Return the report as HTML text."""
     from jinja2 import DictLoader, Environment, StrictUndefined
     from markupsafe import Markup
@@ -110,6 +113,7 @@ def render(comparison: Comparison, *, command: str) -> str:
         status_marks=STATUS_MARKS,
         severity=severity,
         command=command,
+        foreword=foreword,
         map_max=figures.MAP_MAX_KJ,
         embed=lambda value: Markup(_embed(value)),
         style=Markup("\n".join(text_of(name) for name in _STYLES)),

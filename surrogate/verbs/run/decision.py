@@ -1,0 +1,171 @@
+"""The decision how a budget is spent on a scene: by MD, or by a surrogate that MD then judges, from measured rates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from surrogate.verbs.run.rates import REPLICAS, Rates
+from systems.errors import InputError
+from systems.units import format_time_ps, format_wall
+
+Way = Literal["md", "rollout", "potential", "trained"]
+Stage = Literal["training md", "train", "rollout", "md", "held-out md", "bursts", "report"]
+
+WAYS: dict[Way, str] = {
+    "md": "MD for the whole budget",
+    "rollout": "rollout with weights that cover the scene, checked by MD",
+    "potential": "a potential that learns from GFN2-xTB, checked by MD",
+    "trained": "weights trained on MD made here, checked by other MD",
+}
+# Shares of what is left when the report is paid for.
+_SHARES: dict[Way, tuple[tuple[Stage, float], ...]] = {
+    "md": (("md", 0.5), ("held-out md", 0.5)),
+    "rollout": (("rollout", 0.3), ("held-out md", 0.5), ("bursts", 0.2)),
+    "potential": (("train", 0.6), ("held-out md", 0.25), ("rollout", 0.1), ("bursts", 0.05)),
+    "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("held-out md", 0.15), ("bursts", 0.05)),
+}
+LEAST_BUDGET_S = 20.0
+# Below this a potential has no time to learn from as many states as it needs.
+LEAST_TRAINING_S = 240.0
+BURST_PS = 10.0
+MOST_BURSTS, _LEAST_BURSTS = 300, 60
+# Of a burst: relaxing the frame that it starts from, in steps of MD, and what the estimate is less sure of.
+_RELAXING_STEPS, _SURE = 150, 0.7
+# The judge: processor seconds at all, and of an atom in a frame.
+_JUDGE_S, _JUDGE_ATOM_S = 8.0, 3e-6
+_JUDGE_SHARE = 0.1
+_MOST_FRAMES, _LEAST_FRAMES = 400_000, 4_000
+_NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """A stage and the wall seconds that it may take."""
+
+    name: Stage
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """How a budget is spent. `why`: the reasons, a line each; `save_every_ps`: of all trajectories; `n_bursts` of
+    `burst_ps` each; `expected_md_ps`, `expected_rollout_ps`: what the stages should come to."""
+
+    way: Way
+    why: tuple[str, ...]
+    stages: tuple[PlannedStage, ...]
+    save_every_ps: float
+    n_bursts: int
+    burst_ps: float
+    expected_md_ps: float
+    expected_rollout_ps: float
+
+    def seconds(self, name: Stage) -> float:
+        """Return what a stage may take; 0 for one that there is none of."""
+        return sum(stage.seconds for stage in self.stages if stage.name == name)
+
+
+def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: float | None = None) -> Decision:
+    """Return how `budget_s` (what is left of it, in s of wall time) is spent; `way`: md, surrogate or auto.
+
+    Raises InputError for a budget in which nothing can be judged.
+    """
+    if budget_s < LEAST_BUDGET_S:
+        raise InputError(
+            f"{format_wall(max(budget_s, 0.0))} is too short to simulate and judge anything; "
+            f"use `budget_s='{LEAST_BUDGET_S:g}s'` or more."
+        )
+    chosen, why = _choose(rates, budget_s, way)
+    frames = _frames(rates, budget_s)
+    report_s = min(0.5 * budget_s, (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * rates.stretch)
+    left_s = budget_s - report_s
+    shares = dict(_SHARES[chosen])
+    n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
+    if "bursts" in shares:
+        burst_s = (burst_ps / rates.timestep_ps + _RELAXING_STEPS) * rates.step_s * rates.stretch
+        n_bursts = min(MOST_BURSTS, int(_SURE * shares["bursts"] * left_s / burst_s))
+        if n_bursts < _LEAST_BURSTS:
+            why += (f"no bursts: one of {burst_ps:g} ps takes {format_wall(burst_s)}, and {_LEAST_BURSTS} are needed",)
+            n_bursts = 0
+            del shares["bursts"]
+        else:
+            shares["bursts"] = n_bursts * burst_s / _SURE / left_s
+    others = sum(share for name, share in shares.items() if name != "bursts")
+    scale = (1.0 - shares.get("bursts", 0.0)) / others
+    stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
+              for name, share in shares.items()]  # fmt: skip
+    found = Decision(chosen, why, (*stages, PlannedStage("report", report_s)), 0.0, n_bursts, burst_ps, 0.0, 0.0)
+    md_s = found.seconds("md") + found.seconds("held-out md") + found.seconds("training md")
+    found = replace(
+        found,
+        expected_md_ps=md_s * rates.md_ps_per_s,
+        expected_rollout_ps=found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0),
+    )
+    every_ps = save_every_ps or _interval(rates, max(found.expected_md_ps, found.expected_rollout_ps) / frames)
+    return replace(found, save_every_ps=every_ps)
+
+
+def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
+    if way == "md":
+        return "md", ("asked for",)
+    if rates.rolls is not None:
+        ratio = rates.rolls.ps_per_s / rates.md_ps_per_s
+        speeds = f"{rates.rolls.weights} rolls {ratio:.2g} times as fast as MD runs here"
+        if ratio > 1.0 or way == "surrogate":
+            return "rollout", (speeds, rates.coverage)
+        return "md", (f"{speeds}: no surrogate pays", rates.coverage)
+    none = f"no weights: {rates.coverage}"
+    if rates.dear:
+        if budget_s >= LEAST_TRAINING_S or way == "surrogate":
+            force_ms = 1e3 * rates.step_s
+            return "potential", (f"a force of the truth takes {force_ms:.3g} ms; a potential learns it", none)
+        least = format_wall(LEAST_TRAINING_S)
+        return "md", (f"a potential needs {least} or more to learn in: MD, however little", none)
+    if way == "surrogate":
+        return "trained", ("asked for; MD is cheap, and what it is trained on would answer by itself", none)
+    day = format_time_ps(float(f"{rates.md_ps_per_s * 86_400:.2g}"))
+    return "md", (f"MD is cheap ({day} a day) and nothing covers the scene: no surrogate would pay", none)
+
+
+def _frames(rates: Rates, budget_s: float) -> int:
+    """Return how many frames in all the judge reads in its share of the budget."""
+    judge_s = max(1.5 * _JUDGE_S, _JUDGE_SHARE * budget_s) - _JUDGE_S
+    return int(min(_MOST_FRAMES, max(_LEAST_FRAMES, judge_s / (_JUDGE_ATOM_S * rates.n_atoms))))
+
+
+def _interval(rates: Rates, least_ps: float) -> float:
+    """Return the interval between saved frames: a round multiple of what the surrogate, or else MD, steps by."""
+    base_ps = rates.rolls.lag_ps if rates.rolls else 0.1 if rates.dear else 1.0
+    return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
+
+
+def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, str]]:
+    """Return the decision and what it rests on, as lines of a name and a text."""
+
+    def per_day(ps_per_s: float) -> str:
+        return f"{format_time_ps(float(f'{ps_per_s * 86_400:.3g}'))} a day"
+
+    busy = f", other work on {rates.others:g} of them" if rates.others >= 0.2 else ""
+    lines = [
+        ("MD", rates.md.rsplit("; about", 1)[0]),
+        ("MD here", f"{per_day(rates.md_ps_per_s)} on {rates.cores} cores{busy}"),
+    ]
+    if rates.rolls is not None:
+        rolled = f"{per_day(rates.rolls.ps_per_s)} by {rates.rolls.weights} in {REPLICAS} replicas"
+        lines.append(("rollout here", rolled))
+    lines.append(("way", WAYS[decision.way]))
+    lines += [("because", reason) for reason in decision.why]
+    lines += [(stage.name, f"{format_wall(stage.seconds)}{_to_come(stage.name, decision, rates)}")
+              for stage in decision.stages]  # fmt: skip
+    lines.append(("in all", f"{format_wall(budget_s)}, frames every {format_time_ps(decision.save_every_ps)}"))
+    return lines
+
+
+def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
+    """Return what a stage is expected to come to."""
+    if name in ("md", "held-out md", "training md"):
+        return f", about {format_time_ps(float(f'{decision.seconds(name) * rates.md_ps_per_s:.2g}'))}"
+    if name == "rollout" and decision.expected_rollout_ps:
+        return f", about {format_time_ps(float(f'{decision.expected_rollout_ps:.2g}'))}"
+    return f", {decision.n_bursts} of {decision.burst_ps:g} ps" if name == "bursts" else ""

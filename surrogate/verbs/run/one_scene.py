@@ -1,0 +1,255 @@
+"""A run of one scene: its folder, its stages one after the other within the budget, the report at the end."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.progress import progress_bar
+from surrogate.verbs.options import RunOptions
+from surrogate.verbs.reference import settle_run
+from surrogate.verbs.run.decision import Decision, decide
+from surrogate.verbs.run.rates import measure
+from surrogate.verbs.run.run_record import (
+    RUN_NAME,
+    RunRecord,
+    StageEntry,
+    read_run,
+    settings_of_run,
+    write_run,
+)
+from surrogate.verbs.run.stage_clock import Clock
+from surrogate.verbs.run.stages import STAGES, Site, md_options
+from surrogate.verbs.scene_listing import prepare_scene
+from surrogate.verbs.telling import tell
+from systems.errors import InputError, SurromdError
+from systems.trajectory.claim import Claim
+
+if TYPE_CHECKING:
+    from md_reference.run.config import MDConfig
+    from systems.scene import Scene
+
+LOG_NAME = "log.txt"
+# Without these there is nothing to judge; a run that lost them to a fault of the surrogate goes on by MD.
+_OF_SURROGATE = ("train", "rollout")
+_GOES_ON = "the same again with `resume=True` goes on"
+
+
+def plan_scene(scene: str | Path | Scene, options: RunOptions) -> RunRecord:
+    """Return what a run of a scene would be: rates, measured now, and the decision. Nothing is written."""
+    molecule, config = _settled(scene, options)
+    record = _new_record(scene, molecule, options)
+    return _decided(record, molecule, config, options, lambda: 0.0)
+
+
+def run_scene(
+    scene: str | Path | Scene, folder: Path, options: RunOptions, tell_decision: Callable[[RunRecord], None]
+) -> RunRecord:
+    """Run a scene into `folder`, or go on with the run there, and return its record, which is done.
+
+    `tell_decision` is called when it is known how the budget is spent. Raises InputError for a folder that is not
+    ours, KeyboardInterrupt with what is kept, and what preparing a scene or MD of it raises.
+    """
+    before = _open_folder(folder, options)
+    try:
+        with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
+            saved = [before] if before is not None else []
+            clock = Clock(options.budget_s, before.spent_s if before else 0.0, lambda s: _keep(folder, saved, s),
+                          advance)  # fmt: skip
+            settled = clock.work("preparing", options.budget_s, lambda: _settled(scene, options)).result
+            if settled is None:
+                raise InputError("the budget is spent before the scene is prepared; give more `budget_s`.")
+            molecule, config = settled
+            if before is None:
+                record = _new_record(scene, molecule, options)
+            else:
+                before.check_same(settings_of_run(options), molecule.topology_hash, folder)
+                record = before
+            if record.decision is None:
+                record = _decide(record, molecule, config, options, clock)
+            tell_decision(record)
+            run = _Run(folder, molecule, config, options, record, clock, saved)
+            return run.to_the_end()
+    except KeyboardInterrupt as stop:
+        if not (folder / RUN_NAME).exists():
+            raise
+        said = f"{stop.args[0].split(';')[0]}; " if stop.args else ""
+        raise KeyboardInterrupt(f"{said}{folder} keeps what was done; {_GOES_ON}") from None
+
+
+class _Run:
+    """A run under way: every change of its record is on disk before the next stage."""
+
+    def __init__(self, folder: Path, scene: Scene, config: MDConfig, options: RunOptions, record: RunRecord,
+                 clock: Clock, saved: list[RunRecord]) -> None:  # fmt: skip
+        self.site = Site(folder, scene, config, options)
+        self.clock, self.saved, self.quiet = clock, saved, options.quiet
+        self.record = record
+        self.keep(record)
+
+    def keep(self, record: RunRecord) -> None:
+        """Make `record` the run's, here and on disk."""
+        self.record = replace(record, spent_s=round(self.clock.spent_s, 1))
+        self.saved[:] = [self.record]
+        write_run(self.site.folder, self.record)
+
+    def say(self, line: str) -> None:
+        """Write a line into the log, and show it."""
+        with open(self.site.folder / LOG_NAME, "a", encoding="utf-8") as log:
+            log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
+        if not self.quiet:
+            tell(self.site.scene.name, line)
+
+    def to_the_end(self) -> RunRecord:
+        """Do the stages that have not ended and return the record."""
+        while (name := self._next()) is not None:
+            self._do(name)
+        self.keep(self.record)
+        return self.record
+
+    @property
+    def decision(self) -> Decision:
+        assert self.record.decision is not None
+        return self.record.decision
+
+    def _next(self) -> str | None:
+        return next((stage.name for stage in self.decision.stages if self.record.ended(stage.name) is None), None)
+
+    def _do(self, name: str) -> None:
+        pending = [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]
+        later_s = sum(stage.seconds for stage in pending[1:])
+        # A minute more is better than no report.
+        seconds = max(self.clock.budget_s - self.clock.spent_s - later_s, 2.0) if name != "report" else 86_400.0
+        began = self.clock.spent_s
+        self.say(f"{name}: for {seconds:.0f} s" if name != "report" else name)
+        stage = STAGES[name]
+        record = self.record
+        try:
+            ended = self.clock.work(name, seconds, lambda: stage.work(self.site, record, seconds))
+        except SurromdError as error:
+            if not stage.may_fail:
+                raise
+            self._failed(name, str(error), self.clock.spent_s - began)
+            return
+        wall_s = round(self.clock.spent_s - began, 1)
+        found = stage.found(self.site, record) if ended.result is None else ended.result
+        if found is None:
+            self._failed(name, "nothing came of it in its time", wall_s)
+            return
+        entry = StageEntry(name, "done" if ended.result is not None else "out of time", wall_s)
+        self.keep(found.with_stage(entry))
+
+    def _failed(self, name: str, reason: str, wall_s: float) -> None:
+        self.say(f"{name} failed: {reason}")
+        found = STAGES[name].found(self.site, self.record) or self.record
+        self.keep(found.with_stage(StageEntry(name, "failed", round(wall_s, 1), reason)))
+        if name in _OF_SURROGATE and not self.record.trajectory and self.decision.way != "md":
+            self._by_md(f"{name} failed ({reason})")
+
+    def _by_md(self, why: str) -> None:
+        """Spend what is left on MD."""
+        assert self.record.rates is not None
+        left_s = max(self.clock.budget_s - self.clock.spent_s, 30.0)
+        decision = decide(self.record.rates, left_s, "md", save_every_ps=self.decision.save_every_ps)
+        ended = {entry.name for entry in self.record.stages}
+        stages = tuple(stage for stage in decision.stages if stage.name not in ended)
+        self.keep(replace(self.record, decision=replace(decision, why=(why,), stages=stages)))
+        self.say(f"{why}: MD for the rest of the budget")
+
+
+def _decide(record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, clock: Clock) -> RunRecord:
+    """Measure and decide, on the clock."""
+
+    def work() -> RunRecord:
+        return _decided(record, scene, config, options, lambda: clock.spent_s)
+
+    found = clock.work("measuring", options.budget_s, work).result
+    if found is None:
+        raise InputError("the budget is spent before the scene is measured; give more `budget_s`.")
+    return found
+
+
+def _decided(
+    record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, spent_s: Callable[[], float]
+) -> RunRecord:
+    """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known."""
+    rates = measure(scene, config, options.weights, options.cores)
+    decision = decide(rates, options.budget_s - spent_s(), options.way, save_every_ps=options.save_every_ps)
+    weights = rates.rolls.weights if decision.way == "rollout" and rates.rolls else ""
+    return replace(record, rates=rates, decision=decision, weights=weights)
+
+
+def _settled(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MDConfig]:
+    """Return the scene and the settings of its MD."""
+    molecule = prepare_scene(scene, options, quiet=options.quiet)
+    return settle_run(molecule, md_options(options), {"time_ps": 0.0}, quiet=options.quiet)[:2]
+
+
+def _new_record(scene: str | Path | Scene, molecule: Scene, options: RunOptions) -> RunRecord:
+    from importlib.metadata import version
+
+    import openmm
+
+    programs = {"surromd": version("surromd"), "openmm": openmm.__version__, "python": sys.version.split()[0]}
+    return RunRecord(
+        scene=_named(scene),
+        molecule=molecule.name,
+        formula=molecule.formula,
+        topology_hash=molecule.topology_hash,
+        settings=settings_of_run(options),
+        programs=programs,
+        started=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+
+
+def _named(scene: str | Path | Scene) -> str:
+    return str(scene) if isinstance(scene, str | Path) else scene.name
+
+
+def _keep(folder: Path, saved: list[RunRecord], spent_s: float) -> None:
+    if saved:
+        write_run(folder, replace(saved[0], spent_s=round(spent_s, 1)))
+
+
+def _open_folder(folder: Path, options: RunOptions) -> RunRecord | None:
+    """Return the record of the run to go on with, None for a new one in an empty folder. Raises InputError."""
+    if options.resume and options.overwrite:
+        raise InputError("`resume` and `overwrite` exclude each other.")
+    if folder.is_file():
+        raise InputError(f"{folder} is a file; name a folder.")
+    is_run = (folder / RUN_NAME).is_file()
+    if is_run and options.resume:
+        return read_run(folder)
+    if is_run and not options.overwrite:
+        raise InputError(f"{folder} holds a run; add `resume=True` to go on, or `overwrite=True` to start over.")
+    if is_run:
+        _clear(folder)
+    elif folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
+        raise InputError(f"{folder} is not empty and no run's folder; name another.")
+    folder.mkdir(parents=True, exist_ok=True)
+    return None
+
+
+def _clear(folder: Path) -> None:
+    """Remove what an earlier run wrote, its record last."""
+    for name in ("reference", "trajectory"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    for pattern in ("report.*", "weights.*", "bursts.json", LOG_NAME, RUN_NAME):
+        for path in folder.glob(pattern):
+            with suppress(FileNotFoundError):
+                path.unlink()
+
+
+def describe_run(folder: Path) -> dict[str, Any]:
+    """Return a JSON-able account of a run's folder; `summary` is one line."""
+    record = read_run(folder)
+    outcome = record.outcome
+    done = outcome.headline if outcome else f"not done; {len(record.stages)} stages have ended"
+    return {"file": str(folder), "type": "run", "summary": done, **json.loads(json.dumps(record.to_dict()))}

@@ -1,0 +1,153 @@
+"""Rates of a scene on this machine, measured in seconds: what MD and the weights that cover it simulate."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from systems.errors import OutOfDomainError
+
+if TYPE_CHECKING:
+    from md_reference.run.config import MDConfig
+    from surrogate.data.weights import Weights
+    from systems.scene import Scene
+
+# Rollouts side by side: one batch, which costs little more than one of them.
+REPLICAS = 8
+# Weights for several lags step so far, or as near to it as they can.
+LONG_LAG_PS = 10.0
+_CHUNKS = 4
+_SAME = ("force_field", "solvent", "temperature_k")
+
+
+@dataclass(frozen=True)
+class Rolls:
+    """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together."""
+
+    weights: str
+    lag_ps: float
+    ps_per_s: float
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What was measured. `others`: processes of others that share the `cores`. `step_s`: processor seconds of a step of
+    MD on one core, `md_ps_per_s`: of MD on all cores, with what the others leave, in a second of wall time; `dear`: it
+    is quantum mechanics. `rolls`: of weights that cover the scene, None where none do; `coverage`: why these, or none.
+    """
+
+    n_atoms: int
+    cores: int
+    others: float
+    dear: bool
+    md: str
+    step_s: float
+    timestep_ps: float
+    md_ps_per_s: float
+    coverage: str
+    rolls: Rolls | None = None
+
+    @property
+    def stretch(self) -> float:
+        """Wall seconds of a second of processor time, with all cores in use."""
+        return (self.cores + self.others) / self.cores
+
+
+def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int | None = None) -> Rates:
+    """Return the rates of a scene: of MD with these settings, and of the weights `named`, or of shipped ones;
+    `cores`: how many may be used, all by default.
+
+    Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
+    """
+    from md_reference.forces.spec import QUANTUM
+    from md_reference.run.machine import available_cores
+    from md_reference.run.plan import make_plan
+
+    cores, others = cores or available_cores(), _other_processes()
+    plan = make_plan(scene, config, replicas=cores)
+    assert plan.us_per_step is not None
+    step_s = plan.us_per_step * 1e-6
+    share = cores / (cores + others)
+    weights, coverage = _covering(scene, config, named)
+    return Rates(
+        n_atoms=scene.n_atoms,
+        cores=cores,
+        others=others,
+        dear=config.force.force_field == QUANTUM,
+        md=plan.line,
+        step_s=step_s,
+        timestep_ps=config.timestep_ps,
+        md_ps_per_s=cores * share * config.timestep_ps / step_s,
+        coverage=coverage,
+        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k),
+    )
+
+
+def rollout_rate(scene: Scene, weights: Weights, temperature_k: float) -> Rolls:
+    """Return how weights roll a scene that they cover, by a few chunks of it."""
+    from surrogate.data.shipped import shipped_weights
+    from surrogate.sampling.runner import RolloutConfig, rollout
+
+    lag_ps = weights.domain.lag_ps
+    if weights.domain.jumps:
+        lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
+    seen: list[tuple[float, int]] = []
+    with tempfile.TemporaryDirectory(prefix="surromd-rate-") as folder:
+        rollout(
+            scene,
+            weights,
+            [Path(folder) / f"r{k}.h5" for k in range(REPLICAS)],
+            RolloutConfig(
+                time_ps=_CHUNKS * weights.model.n_new * lag_ps,
+                save_every_ps=lag_ps,
+                temperature_k=temperature_k,
+            ),
+            progress=lambda done, total, note: seen.append((time.monotonic(), done)),
+            flush_every_s=3600.0,
+        )
+    # The first chunk makes what all others use again, the last one is flushed.
+    (began, first), (ended, last) = seen[0], seen[-2]
+    name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
+    return Rolls(name, lag_ps, REPLICAS * (last - first) * lag_ps / max(ended - began, 1e-6))
+
+
+def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
+    """Return the weights that cover the scene under these conditions, and why these or why none."""
+    from surrogate.data.shipped import weights_path
+    from surrogate.data.weights import load_weights
+    from surrogate.sampling.choice import choose_weights
+    from surrogate.sampling.domain import match_domain
+
+    if named is not None:
+        weights, why = load_weights(weights_path(named)), "asked for"
+        match_domain(scene, weights, temperature_k=config.temperature_k)
+    else:
+        try:
+            weights, why = choose_weights(scene, temperature_k=config.temperature_k)
+        except OutOfDomainError as error:
+            return None, str(error)
+    asked = {
+        "force_field": config.force.force_field,
+        "solvent": config.force.solvent,
+        "temperature_k": config.temperature_k,
+    }
+    known = weights.domain.conditions
+    apart = [f"{key} {known[key]}, not {asked[key]}" for key in _SAME if known.get(key) not in (None, asked[key])]
+    if apart:
+        reason = f"{weights.path.name} was trained under other conditions: {', '.join(apart)}"
+        if named is not None:
+            raise OutOfDomainError(f"{reason}; leave `weights` out, or ask for these conditions.")
+        return None, reason
+    return weights, why
+
+
+def _other_processes() -> float:
+    """Return how many processes computed on this machine over the last minute, on average."""
+    try:
+        return round(os.getloadavg()[0], 1)
+    except (OSError, AttributeError):
+        return 0.0

@@ -1,0 +1,121 @@
+"""The record of a run, run.json: what was asked for, measured, decided and done, and what came of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from surrogate.verbs.run.decision import Decision
+from surrogate.verbs.run.rates import Rates
+from systems.errors import InputError
+from systems.files.outside import content
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
+
+RUN_NAME = "run.json"
+FORMAT = 1
+# What may change from one sitting to the next.
+_FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})
+
+Status = Literal["done", "out of time", "failed"]
+
+
+@dataclass(frozen=True)
+class StageEntry:
+    """A stage that has ended: how, after how many seconds of wall time, and what there is to say of it."""
+
+    name: str
+    status: Status
+    wall_s: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run. `headline`: the report's first line; `held_out_ps` of MD that judged, `rolled_ps` that was
+    judged; `worth` in words, `gain` over as much wall time of MD as a lower bound, None where it cannot be told;
+    `bursts`: their verdict."""
+
+    headline: str
+    status: str
+    verdict: str
+    held_out_ps: float
+    rolled_ps: float
+    worth: str = ""
+    gain: float | None = None
+    bursts: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget; `trajectory`,
+    `held_out`: files, relative to the folder; `weights`: a file there, or the name of shipped ones."""
+
+    scene: str
+    molecule: str
+    formula: str
+    topology_hash: str
+    settings: dict[str, Any]
+    programs: dict[str, str] = field(default_factory=dict)
+    started: str = ""
+    spent_s: float = 0.0
+    rates: Rates | None = None
+    decision: Decision | None = None
+    stages: tuple[StageEntry, ...] = ()
+    trajectory: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+    weights: str = ""
+    outcome: Outcome | None = None
+
+    def ended(self, name: str) -> StageEntry | None:
+        """Return how a stage ended, None where it has not."""
+        return next((entry for entry in self.stages if entry.name == name), None)
+
+    def with_stage(self, entry: StageEntry) -> RunRecord:
+        """Return the record with one more stage that has ended."""
+        return replace(self, stages=(*self.stages, entry))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {"format": FORMAT, **asdict(self)}
+
+    def check_same(self, settings: dict[str, Any], topology_hash: str, folder: Path) -> None:
+        """Raise InputError unless a run of these settings on this molecule may go on with this one."""
+        if self.topology_hash != topology_hash:
+            raise InputError(f"{folder} is a run of another molecule ({self.scene}); name another folder.")
+        for key in sorted(settings.keys() | self.settings.keys()):
+            was, now = self.settings.get(key), settings.get(key)
+            if was != now:
+                raise InputError(
+                    f"{folder} was started with {key} = {was!r}, not {now!r}; go on with the same settings, or name "
+                    "another folder."
+                )
+
+
+def settings_of_run(options: Any) -> dict[str, Any]:
+    """Return the options that make a run what it is, JSON-able."""
+    values = {key: value for key, value in asdict(options).items() if key not in _FREE}
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain
+
+
+def write_run(folder: Path, record: RunRecord) -> None:
+    """Write run.json into the folder, whole or not at all. Raises StorageError."""
+    create_whole(folder / RUN_NAME, json.dumps(record.to_dict(), indent=1) + "\n")
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Return the record of a run's folder. Raises InputError when there is none or it cannot be read."""
+    path = folder / RUN_NAME
+    try:
+        found = dict(parsed(content(path)))
+        if found.pop("format", None) != FORMAT:
+            raise InputError(f"{path} was written by another version of surromd (its format is not {FORMAT}).")
+        return built(RunRecord, found)
+    except FileNotFoundError:
+        raise InputError(f"{folder} holds no {RUN_NAME}: there is no run to go on with.") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path} cannot be read as the record of a run ({error}).") from error

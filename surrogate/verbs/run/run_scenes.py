@@ -1,0 +1,56 @@
+"""The verb `run`: a scene and a budget in, a judged trajectory out, by whatever way pays best on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.verbs.options import PathLike, RunOptions
+from surrogate.verbs.run.decision import table
+from surrogate.verbs.run.one_scene import describe_run, plan_scene, run_scene
+from surrogate.verbs.run.run_record import RunRecord
+from surrogate.verbs.telling import tell
+from systems.errors import InputError
+from systems.takes import takes
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
+
+
+@takes(RunOptions)
+def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOptions) -> dict[str, Any]:
+    """Simulate a molecule in `budget_s` of wall time by whatever way pays best here, judge it, and return the record.
+
+    What MD and the weights that cover the scene simulate is measured in the first seconds, and decides: weights that
+    cover it and outrun MD are rolled, and checked by MD that is held out and by bursts of MD from their frames; where
+    nothing covers it and MD is cheap, MD takes the whole budget, one half as the judge of the other; at
+    `level='gfn2-xtb'` a potential learns the molecule first. `way` overrides that. `dry_run`: the decision alone.
+
+    The folder `out` holds `report.html`, whose first line says what was achieved, the trajectory, `reference/`, the
+    weights that were trained, `run.json` (the record that is returned: rates, decision, stages, seeds, versions) and
+    `log.txt`. Ctrl-C and a kill lose nothing that was written; `resume` goes on, within the same budget.
+    Raises InputError, PreparationError, OutOfDomainError (`weights` that do not cover the scene), SimulationError.
+    """
+    if options.dry_run:
+        record = plan_scene(scene, options)
+        return {"decision_table": decision_table(record, options), **record.to_dict()}
+    if out is None:
+        raise InputError("name a folder for the trajectory and the report with `out`.")
+    folder = Path(out)
+
+    def told(found: RunRecord) -> None:
+        if not options.quiet:
+            for name, text in decision_table(found, options).items():
+                tell(found.molecule, f"{name}: {text}")
+
+    run_scene(scene, folder, options, told)
+    return describe_run(folder)
+
+
+def decision_table(record: RunRecord, options: RunOptions) -> dict[str, str]:
+    """Return a run's rates and its decision, line by line."""
+    assert record.rates is not None and record.decision is not None
+    lines: dict[str, str] = {}
+    for name, text in table(record.rates, record.decision, options.budget_s):
+        lines[name] = f"{lines[name]}; {text}" if name in lines else text
+    return lines

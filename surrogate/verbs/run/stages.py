@@ -1,0 +1,233 @@
+"""The stages of a run, each one call of a verb: its files stay, so that it can be stopped at any moment and gone on."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surrogate.verbs.bursts import bursts
+from surrogate.verbs.compare import compare
+from surrogate.verbs.options import BurstOptions, MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
+from surrogate.verbs.reference import reference
+from surrogate.verbs.rollout import rollout
+from surrogate.verbs.run.decision import Decision, table
+from surrogate.verbs.run.outcome_words import Costs, outcome
+from surrogate.verbs.run.rates import REPLICAS, Rates, rollout_rate
+from surrogate.verbs.run.run_record import RunRecord
+from surrogate.verbs.train import train
+from systems.errors import InputError
+from systems.files.whole_file import create_whole
+from systems.preparation import Preparation
+
+if TYPE_CHECKING:
+    from md_reference.run.config import MDConfig
+    from systems.scene import Scene
+
+# A run may turn out faster than measured: the clock, not its length, ends it.
+_AMPLE = 3.0
+_LEAST_FRAMES = 20
+# Runs of one scene whose seeds differ by this are independent, replicas and all.
+_SEEDS_APART = 10_000
+_EQUILIBRATION_SHARE = 0.1
+WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """Where a run takes place: its folder, the scene, the settings of its MD, and what was asked for."""
+
+    folder: Path
+    scene: Scene
+    config: MDConfig
+    options: RunOptions
+
+
+@dataclass(frozen=True)
+class StageOf:
+    """`work(site, record, seconds)` does a stage and returns the record with what it made; `found(site, record)`
+    returns it with what there is after a stop, None for nothing. `may_fail`: a run goes on without it."""
+
+    work: Callable[[Site, RunRecord, float], RunRecord]
+    found: Callable[[Site, RunRecord], RunRecord | None]
+    may_fail: bool = False
+
+
+def _settled(record: RunRecord) -> tuple[Rates, Decision]:
+    assert record.rates is not None and record.decision is not None
+    return record.rates, record.decision
+
+
+def _md_stage(name: str, place: str, seed: int, to: str) -> StageOf:
+    """Return a stage of MD into `place`, replicas on all cores."""
+
+    def outs(site: Site, record: RunRecord) -> list[Path]:
+        from md_reference.run.replicas import replica_paths
+
+        suffix = f".{site.options.format}" if to == "trajectory" else ".h5"
+        return replica_paths(site.folder / f"{place}{suffix}", _settled(record)[0].cores)
+
+    def work(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+        rates, decision = _settled(record)
+        every_ps = decision.save_every_ps
+        expected_ps = decision.seconds(name) * rates.md_ps_per_s / rates.cores  # type: ignore[arg-type]
+        first = outs(site, record)
+        out = site.folder / f"{place}{first[0].suffix}"
+        out.parent.mkdir(exist_ok=True)
+        reference(
+            site.scene,
+            out,
+            options=md_options(
+                site.options,
+                time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * expected_ps / every_ps)),
+                save_every_ps=every_ps,
+                equilibrate_ps=min(site.config.equilibrate_ps, _EQUILIBRATION_SHARE * expected_ps),
+                replicas=rates.cores,
+                seed=site.options.seed + seed * _SEEDS_APART,
+                resume=True,
+            ),
+        )
+        done = found(site, record)
+        if done is None:
+            raise InputError("MD wrote no frames.")
+        return done
+
+    def found(site: Site, record: RunRecord) -> RunRecord | None:
+        files = _with_frames(site.folder, outs(site, record))
+        if not files:
+            return None
+        if to == "held_out":
+            return replace(record, held_out=files)
+        return replace(record, trajectory=files) if to == "trajectory" else record
+
+    return StageOf(work, found)
+
+
+def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
+    """Return what `reference` is told of a run's MD: its settings, and `more`."""
+    given = {f.name: getattr(options, f.name) for kind in (MDSettings, Preparation) for f in fields(kind)}
+    return ReferenceOptions(**{**given, "time_ps": 0.0, "quiet": True, **more})
+
+
+def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
+    from systems.trajectory.checkpoint import frames_in
+
+    return tuple(str(path.relative_to(folder)) for path in paths if path.exists() and frames_in(path))
+
+
+def _train(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+    out = site.folder / WEIGHTS_NAME
+    _, decision = _settled(record)
+    dear = decision.way == "potential"
+    options = TrainOptions(
+        level=site.options.level if dear else None,
+        # What training does before and after it counts its seconds has to fit in as well.
+        budget_s=0.9 * decision.seconds("train"),
+        seed=site.options.seed,
+        resume=True,
+        quiet=True,
+    )
+    train(site.scene if dear else sorted((site.folder / "reference").glob("training*.h5")), out, options=options)
+    return _trained(site, record) or record
+
+
+def _trained(site: Site, record: RunRecord) -> RunRecord | None:
+    """Return the record with the weights that were trained, and how fast they roll."""
+    from surrogate.data.weights import load_weights
+
+    out = site.folder / WEIGHTS_NAME
+    if not out.exists():
+        return None
+    rates, _ = _settled(record)
+    rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k)
+    return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
+
+
+def _rolled_paths(site: Site) -> list[Path]:
+    from md_reference.run.replicas import replica_paths
+
+    return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", REPLICAS)
+
+
+def _roll(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+    rates, decision = _settled(record)
+    assert rates.rolls is not None
+    every_ps = rates.rolls.lag_ps * math.ceil(decision.save_every_ps / rates.rolls.lag_ps - 1e-6)
+    expected_ps = decision.seconds("rollout") * rates.rolls.ps_per_s / REPLICAS
+    own = site.folder / WEIGHTS_NAME
+    out = site.folder / f"trajectory/surrogate.{site.options.format}"
+    out.parent.mkdir(exist_ok=True)
+    rollout(
+        site.scene,
+        own if record.weights == WEIGHTS_NAME else record.weights,
+        out,
+        options=RolloutOptions(
+            time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * expected_ps / every_ps)),
+            save_every_ps=every_ps,
+            temperature_k=site.config.temperature_k,
+            seed=site.options.seed,
+            replicas=REPLICAS,
+            resume=True,
+            quiet=True,
+        ),
+    )
+    return _rolled(site, record) or record
+
+
+def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
+    files = _with_frames(site.folder, _rolled_paths(site))
+    return replace(record, trajectory=files) if files else None
+
+
+def _burst(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+    _, decision = _settled(record)
+    options = BurstOptions(n_bursts=decision.n_bursts, burst_ps=decision.burst_ps, seed=site.options.seed, quiet=True)
+    check = bursts([site.folder / file for file in record.trajectory], options=options)
+    text = json.dumps(check.to_dict(), indent=1, default=str)
+    create_whole(site.folder / BURSTS_NAME, text + "\n")
+    return record
+
+
+def _report(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+    from surrogate.judge.report.report import write_report
+
+    rates, decision = _settled(record)
+    held = [site.folder / file for file in record.held_out]
+    truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
+    label = "MD" if decision.way == "md" else "surrogate"
+    comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
+    spent = {entry.name: entry.wall_s for entry in record.stages}
+    measured_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
+    # The faster of what was measured before and what it came to: the gain is a lower bound.
+    md_ps_per_s = max(rates.md_ps_per_s, measured_ps / max(spent.get("held-out md", 0.0), 1e-9))
+    training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
+    bursts_file = site.folder / BURSTS_NAME
+    said = json.loads(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
+    notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
+    found = outcome(decision.way, comparison, Costs(spent.get("rollout", 0.0), training_s, md_ps_per_s), said, notes)
+    lines = [f"{name}: {text}" for name, text in table(rates, decision, site.options.budget_s)]
+    write_report(
+        comparison,
+        site.folder / REPORT_NAME,
+        command=f"surromd run {record.scene!r} -o {site.folder.name}",
+        foreword=(found.headline, "; ".join(lines), *notes),
+    )
+    return replace(record, outcome=found)
+
+
+def _nothing(site: Site, record: RunRecord) -> RunRecord | None:
+    return None
+
+
+STAGES: dict[str, StageOf] = {
+    "training md": _md_stage("training md", "reference/training", 2, ""),
+    "md": _md_stage("md", "trajectory/md", 0, "trajectory"),
+    "held-out md": _md_stage("held-out md", "reference/held_out", 1, "held_out"),
+    "train": StageOf(_train, _trained, may_fail=True),
+    "rollout": StageOf(_roll, _rolled, may_fail=True),
+    "bursts": StageOf(_burst, _nothing, may_fail=True),
+    "report": StageOf(_report, _nothing),
+}

@@ -1,0 +1,88 @@
+"""How a budget is spent, from rates that are made up: which way, which stages, and that they fill the budget."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from surrogate.verbs.run.decision import Decision, decide, table
+from surrogate.verbs.run.rates import Rates, Rolls
+from systems.errors import InputError
+
+# Alanine dipeptide on two cores: 20 ns of MD in a minute, and weights that roll five times as fast.
+FAST = Rolls("alanine-dipeptide", 1.0, 1600.0)
+COVERED = Rates(22, 2, 0.0, False, "OBC2; about 1", 25e-6, 0.004, 320.0, "trained on it", FAST)
+UNCOVERED = replace(COVERED, rolls=None, coverage="elements: S not seen")
+DEAR = replace(UNCOVERED, dear=True, step_s=16e-3, timestep_ps=0.0005, md_ps_per_s=0.0625)
+
+
+def named(decision: Decision) -> list[str]:
+    return [stage.name for stage in decision.stages]
+
+
+def test_weights_that_outrun_md_are_rolled_and_checked_by_bursts() -> None:
+    found = decide(COVERED, 600.0)
+    assert found.way == "rollout"
+    assert named(found) == ["rollout", "held-out md", "bursts", "report"]
+    assert found.n_bursts >= 60
+    assert found.expected_rollout_ps == pytest.approx(1600.0 * found.seconds("rollout"))
+
+
+def test_weights_slower_than_md_are_not() -> None:
+    slow = replace(COVERED, rolls=replace(FAST, ps_per_s=300.0))
+    found = decide(slow, 600.0)
+    assert found.way == "md" and "no surrogate pays" in found.why[0]
+    assert decide(slow, 600.0, "surrogate").way == "rollout", "but by request"
+
+
+def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
+    found = decide(UNCOVERED, 600.0)
+    assert found.way == "md" and named(found) == ["md", "held-out md", "report"]
+    assert found.seconds("md") == found.seconds("held-out md")
+    assert "S not seen" in found.why[1]
+    assert decide(UNCOVERED, 600.0, "surrogate").way == "trained"
+
+
+def test_dear_truth_is_learned_where_there_is_time_to() -> None:
+    assert decide(DEAR, 3600.0).way == "potential"
+    short = decide(DEAR, 60.0)
+    assert short.way == "md" and "needs 4 min" in short.why[0]
+    assert decide(DEAR, 3600.0, "md").way == "md"
+
+
+@pytest.mark.parametrize("rates", [COVERED, UNCOVERED, DEAR])
+@pytest.mark.parametrize("way", ["auto", "md", "surrogate"])
+@pytest.mark.parametrize("budget_s", [20.0, 60.0, 600.0, 36_000.0])
+def test_stages_fill_the_budget(rates: Rates, way: str, budget_s: float) -> None:
+    found = decide(rates, budget_s, way)
+    assert sum(stage.seconds for stage in found.stages) == pytest.approx(budget_s)
+    assert min(stage.seconds for stage in found.stages) > 0.0
+    assert ("bursts" in named(found)) == (found.n_bursts > 0)
+    assert table(rates, found, budget_s)[-1][0] == "in all"
+
+
+def test_bursts_that_are_too_dear_are_left_out_and_said_to_be() -> None:
+    found = decide(DEAR, 3600.0)
+    assert found.n_bursts == 0 and any("no bursts" in line for line in found.why)
+    cheap = replace(DEAR, step_s=20e-6, md_ps_per_s=50.0)
+    assert decide(cheap, 3600.0, "surrogate").n_bursts > 0, "control"
+
+
+def test_frames_are_saved_no_more_often_than_the_judge_can_read() -> None:
+    short, long = decide(COVERED, 60.0), decide(COVERED, 36_000.0)
+    assert short.save_every_ps < long.save_every_ps
+    for found in (short, long):
+        assert found.save_every_ps % FAST.lag_ps == 0.0
+    assert long.expected_rollout_ps / long.save_every_ps < 400_000
+    assert decide(COVERED, 36_000.0, save_every_ps=1.0).save_every_ps == 1.0
+
+
+def test_other_work_on_the_machine_leaves_fewer_bursts() -> None:
+    busy = replace(COVERED, others=2.0, md_ps_per_s=160.0)
+    assert decide(busy, 60.0).n_bursts < decide(COVERED, 60.0).n_bursts
+
+
+def test_a_budget_in_which_nothing_can_be_judged_is_refused() -> None:
+    with pytest.raises(InputError, match="20"):
+        decide(COVERED, 5.0)
