@@ -24,9 +24,22 @@ from systems.chemistry.graph import bonded_graph, rotatable_torsions
 from systems.errors import PreparationError, SimulationError
 from systems.scene import FloatArray, Scene
 
-_TIMESTEP_PS = 0.0005
-_SETTLE_PS = 2.0
-_APART_PS = 0.25
+
+@dataclass(frozen=True)
+class _Pace:
+    """How hot MD goes: its step and its hydrogens, how long it settles, how far apart its states are, and how many of
+    the frames asked of plain MD it makes."""
+
+    timestep_ps: float
+    hydrogen_mass_da: float | None
+    settle_ps: float
+    apart_ps: float
+    share: float
+
+
+_CHEAP = _Pace(0.0005, None, 2.0, 0.25, 1.0)
+# Where every step is a dear force: as few as will do.
+_DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
 # Every so many-th hot state has one of its torsions turned to any angle.
 _TURN_EVERY = 3
 # Atoms that a turned torsion brings nearer than this are no state of the molecule.
@@ -98,7 +111,8 @@ class Teacher:
         each = -(-n_states // len(temperatures_k))
         found = []
         for temperature_k in temperatures_k:
-            found.append(self.motion(each, _APART_PS, temperature_k, seed=int(rng.integers(2**31))))
+            seed = int(rng.integers(2**31))
+            found.append(self._md(each, self._cheap[2].apart_ps, temperature_k, seed=seed))
         states = np.concatenate(found)
         torsions = rotatable_torsions(self.scene, rotors=True)
         if len(torsions):
@@ -109,33 +123,38 @@ class Teacher:
         return order
 
     def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> FloatArray:
-        """Return frames `(n_frames, n_atoms, 3)` nm of MD, `lag_ps` apart, by GAFF2, or by GFN2-xTB where GAFF2 has no
-        parameters; the centre of mass stays where it is."""
-        spec, system = self._cheap
-        conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=_TIMESTEP_PS, seed=seed,
+        """Return frames `(n_frames, n_atoms, 3)` nm of MD, `lag_ps` apart, by GAFF2, or an eighth as many by GFN2-xTB
+        where GAFF2 has no parameters; the centre of mass stays where it is."""
+        return self._md(max(2, round(n_frames * self._cheap[2].share)), lag_ps, temperature_k, seed=seed)
+
+    def _md(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> FloatArray:
+        spec, system, pace = self._cheap
+        conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=pace.timestep_ps, seed=seed,
                                 platform="Reference")  # fmt: skip
         frames = np.empty((n_frames, self.scene.n_atoms, 3))
         with Engine(self.scene, conditions, system=system) as engine:
             engine.minimise()
             engine.thermalise()
-            engine.step(round(_SETTLE_PS / _TIMESTEP_PS))
+            engine.step(round(pace.settle_ps / pace.timestep_ps))
             for k in range(n_frames):
-                engine.step(round(lag_ps / _TIMESTEP_PS))
+                engine.step(round(lag_ps / pace.timestep_ps))
                 frames[k] = engine.positions()
         share = self.scene.masses_da / self.scene.masses_da.sum()
         return frames - np.einsum("n,tnk->tk", share, frames)[:, None]
 
     @cached_property
-    def _cheap(self) -> tuple[ForceFieldSpec, Any]:
-        """The forces of hot MD, and their `openmm.System`."""
+    def _cheap(self) -> tuple[ForceFieldSpec, Any, _Pace]:
+        """The forces of hot MD, their `openmm.System`, and how it goes."""
         from md_reference.forces.forcefield import build_system
 
-        spec = ForceFieldSpec("gaff2", "vacuum", None, constrain_hydrogens=False)
-        try:
-            return spec, build_system(self.scene, spec)
-        except PreparationError:
-            spec = ForceFieldSpec(QUANTUM, "vacuum", None, constrain_hydrogens=False)
-            return spec, build_system(self.scene, spec)
+        found = []
+        for name, pace in (("gaff2", _CHEAP), (QUANTUM, _DEAR)):
+            spec = ForceFieldSpec(name, "vacuum", pace.hydrogen_mass_da, constrain_hydrogens=False)
+            try:
+                return spec, build_system(self.scene, spec), pace
+            except PreparationError as error:
+                found.append(error)
+        raise found[-1]
 
 
 def _turned(x: FloatArray, torsion: Any, graph: nx.Graph, angle: float) -> FloatArray:

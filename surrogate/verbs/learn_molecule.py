@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,8 +26,11 @@ def learn_molecule(
 ) -> Path:
     """Learn the molecule that `given` names from `options.level` and return the weights.
 
+    The budget is of wall time for all of it: the molecule's preparation, answers, steps, and the verdict that the
+    caller comes to (`train_verdict.judge_training`).
     Raises InputError for what means nothing here, PreparationError for what the level of theory refuses.
     """
+    began = time.monotonic()
     from md_reference.forces.spec import QUANTUM, at_level
 
     if at_level(options.level, None) != QUANTUM:
@@ -47,11 +51,14 @@ def learn_molecule(
     scene = prepare_scene(given, Preparation(), quiet=options.quiet)
 
     from md_reference.run.teacher import Teacher
+    from surrogate.models.painet.potential.model import PainetPotential
     from surrogate.models.painet.potential.trainer import PotentialTrainer
+    from surrogate.verbs.train_verdict import trial_s
 
     trainer: PotentialTrainer = architecture(POTENTIAL).trainer()
-    trainer.settings(request)  # what is wrong with them is known before anything is computed
+    config = trainer.settings(request).model  # what is wrong with it is known before anything is computed
     with Teacher(scene) as truth:
         if not options.quiet:
             tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
-        return trainer.learn(truth, request, advance)
+        after_s = trial_s(PainetPotential(config), scene)
+        return trainer.learn(truth, request, advance, before_s=time.monotonic() - began, after_s=after_s)

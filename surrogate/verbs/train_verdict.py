@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import statistics
 import tempfile
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,12 +16,15 @@ from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from surrogate.data.weights import TrainingDomain, Weights
+    from surrogate.models.painet.potential.model import PainetPotential
     from surrogate.training.trainer import Trainer
+    from systems.scene import Scene
 
 # Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
 # with a guard that helps.
 USABLE, WITH_HELP = 99.0, 90.0
 _REPLICAS, _CHUNKS, _MOLECULES = 4, 6, 6
+_TIMED_FORCES = 9
 # A validation error that falls by this share over the second half of the last stage has not settled; one this many
 # times the error in training is of frames that the network knows by heart.
 _STILL_FALLS, _BY_HEART = 0.03, 1.5
@@ -97,6 +102,25 @@ def judge_training(path: Path) -> TrainingVerdict:
         word=word,
         advice=() if word == "usable" else tuple(_advice(weights, stages, rolled)),
     )
+
+
+def trial_s(model: PainetPotential, scene: Scene) -> float:
+    """Return about how many seconds the rollout of `judge_training` takes with a potential of a scene, by timing its
+    forces."""
+    import torch
+
+    from surrogate.models.interface import Molecule
+
+    molecule = Molecule.of(scene)
+    frames = torch.tensor(scene.positions_nm)[None].expand(_REPLICAS, -1, -1)
+    model.eval()
+    taken = []
+    for _ in range(1 + _TIMED_FORCES):
+        began = time.monotonic()
+        model.forces(frames, molecule)
+        taken.append(time.monotonic() - began)
+    # The first prepares the molecule.
+    return _CHUNKS * model.n_new * model.steps_per_frame * statistics.median(taken[1:])
 
 
 def write_verdict(path: Path, verdict: TrainingVerdict) -> Path:
@@ -192,6 +216,8 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
     if 2 * rolled.n_with_hydrogen >= rolled.n_stretched and (better := trainer.stabler(weights)) is not None:
         found.append(f"{better.reason} ({better.key} = {json.dumps(better.value)})")
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
+    if weights.model.integrates:
+        n_frames = 0  # it learned from states, which need be no MD
     rows = list(stages.values())[-1] if stages else []
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
     values = series(rows, column)[1] if column else []

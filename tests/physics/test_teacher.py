@@ -62,3 +62,25 @@ def test_what_the_level_refuses_is_known_at_once() -> None:
     scene = scene_from_smiles("CO")
     with pytest.raises(PreparationError, match="unpaired"):
         Teacher(replace(scene, provenance=scene.provenance | {"multiplicity": 2}), workers=1)
+
+
+def test_a_molecule_that_gaff2_does_not_know_moves_by_the_level_itself() -> None:
+    # Borane; methyl, with one electron too many for a pair.
+    for smiles in ("B", "[CH3]"):
+        scene = scene_from_smiles(smiles)
+        with Teacher(scene, workers=1) as teacher:
+            states = teacher.explore(4, (300.0,), seed=0)
+            assert teacher.label(states).failed == 0
+            assert len(teacher.motion(16, 0.01, 300.0, seed=0)) == 2, "an eighth: each step is a dear force"
+        assert states.shape == (4, scene.n_atoms, 3)
+
+
+def test_bad_molecules_are_refused_in_one_line() -> None:
+    for smiles, word in (("[U]", "without the metal"), ("[Na+].[Cl-]", "one molecule")):
+        with pytest.raises(PreparationError, match=word) as caught, Teacher(scene_from_smiles(smiles), workers=1):
+            pass
+        assert "\n" not in str(caught.value)
+    scene = scene_from_smiles("CO")
+    beyond = replace(scene, elements=("Fr", *scene.elements[1:]))
+    with pytest.raises(PreparationError, match="no parameters for Fr"):
+        Teacher(beyond, workers=1)

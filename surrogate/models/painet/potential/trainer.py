@@ -37,6 +37,8 @@ from systems.scene import Scene
 _ASKING_SHARE = 0.6
 # Most of the budget that answers may take.
 _ANSWERING_SHARE = 0.3
+# Least share of it that is for steps, whatever stands before and after them.
+_LEARNING_SHARE = 0.3
 # A sample is learned by a member with this chance.
 _BAG = 0.75
 # Own rollouts: replicas, steps of a ps/1000, and frames kept of each.
@@ -73,7 +75,8 @@ class Truth(Protocol):
 @dataclass(frozen=True)
 class PotentialTraining:
     """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the mean
-    absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned.
+    absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned. `budget_s`:
+    of wall time for all that it takes, from the first states to the weights.
     `temperatures_k`: of hot MD and own rollouts. `energy_weight`: of energies beside forces in the loss."""
 
     budget_s: float | None = None
@@ -122,7 +125,7 @@ class Learner:
             self.samples = Samples.load(self.path, self.key)
         else:
             self.rounds_path.unlink(missing_ok=True)
-        self._started = time.monotonic()
+        self._budget_s, self._started = config.budget_s, time.monotonic()
         self._asking = True
         self._label_s = 0.0
         if len(self.samples):
@@ -137,9 +140,13 @@ class Learner:
         """Share of the budget that is spent."""
         c = self.config
         shares = [0.0 if c.steps is None else self._steps / c.steps]
-        if c.budget_s is not None:
-            shares.append((self._spent_s + time.monotonic() - self._started) / c.budget_s)
+        if self._budget_s is not None:
+            shares.append((self._spent_s + time.monotonic() - self._started) / self._budget_s)
         return max(shares)
+
+    def begin(self, budget_s: float | None) -> None:
+        """Start the clock of the steps, which have so long in all, those before a resumption counted."""
+        self._budget_s, self._started = budget_s, time.monotonic()
 
     def loss(self, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean square error of the members' forces, in units of the typical force, and of their energies; each sample
@@ -190,7 +197,7 @@ class Learner:
         have = len(self.samples)
         if due < min(have * growth, c.most) or have >= c.most:
             return
-        if c.budget_s is not None and self._label_s > _ANSWERING_SHARE * c.budget_s:
+        if self._budget_s is not None and self._label_s > _ANSWERING_SHARE * self._budget_s:
             self._asking = False
             return
         self._ask(round(due) - have, generator)
@@ -272,18 +279,27 @@ def samples_path(out: Path) -> Path:
 
 def learn_potential(
     truth: Truth, out: Path, model_config: PotentialConfig, config: PotentialTraining, *, resume: bool = False,
-    progress: ProgressFn | None = None,
+    progress: ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
-    and the error of forces against evaluations, round by round (NAME.rounds.csv)."""
+    and the error of forces against evaluations, round by round (NAME.rounds.csv).
+
+    Of the budget `before_s` are spent already, and `after_s` are wanted by whoever called, for later.
+    """
+    began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
     log, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.potential.train.safetensors")
     if not resume:
         for path in (log, state, samples_path(out)):
             path.unlink(missing_ok=True)
+    moving = truth.motion(_MOVING_FRAMES, model_config.lag_ps, model_config.temperature_k, seed=config.seed)
     learner = Learner(model, truth, config, out, resume=resume)
-    stage = StageConfig("potential", config.batch, config.learning_rate, config.budget_s, config.steps,
+    budget_s = config.budget_s
+    if budget_s is not None:
+        left_s = budget_s - (time.monotonic() - began) - after_s
+        budget_s = max(left_s, _LEARNING_SHARE * budget_s)
+    stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
                         seed=config.seed, bf16=False, validate_every_s=config.validate_every_s)  # fmt: skip
 
     def advance(name: str, share: float, metrics: dict[str, float]) -> None:
@@ -291,10 +307,11 @@ def learn_potential(
             progress(_line(learner), share, metrics)
 
     place = StagePlace(state, log, torch.device("cpu"), resume)
+    learner.begin(budget_s)
     with _one_thread():
         spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
     errors = learner.errors()
-    domain = domain_of(truth, learner.samples, model_config, config.seed)
+    domain = domain_of(truth.scene, learner.samples, moving, model_config)
     # No MD of the truth was made: what it answered is the reference.
     origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
     found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in errors.items()}
@@ -322,23 +339,22 @@ def _line(learner: Learner) -> str:
     return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
 
 
-def domain_of(truth: Truth, samples: Samples, config: PotentialConfig, seed: int) -> TrainingDomain:
-    """Return what the weights cover: the truth's quieter samples say what frames look like, cheap MD of the molecule
-    how far they move from one to the next."""
-    moving = truth.motion(_MOVING_FRAMES, config.lag_ps, config.temperature_k, seed=seed)
+def domain_of(scene: Scene, samples: Samples, moving: Any, config: PotentialConfig) -> TrainingDomain:
+    """Return what the weights cover: the truth's quieter samples say what frames look like, frames of cheap MD,
+    `moving` (n, n_atoms, 3), how far they move from one to the next."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
         "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": False,
     }  # fmt: skip
-    frames = TrainingFrames(truth.scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
+    frames = TrainingFrames(scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
                             conditions, ())  # fmt: skip
     quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
-    looks = limits_from_frames(truth.scene, quiet, quiet)
+    looks = limits_from_frames(scene, quiet, quiet)
     moves = training_domain(frames)
     assert moves.limits is not None
     limits = replace(looks, **{key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")})
-    geometry = geometry_from_frames(truth.scene, quiet)
+    geometry = geometry_from_frames(scene, quiet)
     return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict())
 
 
@@ -357,12 +373,13 @@ class PotentialTrainer(Trainer):
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         raise _no_trajectories(request)
 
-    def learn(self, truth: Truth, request: TrainingRequest, advance: Callable[[str, float], None]) -> Path:
-        """Learn a molecule from its truth, as the request has it, and return the weights."""
+    def learn(self, truth: Truth, request: TrainingRequest, advance: Callable[[str, float], None], *,
+              before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
+        """Learn a molecule from its truth, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
         return learn_potential(
             truth, request.out, settings.model, settings.training, resume=request.resume,
-            progress=lambda stage, share, metrics: advance(stage, share),
+            progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
 
 

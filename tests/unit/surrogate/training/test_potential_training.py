@@ -13,6 +13,7 @@ import torch
 
 from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
+from surrogate.models.painet.potential import trainer
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
@@ -88,6 +89,33 @@ def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
     chunk = model.next_chunk(torch.tensor(truth.scene.positions_nm[None, None]).float(), molecule, noise)
     lengths = (chunk.frames_nm[..., 0, :] - chunk.frames_nm[..., 1, :]).norm(dim=-1)
     assert ((lengths - truth.pairs[0][2]).abs() < 0.05).all()
+
+
+def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock of its own: a label takes a second, cheap MD a tenth of one a frame, a step nothing."""
+    clock, stages = [0.0], []
+
+    class Slow(Springs):
+        def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any:
+            clock[0] += 0.1 * n_frames
+            return super().motion(n_frames, lag_ps, temperature_k, seed=seed)
+
+        def label(self, positions_nm: Any) -> Answers:
+            clock[0] += len(positions_nm)
+            return super().label(positions_nm)
+
+    def stage(model: Any, config: Any, *_: Any, **__: Any) -> float:
+        stages.append(config)
+        return 0.0
+
+    monkeypatch.setattr(trainer.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(trainer, "run_stage", stage)
+    config = replace(QUICK, steps=None, budget_s=200.0)
+    learn_potential(Slow(), tmp_path / "a.safetensors", SMALL, config, before_s=15.0, after_s=20.0)
+    # 15 before, 400 frames of MD, 24 first labels, 20 for what comes after.
+    assert stages[0].budget_s == pytest.approx(200.0 - 15.0 - 40.0 - 24.0 - 20.0)
+    learn_potential(Slow(), tmp_path / "b.safetensors", SMALL, replace(config, budget_s=90.0), before_s=15.0)
+    assert stages[1].budget_s == pytest.approx(0.3 * 90.0), "a share is for steps however short the budget"
 
 
 def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> None:
