@@ -14,13 +14,14 @@
 extern "C" {
 
 struct System {
-    int32_t n_atoms, n_bonds, n_angles, n_torsions, n_constraints, born;
+    int32_t n_atoms, n_bonds, n_angles, n_torsions, n_constraints, born, n_biased;
     const int32_t *bonds;         // [n_bonds][2]
     const float *bond_terms;      // [n_bonds][2]: length, force constant
     const int32_t *angles;        // [n_angles][3]
     const float *angle_terms;     // [n_angles][2]: angle, force constant
     const int32_t *torsions;      // [n_torsions][4]
     const float *torsion_terms;   // [n_torsions][13]: constant, then of n = 1..6 the factors of cos and of sin
+    const float *biases;          // [n_biased][2][W]: of the first torsions, each copy's own factors of cos and of sin
     const float *pairs;           // [n(n-1)/2][4], i < j: Coulomb, C12, C6, Born
     const float *atoms;           // [n_atoms][6]: 1/mass, thermal speed, radius, radius - offset, scaled radius, Born self
     const int32_t *constraints;   // [n_constraints][2]
@@ -77,6 +78,8 @@ static void torsions(const System *s, const vec3 x, vec3 f, double *energy) {
         const int32_t *q = s->torsions + 4 * t;
         const int i = q[0], j = q[1], k = q[2], m = q[3];
         const float *p = s->torsion_terms + 13 * t;
+        static const float none[2 * W] = {0};
+        const float *own = t < s->n_biased ? s->biases + 2 * W * t : none;
         LANES {
             const float ax = x[j][0][l] - x[i][0][l], ay = x[j][1][l] - x[i][1][l], az = x[j][2][l] - x[i][2][l];
             const float bx = x[k][0][l] - x[j][0][l], by = x[k][1][l] - x[j][1][l], bz = x[k][2][l] - x[j][2][l];
@@ -88,7 +91,7 @@ static void torsions(const System *s, const vec3 x, vec3 f, double *energy) {
             const float uw = sqrtf(u2 * w2);
             const float c = (ux * wx + uy * wy + uz * wz) * uw;
             const float sn = bn * (ax * wx + ay * wy + az * wz) * uw;
-            float cn = 1.0f, sm = 0.0f, slope = 0.0f, sum = p[0];
+            float cn = 1.0f, sm = 0.0f, slope = own[W + l] * c - own[l] * sn, sum = p[0] + own[l] * c + own[W + l] * sn;
             for (int n = 1; n <= 6; n++) {
                 const float next = cn * c - sm * sn;
                 sm = sm * c + cn * sn;

@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import tempfile
 from collections import defaultdict
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,16 +39,17 @@ _PERIODS = 6
 _FORCE_TOLERANCE = 2e-4
 _ENERGY_TOLERANCE_KJ_MOL = 0.02
 _CHECKED_AT = 0.002
+_CENTRED_STEPS = 500
 
 
 class LanesUnavailableError(SimulationError):
     """This machine cannot compile the program, or it does not know a term of the System."""
 
 
-_COUNTS = ("n_atoms", "n_bonds", "n_angles", "n_torsions", "n_constraints", "born")
+_COUNTS = ("n_atoms", "n_bonds", "n_angles", "n_torsions", "n_constraints", "born", "n_biased")
 _ARRAYS = (
-    "bonds", "bond_terms", "angles", "angle_terms", "torsions", "torsion_terms", "pairs", "atoms", "constraints",
-    "lengths",
+    "bonds", "bond_terms", "angles", "angle_terms", "torsions", "torsion_terms", "biases", "pairs", "atoms",
+    "constraints", "lengths",
 )  # fmt: skip
 _NUMBERS = ("surface", "timestep", "keep", "noise")
 
@@ -102,11 +104,19 @@ class Lanes:
 
     `system`: an `openmm.System` without a box, of harmonic bonds and angles, periodic torsions, NonbondedForce without
     a cutoff and, if any, GBSAOBCForce; anything else raises LanesUnavailableError. Friction 0 is NVE (leapfrog).
-    Positions and velocities are `(n_lanes, n_atoms, 3)` in nm and nm/ps.
+    Positions and velocities are `(n_lanes, n_atoms, 3)` in nm and nm/ps. `biased`: torsions, each four atoms, that
+    `set_bias` may hold in each copy at another angle.
     """
 
     def __init__(
-        self, system: Any, *, temperature_k: float, friction_per_ps: float, timestep_ps: float, seed: int
+        self,
+        system: Any,
+        *,
+        temperature_k: float,
+        friction_per_ps: float,
+        timestep_ps: float,
+        seed: int,
+        biased: Sequence[Sequence[int]] = (),
     ) -> None:
         self._program = _program()
         self.n_lanes = n_lanes()
@@ -116,6 +126,11 @@ class Lanes:
         terms = _terms(system)
         keep = math.exp(-friction_per_ps * timestep_ps)
         terms["atoms"][:, 0] = 1.0 / self.masses_da
+        # Biased torsions come first; the molecule's own terms of the same four atoms stand apart.
+        for name, rows in (("torsions", list(biased)), ("torsion_terms", np.zeros((len(biased), 1 + 2 * _PERIODS)))):
+            given = terms[name]
+            terms[name] = np.concatenate([np.reshape(rows, (-1, given.shape[1])), given]).astype(given.dtype)
+        terms["biases"] = np.zeros((len(biased), 2, self.n_lanes), dtype=np.float32)
         terms["atoms"][:, 1] = np.sqrt(GAS_CONSTANT_KJ_MOL_K * temperature_k / self.masses_da)
         # The program reads these arrays in place.
         self._kept = {name: np.ascontiguousarray(terms[name]) for name in _ARRAYS}
@@ -127,6 +142,7 @@ class Lanes:
             n_torsions=len(terms["torsions"]),
             n_constraints=len(terms["constraints"]),
             born=int(terms["born"]),
+            n_biased=len(biased),
             surface=float(terms["surface"]),
             timestep=timestep_ps,
             keep=keep,
@@ -181,6 +197,12 @@ class Lanes:
         """Set velocities `(n_lanes, n_atoms, 3)` nm/ps."""
         self._velocities = _inwards(velocities_nm_ps)
 
+    def set_bias(self, place: int, centres_rad: npt.ArrayLike, stiffness_kj_mol: float) -> None:
+        """Add -stiffness cos(angle - centre) of the biased torsion at this place to the energy of each copy;
+        `centres_rad` (n_lanes,)."""
+        centres = np.asarray(centres_rad, dtype=np.float64)
+        self._kept["biases"][place] = -stiffness_kj_mol * np.stack([np.cos(centres), np.sin(centres)])
+
     def thermalise(self) -> None:
         """Draw velocities from the Maxwell-Boltzmann distribution; the first step removes those along rigid bonds."""
         speed = np.sqrt(GAS_CONSTANT_KJ_MOL_K * self.temperature_k / self.masses_da)[:, None]
@@ -188,17 +210,20 @@ class Lanes:
 
     def step(self, n_steps: int) -> None:
         """Integrate. Raises SimulationError when a constraint cannot be met, or a copy is hotter than chance allows."""
-        met = self._program.step(
-            ctypes.byref(self._system), self._positions.ctypes.data, self._velocities.ctypes.data,
-            self._random.ctypes.data, n_steps,
-        )  # fmt: skip
-        if met:
-            raise SimulationError("a copy of the molecule blew up: its constraints cannot be met")
-        if not np.isfinite(self._positions).all() or self.temperatures_k().max() > hottest_k(
-            self.temperature_k, self.n_dof
-        ):
+        for done in range(0, n_steps, _CENTRED_STEPS):
+            met = self._program.step(
+                ctypes.byref(self._system),
+                self._positions.ctypes.data,
+                self._velocities.ctypes.data,
+                self._random.ctypes.data,
+                min(_CENTRED_STEPS, n_steps - done),
+            )
+            if met:
+                raise SimulationError("a copy of the molecule blew up: its constraints cannot be met")
+            self.set_positions(self.positions_nm)
+        hottest = hottest_k(self.temperature_k, self.n_dof)
+        if not (np.isfinite(self._positions).all() and self.temperatures_k().max() < hottest):
             raise SimulationError("a copy of the molecule blew up: it is hotter than the bath can make it")
-        self.set_positions(self.positions_nm)
 
     def _centred(self, positions_nm: FloatArray) -> FloatArray:
         """Far from the origin, where copies wander, single precision is too coarse for constraints."""
@@ -274,7 +299,8 @@ def _terms(system: Any) -> dict[str, Any]:
         elif not isinstance(force, openmm.CMMotionRemover):
             raise LanesUnavailableError(f"molecular dynamics in lanes knows no {kind}")
     constraints = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    terms["torsions"], terms["torsion_terms"] = list(torsions), list(torsions.values())
+    terms["torsions"] = np.reshape(list(torsions), (-1, 4))
+    terms["torsion_terms"] = np.reshape(list(torsions.values()), (-1, 1 + 2 * _PERIODS))
     terms["constraints"] = [(c[0], c[1]) for c in constraints]
     terms["lengths"] = [c[2]._value for c in constraints]
     # Bonds between atoms whose distance is a constraint exert no force.

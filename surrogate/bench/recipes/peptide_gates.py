@@ -33,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
+from surrogate.bench.recipes.peptide_energies import known_energies
 from surrogate.bench.recipes.peptide_list import training_peptides
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from systems.chemistry.validity import Geometry
@@ -111,15 +112,6 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
         "ten steps against one": joint_distance(torsions(test.scene, short), torsions(test.scene, long)),
         "halves of MD": joint_distance(torsions(test.scene, known[::2, 1]), torsions(test.scene, known[1::2, 1])),
     }
-
-
-def known_energies(folder: Path) -> dict[str, float]:
-    """Return the free energies of phi > 0, kT, that `free-energy` left in a folder, by residue type."""
-    found = {}
-    for path in sorted(folder.glob("ACE-*-NME-free-energy.json")):
-        record = json.loads(path.read_text())
-        found[record["sequence"].split("-")[1]] = (record["metadynamics 1"] + record["metadynamics 2"]) / 2
-    return found
 
 
 def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
