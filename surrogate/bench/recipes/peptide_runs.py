@@ -84,7 +84,7 @@ def _seed_of(peptide: Peptide, k: int) -> int:
 
 def _built(scene: Scene, peptide: Peptide) -> Seeds:
     """Return the built structure, its energy minimised, as often as there are runs."""
-    with Engine(scene, MDConfig(force=_SPEC, platform=_PLATFORM)) as engine:
+    with Engine(scene, MDConfig(time_ps=1.0, force=_SPEC, platform=_PLATFORM)) as engine:
         engine.minimise()
         positions = engine.positions()
     return Seeds(np.repeat(positions[None], peptide.n_starts, axis=0), ("built",) * peptide.n_starts)

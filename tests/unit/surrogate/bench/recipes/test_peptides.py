@@ -101,6 +101,15 @@ def test_runs_start_at_their_seeds_and_are_made_once(tmp_path: Path, monkeypatch
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
+def test_runs_for_testing_start_from_the_built_structure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peptide_runs, "TEST_DISCARD_PS", 1.0)
+    alanine = replace(training_peptides()[0], n_starts=2, time_ps=2.0)
+    peptide_runs.simulate_peptide(tmp_path, alanine, math.inf, seeded=False)
+    with open_trajectory(peptide_runs.run_path(tmp_path, 1)) as reader:
+        assert reader.record["start"] == {"group": "built", "index": 1, "discarded_ps": 1.0}
+    assert not (tmp_path / "seeds.npz").exists()
+
+
 def test_what_is_tested_is_never_made_for_training(tmp_path: Path) -> None:
     order = peptide_runs._order()
     assert len(order) == len(training_peptides()) + len(held_out_peptides())
