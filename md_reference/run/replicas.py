@@ -18,11 +18,9 @@ from md_reference.run.parent_watch import end_with_parent
 from md_reference.run.plan import line_of_run
 from md_reference.run.platforms import measured_platform
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
-from systems.errors import InputError, SimulationError, SurromdError
+from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
-
-_MOST_REPLICAS = 10_000
 
 
 @dataclass(frozen=True)
@@ -32,15 +30,6 @@ class _Board:
     done: Any
     equilibrated: Any
     errors: Any
-
-
-def replica_paths(out: Path, n_replicas: int) -> list[Path]:
-    """Return `out` itself for one replica, else NAME_r0.h5, NAME_r1.h5, ... Raises InputError for too many."""
-    if n_replicas == 1:
-        return [out]
-    if n_replicas > _MOST_REPLICAS:
-        raise InputError(f"{n_replicas:.4g} replicas are too many, {_MOST_REPLICAS} at most; use a campaign for more.")
-    return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
 
 
 def simulate_replicas(

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import shipped_weights
-from surrogate.data.weights import load_weights
-from surrogate.sampling.domain import match_domain
+from surrogate.data.weights import load_weights, read_header
+from surrogate.models.peptides.model import PeptideConfig
+from surrogate.models.registry import architecture
+from surrogate.sampling.domain import match_known
 from systems.errors import OutOfDomainError
 
 if TYPE_CHECKING:
@@ -18,17 +20,21 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
     """Return the shipped weights that cover a scene, and why these.
 
     Weights that were trained on the molecule come before those that know molecules like it, and those that draw frames
-    from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks.
+    from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks. Only those
+    that cover it are loaded; of the others their headers are read.
     Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
     """
     found, refusals = [], []
     for name, path in shipped_weights().items():
-        weights = load_weights(path)
+        header = read_header(path)
+        config = architecture(header.arch).config(header.config)
+        peptides = config if isinstance(config, PeptideConfig) else None
         try:
-            match = match_domain(scene, weights, temperature_k=temperature_k)
+            match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
         except OutOfDomainError as error:
             refusals.append((len(error.args[0].split("; ")), name, str(error)))
             continue
+        weights = load_weights(path)
         found.append((not match.seen, weights.model.carries_velocities, name, weights))
     if not found:
         reason = min(refusals)[2] if refusals else "none are shipped."

@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     # Sampling and training know nothing of each other at run time: the api hands the weights over.
     from surrogate.data.weights import TrainingDomain, Weights
     from surrogate.models.interface import Surrogate
+    from surrogate.models.peptides.model import PeptideConfig
 
 __all__ = [
-    "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain", "match_scene",
+    "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain",
+    "match_known", "match_scene",
     "torsion_environments",
 ]  # fmt: skip
 # A model that does not take the temperature as an input has one; a thermostat is set more finely than this by nobody.
@@ -63,7 +65,7 @@ def find_deviations(
     connectivity, stereo, the starting structure (by the validity of the training reference's frames) and the
     temperature, where one is asked for.
     """
-    return _compare(scene, domain, model, temperature_k).deviations
+    return _compare(scene, domain, None if model is None else _peptides(model), temperature_k).deviations
 
 
 def match_domain(
@@ -75,7 +77,17 @@ def match_domain(
     stereoisomer, a strained start and another temperature can, and the rollout's record says so.
     Raises OutOfDomainError, which says how the scene differs, what the weights cover and what to run instead.
     """
-    found = _compare(scene, weights.domain, weights.model, temperature_k)
+    return match_known(scene, weights.domain, weights.path.name, _peptides(weights.model),
+                       temperature_k=temperature_k, force=force)  # fmt: skip
+
+
+def match_known(
+    scene: Scene, domain: TrainingDomain, name: str, peptides: PeptideConfig | None = None, *,
+    temperature_k: float | None = None, force: bool = False,
+) -> DomainMatch:  # fmt: skip
+    """`match_domain` for weights that are not loaded, of which a file's header tells all that counts: `peptides` are
+    the settings of a model that knows peptides by their residues."""
+    found = _compare(scene, domain, peptides, temperature_k)
     deviations = found.deviations
     barred = [d for d in deviations if not d.forcible]
     if not barred and (force or not deviations):
@@ -87,8 +99,7 @@ def match_domain(
         else "Run `surromd reference` for it instead, or roll with `force=True`: the trajectory is then marked."
     )
     raise OutOfDomainError(
-        f"{weights.path.name} does not cover {scene.name}: {reasons}. These weights cover "
-        f"{weights.domain.describe()}. {advice}"
+        f"{name} does not cover {scene.name}: {reasons}. These weights cover {domain.describe()}. {advice}"
     )
 
 
@@ -129,13 +140,19 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     return match_domain(scene, weights).order
 
 
-def _compare(scene: Scene, domain: TrainingDomain, model: Surrogate | None, temperature_k: float | None) -> DomainMatch:
+def _peptides(model: Surrogate) -> PeptideConfig | None:
+    return model.config if model.knows_chains else None
+
+
+def _compare(
+    scene: Scene, domain: TrainingDomain, peptides: PeptideConfig | None, temperature_k: float | None
+) -> DomainMatch:
     own, beyond = cover(scene, domain)
     seen = not domain.transferable or any(own.scene is member.scene for member in domain.members)
     found, order = list(beyond), np.arange(0)
     nearness = ""
-    if not seen and model is not None and model.knows_chains:
-        own, order, beyond = cover_peptide(scene, domain, model.config)
+    if not seen and peptides is not None:
+        own, order, beyond = cover_peptide(scene, domain, peptides)
         found = list(beyond)
         new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
         nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"

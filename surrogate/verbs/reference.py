@@ -52,7 +52,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     `systems.source.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
-    from md_reference.run.replicas import replica_paths, simulate_replicas
+    from md_reference.run.replicas import simulate_replicas
+    from systems.trajectory.claim import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)

@@ -48,7 +48,7 @@ def rollout(
     Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
     guard cannot bring a chunk through), StorageError.
     """
-    from md_reference.run.replicas import replica_paths
+    from systems.trajectory.claim import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
     check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)

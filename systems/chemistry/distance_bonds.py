@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm
-from systems.files.outside import check_density
+from systems.chemistry.geometry import near_pairs
 from systems.scene import Scene
 
 _TOLERANCE_NM = 0.04
@@ -41,13 +41,9 @@ def with_bonds_by_distance(scene: Scene) -> Scene:
 
 def bonds_by_distance(elements: Sequence[str], positions_nm: npt.ArrayLike) -> npt.NDArray[np.int64]:
     """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm; hydrogen bonds to its nearest."""
-    from scipy.spatial import cKDTree
-
     x = np.asarray(positions_nm, dtype=np.float64)
     radii = np.array([covalent_radius_nm(e) for e in elements])
-    reach, tree = 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM, cKDTree(x)
-    check_density(tree, reach, "the molecule")
-    near = tree.query_pairs(reach, output_type="ndarray")
+    near = near_pairs(x, 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM, "the molecule")
     length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
     close = length < radii[near[:, 0]] + radii[near[:, 1]] + _TOLERANCE_NM
     best: dict[int, tuple[float, int]] = {}

@@ -8,9 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError
+from systems.files.outside import check_density
 
 FloatArray = npt.NDArray[np.floating[Any]]
 
+# Up to so many points all pairs are looked at: sooner done than the library of trees is imported.
+_FEW_POINTS = 300
 _NEWTON_STEPS = 60
 _DEGENERATE = 1e-5
 
@@ -32,6 +35,24 @@ def torsion(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:
     cosine = np.einsum("nkx,nkx->nk", first, second)
     angles: FloatArray = np.arctan2(sine, cosine)
     return angles[0] if single else angles
+
+
+def near_pairs(points: npt.ArrayLike, reach: float, what: str = "") -> npt.NDArray[np.int64]:
+    """Return the pairs i < j `(n, 2)` of points `(n_points, 3)` nearer to each other than `reach`, in ascending order.
+
+    Raises PreparationError, which names `what`, where they stand so close that atoms must coincide.
+    """
+    x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(x) <= _FEW_POINTS:
+        i, j = np.triu_indices(len(x), 1)
+        near = ((x[i] - x[j]) ** 2).sum(axis=1) <= reach**2
+        return np.stack([i[near], j[near]], axis=1)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(x)
+    check_density(tree, reach, what)
+    pairs: npt.NDArray[np.int64] = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2).astype(np.int64)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
 def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatArray:

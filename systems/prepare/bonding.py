@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.components import component, known_template
 from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
+from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import PreparationError, listed
-from systems.files.outside import check_density
 from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.missing_atoms import note_missing
 from systems.prepare.read.records import AtomRecord
@@ -42,12 +43,8 @@ def find_bonds(
     (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide and hydrogens far from
     everything.
     """
-    from scipy.spatial import cKDTree
-
     x = np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0
-    tree = cKDTree(x)
-    check_density(tree, 0.35, "the structure")
-    near = tree.query_pairs(0.35, output_type="ndarray").reshape(-1, 2)
+    near = near_pairs(x, 0.35, "the structure")
     length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
         if d < _COINCIDENT_NM:
@@ -246,11 +243,9 @@ def _hydrogen_bonds_to_parents(
     ions: set[int],
 ) -> set[tuple[int, int]]:
     """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing."""
-    from scipy.spatial import cKDTree
-
     bonded = {i for pair in bonds for i in pair}
     heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in ions], dtype=np.int64)
-    tree = cKDTree(x[heavy]) if len(heavy) else None
+    tree: Any = None
     found = set()
     for i, atom in enumerate(atoms):
         if atom.element != "H" or i in bonded:
@@ -260,7 +255,11 @@ def _hydrogen_bonds_to_parents(
         if i not in free and len(own):
             gaps = np.linalg.norm(x[own] - x[i], axis=1)
             parent, distance = int(own[gaps.argmin()]), float(gaps.min())
-        if distance > _HYDROGEN_NM and tree is not None:
+        if distance > _HYDROGEN_NM and len(heavy):
+            if tree is None:  # few structures need it, and it is slow to import
+                from scipy.spatial import cKDTree
+
+                tree = cKDTree(x[heavy])
             gap, k = tree.query(x[i])
             parent, distance = int(heavy[k]), float(gap)
         if distance > _HYDROGEN_NM:

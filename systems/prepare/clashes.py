@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.geometry import near_pairs
 from systems.errors import PreparationError
 from systems.prepare.read.records import AtomRecord
 from systems.prepare.structure import atom_label
@@ -22,15 +23,13 @@ def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) ->
 
     Raises PreparationError for atoms that stand in each other.
     """
-    from scipy.spatial import cKDTree
-
     neighbours: dict[int, set[int]] = {}
     for i, j in bonds.tolist():
         neighbours.setdefault(i, set()).add(j)
         neighbours.setdefault(j, set()).add(i)
     x = np.array([a.position_angstrom for a in atoms])
     found = []
-    for i, j in cKDTree(x).query_pairs(max(_CLOSE_ANGSTROM)):
+    for i, j in near_pairs(x, max(_CLOSE_ANGSTROM), "the structure").tolist():
         gap = float(np.linalg.norm(x[i] - x[j]))
         kind = sum(atoms[k].element == "H" for k in (i, j))
         if gap < _CLOSE_ANGSTROM[kind] and not _is_near(neighbours, i, j):

@@ -69,11 +69,11 @@ def settle_solvent(
 
 def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:
     """Those of the ions that no N, O or S of the solute holds."""
-    from scipy.spatial import cKDTree
-
     donors = [atoms[i].position_angstrom for i in solute if atoms[i].element in ("N", "O", "S")]
     if not ions or not donors:
         return set(ions)
+    from scipy.spatial import cKDTree
+
     gap, _ = cKDTree(np.array(donors)).query(np.array([atoms[i].position_angstrom for i in ions]))
     return {i for i, d in zip(ions, np.atleast_1d(gap).tolist(), strict=True) if d > _BOUND_ANGSTROM}
 

@@ -1,4 +1,4 @@
-"""Lock on an output file: one process writes it at a time."""
+"""Output files: their names, and a lock on each, so that one process writes it at a time."""
 
 from __future__ import annotations
 
@@ -10,10 +10,20 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from systems.errors import TrajectoryError
+from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import storage_error
 
 _ASK_EVERY_S = 0.5
+_MOST_REPLICAS = 10_000
+
+
+def replica_paths(out: Path, n_replicas: int) -> list[Path]:
+    """Return `out` itself for one replica, else NAME_r0.h5, NAME_r1.h5, ... Raises InputError for too many."""
+    if n_replicas == 1:
+        return [out]
+    if n_replicas > _MOST_REPLICAS:
+        raise InputError(f"{n_replicas:.4g} replicas are too many, {_MOST_REPLICAS} at most; use a campaign for more.")
+    return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
 
 
 class Claim:

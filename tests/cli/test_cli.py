@@ -17,6 +17,8 @@ import pytest
 from command_line import refused, run
 from surrogate import api
 from systems.errors import SurromdError
+from systems.library.named_scenes import load
+from systems.trajectory.topology_file import pdb_text
 
 COMMANDS = ["demo", "run", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli.main"]
@@ -41,6 +43,18 @@ def test_starting_loads_no_heavy_library() -> None:
     code = f"import sys, surrogate.cli.main, surrogate; print([m for m in {HEAVY} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_rollout_of_a_pdb_file_loads_no_library_that_it_does_not_need(tmp_path: Path) -> None:
+    (tmp_path / "my.pdb").write_text(pdb_text(load("alanine-dipeptide")))
+    arguments = ["rollout", str(tmp_path / "my.pdb"), "--time", "1ps", "-o", str(tmp_path / "out.h5"), "--quiet"]
+    unneeded = ("openmm", "pdbfixer", "rdkit", "scipy", "mdtraj", "MDAnalysis", "matplotlib", "torch._dynamo")
+    code = (
+        f"import atexit, sys; atexit.register(lambda: print([m for m in {unneeded} if m in sys.modules]))\n"
+        f"from surrogate.cli.main import main; sys.argv = ['surromd', *{arguments}]; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("command", COMMANDS)

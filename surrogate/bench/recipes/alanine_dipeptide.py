@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from md_reference.run.replicas import replica_paths
 from surrogate import api
+from systems.trajectory.claim import replica_paths
 from systems.units import parse_wall_s
 
 if TYPE_CHECKING:

@@ -85,8 +85,9 @@ def make_reference(folder: Path, name: str, runs: Runs) -> list[Path]:
     """Run what is missing: ff14SB, OBC2, flexible bonds, natural masses, velocity Verlet, frames 1 fs apart."""
     from md_reference.forces.spec import ForceFieldSpec
     from md_reference.run.config import MDConfig
-    from md_reference.run.replicas import replica_paths, simulate_replicas
+    from md_reference.run.replicas import simulate_replicas
     from systems.library.named_scenes import load
+    from systems.trajectory.claim import replica_paths
 
     config = MDConfig(
         time_ps=RUN_PS,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from systems.chemistry.geometry import near_pairs
 from systems.errors import InputError, PreparationError
 from systems.prepare.read.file_text import read_text, suffix_of
 from systems.prepare.read.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
@@ -190,12 +191,10 @@ def _is_drawing(molecule: Any, conformer: Any) -> bool:
 
 
 def _refuse_coincident(molecule: Any) -> None:
-    from scipy.spatial import cKDTree
-
     positions = np.array(molecule.GetConformer().GetPositions())
-    pairs = cKDTree(positions).query_pairs(0.3)
-    if pairs:
-        i, j = sorted(pairs)[0]
+    pairs = near_pairs(positions, 0.3, "the molecule")
+    if len(pairs):
+        i, j = pairs[0].tolist()
         symbols = [molecule.GetAtomWithIdx(k).GetSymbol() for k in (i, j)]
         raise PreparationError(
             f"atoms {i + 1} ({symbols[0]}) and {j + 1} ({symbols[1]}) stand on one point; correct the coordinates."

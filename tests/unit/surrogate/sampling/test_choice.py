@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from surrogate.data.weights import Weights, load_weights
+from surrogate.sampling import choice
 from surrogate.sampling.choice import choose_weights
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load
@@ -31,3 +35,15 @@ def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> Non
 def test_another_temperature_is_covered_by_none() -> None:
     with pytest.raises(OutOfDomainError, match="temperature"):
         choose_weights(load("alanine-dipeptide"), temperature_k=350.0)
+
+
+def test_only_weights_that_cover_the_scene_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+
+    def load_one(path: Path) -> Weights:
+        loaded.append(path.stem)
+        return load_weights(path)
+
+    monkeypatch.setattr(choice, "load_weights", load_one)
+    choose_weights(load("alanine-dipeptide"))
+    assert sorted(loaded) == ["alanine-dipeptide", "alanine-dipeptide-painet"]

@@ -7,9 +7,10 @@ from time import process_time
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from systems.chemistry.geometry import signed_volumes, superpose, superposition, torsion
+from systems.chemistry.geometry import near_pairs, signed_volumes, superpose, superposition, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 from systems.scene import Scene
@@ -139,3 +140,10 @@ def test_superposition_is_fast(alanine_dipeptide: Scene) -> None:
     start = process_time()
     superposition(frames, template)
     assert len(frames) / (process_time() - start) > 30_000  # of processor time; about 500,000 a second
+
+
+@pytest.mark.parametrize("n_points", [0, 1, 200, 301])
+def test_near_pairs_are_those_of_a_tree_however_they_are_found(n_points: int) -> None:
+    points = np.random.default_rng(n_points).uniform(size=(n_points, 3))
+    expected = sorted(cKDTree(points).query_pairs(0.2)) if n_points else []
+    assert [tuple(pair) for pair in near_pairs(points, 0.2).tolist()] == expected
