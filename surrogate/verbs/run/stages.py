@@ -65,7 +65,7 @@ def _md_stage(name: str, place: str, seed: int, to: str) -> StageOf:
     """Return a stage of MD into `place`, replicas on all cores."""
 
     def outs(site: Site, record: RunRecord) -> list[Path]:
-        from md_reference.run.replicas import replica_paths
+        from systems.trajectory.claim import replica_paths
 
         suffix = f".{site.options.format}" if to == "trajectory" else ".h5"
         return replica_paths(site.folder / f"{place}{suffix}", _settled(record)[0].cores)
@@ -147,7 +147,7 @@ def _trained(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 def _rolled_paths(site: Site) -> list[Path]:
-    from md_reference.run.replicas import replica_paths
+    from systems.trajectory.claim import replica_paths
 
     return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", REPLICAS)
 
