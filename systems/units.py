@@ -10,6 +10,7 @@ from typing import Any, overload
 
 from systems.errors import UnitError
 
+GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
 # What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
 Quantity = float | str
 

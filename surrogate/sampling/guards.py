@@ -17,6 +17,7 @@ from systems.chemistry.validity import (
     NOT_FINITE,
     PLANARITY,
     STILL,
+    UNSURE,
     Geometry,
     check_frames,
 )
@@ -28,7 +29,7 @@ FloatArray = npt.NDArray[np.floating[Any]]
 Flags = npt.NDArray[np.uint16]
 
 # Any of these bits, and a frame does not pass.
-CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY | STILL
+CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY | STILL | UNSURE
 
 
 class Guard:

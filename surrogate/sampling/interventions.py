@@ -23,8 +23,9 @@ import numpy.typing as npt
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.guards import Flags, Guard, caught, finite
 from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.openmm.energy_checks import EnergyCheck, MemberSpread
 from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Clock, Tally
-from systems.chemistry.validity import ENERGY, INVALID, JUMP, STILL, flag_names
+from systems.chemistry.validity import ENERGY, INVALID, JUMP, STILL, UNSURE, flag_names
 from systems.errors import SimulationError
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -42,7 +43,7 @@ _WRONG_SHARE = 0.1
 @dataclass(eq=False)
 class Chunk:
     """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`account.MARKS`) and, where they were
-    computed, energies of relaxed frames in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
+    computed, what the energy check found in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
     that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
 
     frames_nm: FloatArray
@@ -84,8 +85,8 @@ def none_through(
 class Interventions:
     """Draws chunks and treats frames that the checks caught as `guard` says (`surrogate.sampling.config.GUARDS`).
 
-    `coupling` is needed by 'repair', 'fallback', `energy_every` (every k-th frame's energy is checked) and `n_between`
-    (frames of MD after each chunk).
+    `coupling` is needed by 'repair', 'fallback' and `n_between` (frames of MD after each chunk); `energy` checks every
+    `energy_every`-th frame, `spread` every frame of a learned potential.
     """
 
     sampler: ChunkSampler
@@ -96,6 +97,8 @@ class Interventions:
     coupling: Coupling | None = None
     energy_every: int = 0
     n_between: int = 0
+    energy: EnergyCheck | None = None
+    spread: MemberSpread | None = None
 
     def advance(
         self,
@@ -290,27 +293,25 @@ class _Advance:
     def _check(self, rows: npt.NDArray[np.int64]) -> None:
         with self.plan.clock.timed("check"):
             frames, before = self.chunk.frames_nm[rows], self.last[rows, -1]
-            self.chunk.flags[rows] = self.plan.checks.check(frames, before, from_start=self.step == 0)
-        if self.plan.energy_every:
-            assert self.plan.coupling is not None
+            flags = self.plan.checks.check(frames, before, from_start=self.step == 0)
+            if self.plan.spread is not None:
+                flags |= np.uint16(UNSURE) * self.plan.spread.unsure(frames)
+            self.chunk.flags[rows] = flags
+        if self.plan.energy is not None:
             with self.plan.clock.timed("energy limit"):
-                limit = self.plan.coupling.energy_limit_kj_mol
+                _ = self.plan.energy.limit
             with self.plan.clock.timed("energy"):
                 for row in rows.tolist():
-                    self._check_energies(row, limit)
+                    self._check_energies(row, self.plan.energy)
 
-    def _check_energies(self, row: int, limit_kj_mol: float) -> None:
-        """Flag frames whose turn it is and whose energy, after stiff bonds are relaxed, no MD reaches."""
-        assert self.plan.coupling is not None
+    def _check_energies(self, row: int, check: EnergyCheck) -> None:
+        """Flag frames whose turn it is and whose energy is none that the truth has."""
         steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
         energies = self.chunk.energies_kj_mol[row]
         for k in np.flatnonzero((steps % self.plan.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():
             if np.isnan(energies[k]):
-                try:
-                    energies[k] = self.plan.coupling.relax(self.chunk.frames_nm[row, k]).potential_kj_mol
-                except SimulationError:
-                    energies[k] = np.inf
-            if energies[k] > limit_kj_mol:
+                energies[k] = check.value(self.chunk.frames_nm[row, k])
+            if check.fails(energies[k]):
                 self.chunk.flags[row, k] |= np.uint16(ENERGY)
 
     def _caught_rows(self) -> list[int]:

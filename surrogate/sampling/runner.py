@@ -18,6 +18,7 @@ from surrogate.sampling.domain import fit_weights, in_bath
 from surrogate.sampling.guards import Guard
 from surrogate.sampling.interventions import Chunk, Interventions, none_through
 from surrogate.sampling.openmm.coupling import Coupling
+from surrogate.sampling.openmm.energy_checks import EnergyCheck, MemberSpread, RelaxedEnergy, TruthDifference
 from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
 from surrogate.sampling.rollout_account import Clock, Tally
 from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
@@ -124,8 +125,12 @@ def rollout(
         if config.needs_openmm:
             coupling = Coupling(weights)
             stack.callback(coupling.close)
+        learned = weights.model.integrates
+        energy: EnergyCheck | None = None
+        if config.energy_every and coupling is not None:
+            energy = TruthDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
         engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
-                               plan.n_between)  # fmt: skip
+                               plan.n_between, energy, MemberSpread(weights) if learned else None)  # fmt: skip
 
         def save() -> None:
             header["progress"], arrays = packed_progress(state)
@@ -144,7 +149,7 @@ def rollout(
             nonlocal flushed_at, flushed_s
             began = time.monotonic()
             for writer, buffer in zip(writers, buffers, strict=True):
-                _flush(writer, buffer)
+                _flush(writer, buffer, energy)
             header["files"] = [{"n_frames": writer.n_frames, "digest": writer.digest()} for writer in writers]
             # Frames of the last chunk may be left out: a longer rollout could not go on from its end.
             if state.steps < plan.n_steps:
@@ -235,13 +240,13 @@ def _buffer(plan: Plan, state: Progress, chunk: Chunk, buffers: list[list[_Block
         )
 
 
-def _flush(writer: TrajectoryWriter, buffer: list[_Block]) -> None:
+def _flush(writer: TrajectoryWriter, buffer: list[_Block], check: EnergyCheck | None) -> None:
     if not buffer:
         return
     joined = {name: np.concatenate([getattr(b, name) for b in buffer]) for name in vars(buffer[0])}
     scalars = {"intervention": joined["marks"]}
-    if not np.isnan(joined["energies"]).all():
-        scalars["relaxed_energy_kj_mol"] = joined["energies"]
+    if check is not None:
+        scalars[check.column] = joined["energies"]
     writer.append(
         joined["frames"], joined["times"], flags=joined["flags"], chunk_idx=joined["chunk_idx"], scalars=scalars
     )

@@ -39,6 +39,7 @@ JUMP = 512
 DRIFT = 1024
 ENERGY = 2048
 STILL = 4096
+UNSURE = 8192
 INVALID = NOT_FINITE | BOND_HALF_ANGSTROM | CLASH | CHIRALITY | OMEGA | RING
 
 _NAMES = {
@@ -55,6 +56,7 @@ _NAMES = {
     DRIFT: "drift of the whole",
     ENERGY: "energy above the reference",
     STILL: "hardly a change from the frame before",
+    UNSURE: "the model is unsure of its energy",
 }
 
 

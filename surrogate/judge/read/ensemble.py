@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, unseen_notes
 from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
 from surrogate.judge.read.stored_frames import StoredFrames
+from surrogate.judge.read.truth_asked import reweighting_notes
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.selection import part_of
@@ -155,6 +156,7 @@ def load_ensemble(
     chunks: list[npt.NDArray[np.int32]] = []
     changed: list[npt.NDArray[np.bool_]] = []
     records: list[dict[str, Any]] = []
+    scalars: list[Mapping[str, npt.NDArray[np.float64]]] = []
     lags: list[float] = []
     notes: list[str] = []
     kept: list[IntArray] = []
@@ -180,12 +182,13 @@ def load_ensemble(
         if COLUMN in reader.scalars:
             changed += np.split(reader.scalars[COLUMN] > 0, cuts)
         records.append(dict(reader.record))
+        scalars.append(reader.scalars)
         if records[-1].get("completed") is False:
             notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
     assert template is not None
     if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
         raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
-    notes += unseen_notes(name, records) + intervention_notes(name, records)
+    notes += unseen_notes(name, records) + intervention_notes(name, records) + reweighting_notes(name, records, scalars)
     lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
     part = kept[0] if len(kept[0]) < template.n_atoms else None
     return Ensemble(

@@ -74,6 +74,15 @@ class Coupling:
         """
         return self._relaxer.relax(frame_nm)
 
+    def energy_kj_mol(self, frame_nm: FloatArray) -> float:
+        """Return the energy of a frame `(n_atoms, 3)` nm as it is. Raises SurromdError where there is none."""
+        return float(self._still.energy(frame_nm))
+
+    @cached_property
+    def _still(self) -> Any:
+        """An engine that is asked for energies alone."""
+        return self._engine(seed=0)
+
     @cached_property
     def energy_limit_kj_mol(self) -> float:
         """The highest energy of a relaxed frame that passes: 1.5 times as far above the mean as MD goes in 150 frames.
@@ -132,6 +141,8 @@ class Coupling:
     def close(self) -> None:
         """Free OpenMM's Contexts."""
         self._relaxer.close()
+        if "_still" in vars(self):
+            self._still.close()
 
 
 def _cannot(weights: Weights) -> str:

@@ -13,7 +13,7 @@ from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.model import GAS_CONSTANT_KJ_MOL_K, PainetPotential
+from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.sampling.domain import match_scene
 from systems.errors import InputError, SimulationError
 
@@ -101,16 +101,3 @@ class LearnedForces:
                 }
 
         return Learned()
-
-
-def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
-    """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the truth, and how many
-    effective frames they leave (Kish: 1 / sum w^2).
-
-    `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent
-    frames are assumed; correlation in time lessens the number further.
-    """
-    reduced = -np.asarray(differences_kj_mol, dtype=np.float64) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)
-    weights = np.exp(reduced - reduced.max())
-    weights /= weights.sum()
-    return weights, float(1.0 / np.square(weights).sum())

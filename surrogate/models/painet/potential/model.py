@@ -16,9 +16,8 @@ from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
 from surrogate.models.painet.potential.gradient import CompiledGradient, GradientFn, gradient_of
 from systems.errors import InputError
-from systems.units import whole_steps
+from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
 
-GAS_CONSTANT_KJ_MOL_K = 0.00831446261815324
 _HYDROGEN = 1
 
 

@@ -22,7 +22,7 @@ from surrogate.data.references import References
 from surrogate.data.weights import TrainingDomain, save_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.config import PotentialConfig
-from surrogate.models.painet.potential.model import GAS_CONSTANT_KJ_MOL_K, PainetPotential
+from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
 from surrogate.training.loss_curves import read_curves
@@ -32,6 +32,7 @@ from systems.chemistry.limits import limits_from_frames
 from systems.chemistry.validity import geometry_from_frames
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 # The share of the budget after which no more states are asked for.
 _ASKING_SHARE = 0.6

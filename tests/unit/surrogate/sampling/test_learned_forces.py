@@ -9,17 +9,22 @@ import numpy as np
 import pytest
 import torch
 
+from md_reference.forces.quantum import Potential
 from surrogate.data.weights import TrainingDomain, Weights
+from surrogate.judge.read.ensemble import load_ensemble
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.sampling.domain import in_bath
-from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces, reweighting
+from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces
+from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.matching import match_atoms
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
 from systems.errors import InputError, OutOfDomainError, SurromdError
 from systems.prepare.molecule import scene_from_smiles
+from systems.reweighting import DIFFERENCE_COLUMN
+from systems.trajectory.codec import open_trajectory
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4)
 
@@ -80,23 +85,7 @@ def test_other_weights_and_other_molecules_are_refused() -> None:
         LearnedForces(scene_from_smiles("CCO"), weights())
 
 
-def test_frames_of_a_wrong_spring_are_reweighted_to_the_right_one() -> None:
-    rng, kt = np.random.default_rng(0), 8.31446261815324e-3 * 300.0
-    x = rng.normal(size=20_000) * np.sqrt(kt / 100.0)  # in a spring of 100 kJ/mol/nm^2, the truth's is 150
-    difference = 0.5 * 50.0 * x**2
-    weight, effective = reweighting(difference, 300.0)
-    assert weight.sum() == pytest.approx(1.0)
-    assert (weight * x**2).sum() == pytest.approx(kt / 150.0, rel=0.03)
-    # Negative control: as they are, the frames say otherwise.
-    assert np.mean(x**2) > 1.4 * kt / 150.0
-    assert 0.8 * len(x) < effective < 0.999 * len(x)
-    assert reweighting(np.zeros(10), 300.0)[1] == pytest.approx(10.0)
-
-
 def test_a_potential_is_rolled_in_the_bath_that_is_asked_for(tmp_path: Path) -> None:
-    from surrogate.sampling.runner import RolloutConfig, rollout
-    from systems.trajectory.codec import open_trajectory
-
     potential = PainetPotential(replace(SMALL, n_new=2, lag_ps=0.002))
     loaded = weights(potential)
     loaded = replace(loaded, domain=replace(loaded.domain, lag_ps=0.002))
@@ -124,3 +113,31 @@ def test_models_of_frames_take_no_other_bath() -> None:
         in_bath(loaded, {"friction_per_ps": 2.0})
     with pytest.raises(SurromdError, match="time steps"):
         in_bath(weights(), {"timestep_ps": 0.003})
+
+
+def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(tmp_path: Path) -> None:
+    """A model that knows nothing: every difference is large, and its members differ from each other."""
+    pytest.importorskip("tblite")
+    given = weights(PainetPotential(replace(SMALL, n_new=4, lag_ps=0.002)))
+    bath = {"force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": 300.0, "timestep_ps": 0.001,
+            "hydrogen_mass_da": None, "constrain_hydrogens": False}  # fmt: skip
+    domain = replace(given.domain, lag_ps=0.002, conditions=bath)
+    frames, flags = {}, {}
+    for error_kj_mol in (1e-3, 1e9):
+        loaded = replace(given, domain=domain, provenance={"energy_mae": error_kj_mol})
+        out = tmp_path / f"{error_kj_mol}.h5"
+        rollout(domain.scene, loaded, [out], RolloutConfig(time_ps=0.032, guard="off", energy_every=1))
+        with open_trajectory(out) as reader:
+            frames[error_kj_mol], flags[error_kj_mol] = reader.read(), np.asarray(reader.flags)
+            differences = reader.scalars[DIFFERENCE_COLUMN]
+    np.testing.assert_array_equal(*frames.values())
+    assert np.isfinite(differences).all()
+    truth, learned = Potential(domain.scene), LearnedForces(domain.scene, given)
+    x = frames[1e9][1].astype(np.float64)
+    assert differences[1] == pytest.approx(truth(x)[0] - learned(x)[0], abs=0.05)
+    poor, fine = flags.values()
+    assert (poor & np.uint16(UNSURE)).all() and not (fine & np.uint16(UNSURE | ENERGY)).any()
+    # A frame that is caught already is not asked about.
+    assert not (poor & np.uint16(ENERGY)).any()
+    (note,) = [note for note in load_ensemble([out]).notes if "Reweighted" in note]
+    assert "asked about 16 frames" in note and "of 16 frames are effective" in note
