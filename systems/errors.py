@@ -30,7 +30,11 @@ class TrajectoryError(SurromdError):
 
 
 class OutOfDomainError(SurromdError):
-    """A scene that the weights were not trained for."""
+    """A scene that the weights were not trained for. `brief`: how it differs, without the advice."""
+
+    def __init__(self, message: str, brief: str = "") -> None:
+        super().__init__(message)
+        self.brief = brief or message
 
 
 class WeightsError(SurromdError):

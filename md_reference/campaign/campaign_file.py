@@ -24,7 +24,7 @@ from systems.preparation import Preparation
 from systems.units import parse_temperature_k, parse_wall_s
 
 T = TypeVar("T")
-_SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
+SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
 # Folder of the batch system's logs, inside the campaign's.
 JOB_LOGS = "jobs"
 _LONGEST_NAME, _MOST_RUNS = 40, 100_000
@@ -215,7 +215,7 @@ def _kind(text: str) -> str:
 
 def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where: str) -> SceneSpec:
     source, digest = head.scene, ""
-    if not _kind(source) and (Path(source).suffix.lower() in _SCENE_FILES or "/" in source):
+    if not _kind(source) and (Path(source).suffix.lower() in SCENE_FILES or "/" in source):
         path = (base / source).resolve()
         if not path.is_file():
             raise InputError(f"{where}no such file: {path}.")
@@ -226,10 +226,10 @@ def _scene_spec(head: _SceneHead, preparation: dict[str, Any], base: Path, where
         named_scenes.describe(source)  # an unknown name is refused now, with the nearest
     if head.name and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}", head.name):
         raise InputError(f"{where}name = {head.name!r} must be letters, digits and . _ + - (it names files).")
-    return SceneSpec(head.name or _name_of(source), source, digest, preparation)
+    return SceneSpec(head.name or name_of(source), source, digest, preparation)
 
 
-def _name_of(source: str) -> str:
+def name_of(source: str) -> str:
     """A name for files: a file's stem, a sequence, a SMILES with what files cannot have replaced, and then a hash."""
     kind = _kind(source)
     text = source.partition(":")[2] if kind else Path(source).name.removesuffix(".gz")

@@ -107,7 +107,7 @@ def prepare_scene(task: SceneTask) -> dict[str, Any]:
         path = scene_path(Path(task.folder), task.spec.name)
         return prepare_once(path, task.spec, task.run.config, task.seed).account()
 
-    return _guarded(task.token, Path(task.folder), work)
+    return guarded(task.token, Path(task.folder) / MANIFEST_NAME, work)
 
 
 def simulate_run(task: RunTask) -> dict[str, Any]:
@@ -123,21 +123,22 @@ def simulate_run(task: RunTask) -> dict[str, Any]:
         finally:
             session.frames.pop(task.run.name, None)
 
-    return _guarded(task.token, folder, work)
+    return guarded(task.token, folder / MANIFEST_NAME, work)
 
 
-def _guarded(token: str, folder: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def guarded(token: str, witness: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own.
 
-    What waits within it, for a frame or for another program's charges, hears when the campaign is to stop.
+    `witness`: a file that whoever started the task has written where the task is to write. What waits within it, for a
+    frame or for another program's charges, hears when the campaign is to stop.
     """
     session = _session(token)
     if session.stopped:
         return {"status": "stopped"}
     try:
         # A file system that lags behind, or is not shared, is the only reason for its absence.
-        if not (folder / MANIFEST_NAME).is_file():
-            raise StorageError(f"{socket.gethostname()} does not see {folder}; all workers must share that folder.")
+        if not witness.is_file():
+            raise StorageError(f"{socket.gethostname()} does not see {witness}; all workers must share that folder.")
         with stop_when(session.should_stop):
             return {"status": "complete", **work()}
     except KeyboardInterrupt:

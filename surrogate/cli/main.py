@@ -161,7 +161,10 @@ def run(
 
     if out is None and not options.dry_run:
         raise usage_error("run needs --out: Folder for trajectory, report and record.")
-    print_run(api.run(scene, out, options=options), as_json=as_json)
+    result = api.run(scene, out, options=options)
+    print_run(result, as_json=as_json)
+    if result.get("failed"):
+        raise typer.Exit(1)
 
 
 @app.command()

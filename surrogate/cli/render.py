@@ -89,6 +89,10 @@ def print_run(record: dict[str, Any], *, as_json: bool) -> None:
     """Print what came of a run: its first line, the verdict, where the report is; of a dry run the decision."""
     if as_json:
         print_json(record)
+    elif "molecules" in record:
+        for result in record["molecules"]:
+            _say(f"{result['name']}: {(result['failed'] and 'failed: ' + result['failed']) or result['headline']}")
+        _say(f"{record['summary']}: {Path(record['file']) / 'index.html'}")
     elif (outcome := record.get("outcome")) is None:
         print_pairs(record["decision_table"])
     else:

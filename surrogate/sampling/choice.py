@@ -32,13 +32,15 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
         except OutOfDomainError as error:
-            refusals.append((len(error.args[0].split("; ")), name, str(error)))
+            refusals.append((len(error.args[0].split("; ")), name, error))
             continue
         weights = load_weights(path)
         found.append((not match.seen, weights.model.carries_velocities, name, weights))
     if not found:
-        reason = min(refusals)[2] if refusals else "none are shipped."
-        raise OutOfDomainError(f"no shipped weights cover {scene.name}, and none are named. The nearest: {reason}")
+        nearest = min(refusals, key=lambda one: one[:2])[2] if refusals else OutOfDomainError("none are shipped.")
+        raise OutOfDomainError(
+            f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
+        )
     unseen, _, name, weights = min(found, key=lambda one: one[:3])
     others = sorted(other for *_, other, _ in found if other != name)
     why = "they cover it without having seen it" if unseen else "they were trained on this molecule"

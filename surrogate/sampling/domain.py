@@ -99,7 +99,8 @@ def match_known(
         else "Run `surromd reference` for it instead, or roll with `force=True`: the trajectory is then marked."
     )
     raise OutOfDomainError(
-        f"{name} does not cover {scene.name}: {reasons}. These weights cover {domain.describe()}. {advice}"
+        f"{name} does not cover {scene.name}: {reasons}. These weights cover {domain.describe()}. {advice}",
+        brief=f"{name} does not cover it: {reasons}",
     )
 
 

@@ -118,11 +118,17 @@ class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriti
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignOptions(Quiet):
-    """What `campaign` can be told beside its file."""
+class OnDask:
+    """Options of verbs whose work Dask hands out."""
 
     workers: int | None = option("Processes here.", None, within=(1, None), unset="one per core")
     scheduler: str | None = option("Of Dask, such as tcp://host:8786.", None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions(OnDask, Quiet):
+    """What `campaign` can be told beside its file."""
+
     dry_run: bool = option("List the runs and start nothing.", False)
 
 
@@ -189,8 +195,8 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(MDSettings, Preparation, Seeded, Resuming, Overwriting, Quiet):
-    """What `run` can be told."""
+class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting, Quiet):
+    """What `run` can be told. `workers` and `scheduler` are those of many molecules."""
 
     budget_s: float = option("Wall time to spend in all, such as 1h.")
     way: str = option("MD, a surrogate, or what pays best here.", "auto", choices=("auto", "md", "surrogate"))

@@ -18,14 +18,22 @@ WAYS: dict[Way, str] = {
     "potential": "a potential that learns from GFN2-xTB, checked by MD",
     "trained": "weights trained on MD made here, checked by other MD",
 }
-# Shares of what is left when the report is paid for.
+# Shares of what is left when the report is paid for. MD that judges itself is split by replicas, or by stages if it has
+# one core.
+_BY_STAGES: tuple[tuple[Stage, float], ...] = (("md", 0.5), ("held-out md", 0.5))
 _SHARES: dict[Way, tuple[tuple[Stage, float], ...]] = {
-    "md": (("md", 0.5), ("held-out md", 0.5)),
+    "md": (("md", 1.0),),
     "rollout": (("rollout", 0.3), ("held-out md", 0.5), ("bursts", 0.2)),
     "potential": (("train", 0.6), ("held-out md", 0.25), ("rollout", 0.1), ("bursts", 0.05)),
     "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("held-out md", 0.15), ("bursts", 0.05)),
 }
 LEAST_BUDGET_S = 20.0
+# Of a budget: what is planned with, for stages take a while to stop and estimates are none of the best.
+_AIM = 0.97
+# Processor seconds before the first step of a stage of MD: processes start, forces are built.
+_START_S = 4.0
+# Of a run; no stage of MD spends more of its length on coming to equilibrium.
+_EQUILIBRATION_SHARE = 0.1
 # Below this a potential has no time to learn from as many states as it needs.
 LEAST_TRAINING_S = 240.0
 BURST_PS = 10.0
@@ -36,6 +44,7 @@ _RELAXING_STEPS, _SURE = 150, 0.7
 _JUDGE_S, _JUDGE_ATOM_S = 8.0, 3e-6
 _JUDGE_SHARE = 0.1
 _MOST_FRAMES, _LEAST_FRAMES = 400_000, 4_000
+_MD_STAGES: tuple[Stage, ...] = ("training md", "md", "held-out md")
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -49,13 +58,14 @@ class PlannedStage:
 
 @dataclass(frozen=True)
 class Decision:
-    """How a budget is spent. `why`: the reasons, a line each; `save_every_ps`: of all trajectories; `n_bursts` of
-    `burst_ps` each; `expected_md_ps`, `expected_rollout_ps`: what the stages should come to."""
+    """How a budget is spent. `why`: the reasons, a line each; `save_every_ps`: of all trajectories, `equilibrate_ps`
+    of MD at most; `n_bursts` of `burst_ps` each; `expected_md_ps`, `expected_rollout_ps`: what all stages come to."""
 
     way: Way
     why: tuple[str, ...]
     stages: tuple[PlannedStage, ...]
     save_every_ps: float
+    equilibrate_ps: float
     n_bursts: int
     burst_ps: float
     expected_md_ps: float
@@ -71,16 +81,19 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
 
     Raises InputError for a budget in which nothing can be judged.
     """
-    if budget_s < LEAST_BUDGET_S:
-        raise InputError(
-            f"{format_wall(max(budget_s, 0.0))} is too short to simulate and judge anything; "
-            f"use `budget_s='{LEAST_BUDGET_S:g}s'` or more."
-        )
     chosen, why = _choose(rates, budget_s, way)
+    shares = dict(_BY_STAGES if chosen == "md" and rates.cores == 1 else _SHARES[chosen])
+    n_md = sum(name in _MD_STAGES for name in shares)
+    least_s = max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * rates.stretch)
+    if budget_s < least_s:
+        raise InputError(
+            f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and judge anything on this machine, as "
+            f"busy as it is: {format_wall(least_s)} it takes. Use a longer `budget_s`."
+        )
     frames = _frames(rates, budget_s)
+    budget_s *= _AIM
     report_s = min(0.5 * budget_s, (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * rates.stretch)
     left_s = budget_s - report_s
-    shares = dict(_SHARES[chosen])
     n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
     if "bursts" in shares:
         burst_s = (burst_ps / rates.timestep_ps + _RELAXING_STEPS) * rates.step_s * rates.stretch
@@ -95,15 +108,21 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
     scale = (1.0 - shares.get("bursts", 0.0)) / others
     stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
               for name, share in shares.items()]  # fmt: skip
-    found = Decision(chosen, why, (*stages, PlannedStage("report", report_s)), 0.0, n_bursts, burst_ps, 0.0, 0.0)
-    md_s = found.seconds("md") + found.seconds("held-out md") + found.seconds("training md")
+    found = Decision(chosen, why, (*stages, PlannedStage("report", report_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
+    expected_ps = {name: md_ps(rates, found, name) for name in shares if name in _MD_STAGES}
     found = replace(
         found,
-        expected_md_ps=md_s * rates.md_ps_per_s,
+        equilibrate_ps=_EQUILIBRATION_SHARE * min(expected_ps.values()) / rates.cores,
+        expected_md_ps=sum(expected_ps.values()),
         expected_rollout_ps=found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0),
     )
     every_ps = save_every_ps or _interval(rates, max(found.expected_md_ps, found.expected_rollout_ps) / frames)
     return replace(found, save_every_ps=every_ps)
+
+
+def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:
+    """Return what a stage of MD should come to, in ps, replicas together."""
+    return max(decision.seconds(name) - _START_S * rates.stretch, 1.0) * rates.md_ps_per_s
 
 
 def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
@@ -146,7 +165,7 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
     def per_day(ps_per_s: float) -> str:
         return f"{format_time_ps(float(f'{ps_per_s * 86_400:.3g}'))} a day"
 
-    busy = f", other work on {rates.others:g} of them" if rates.others >= 0.2 else ""
+    busy = f", of which other work takes {1.0 - 1.0 / rates.stretch:.0%}" if rates.stretch > 1.1 else ""
     lines = [
         ("MD", rates.md.rsplit("; about", 1)[0]),
         ("MD here", f"{per_day(rates.md_ps_per_s)} on {rates.cores} cores{busy}"),
@@ -164,8 +183,8 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
 
 def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
     """Return what a stage is expected to come to."""
-    if name in ("md", "held-out md", "training md"):
-        return f", about {format_time_ps(float(f'{decision.seconds(name) * rates.md_ps_per_s:.2g}'))}"
+    if name in _MD_STAGES:
+        return f", about {format_time_ps(float(f'{md_ps(rates, decision, name):.2g}'))}"
     if name == "rollout" and decision.expected_rollout_ps:
         return f", about {format_time_ps(float(f'{decision.expected_rollout_ps:.2g}'))}"
     return f", {decision.n_bursts} of {decision.burst_ps:g} ps" if name == "bursts" else ""

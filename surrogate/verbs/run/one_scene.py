@@ -71,7 +71,7 @@ def run_scene(
                 record = _new_record(scene, molecule, options)
             else:
                 before.check_same(settings_of_run(options), molecule.topology_hash, folder)
-                record = before
+                record = _taken_up(before, options)
             if record.decision is None:
                 record = _decide(record, molecule, config, options, clock)
             tell_decision(record)
@@ -162,6 +162,21 @@ class _Run:
         stages = tuple(stage for stage in decision.stages if stage.name not in ended)
         self.keep(replace(self.record, decision=replace(decision, why=(why,), stages=stages)))
         self.say(f"{why}: MD for the rest of the budget")
+
+
+def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
+    """Return the record of a run that goes on. With a longer budget the stages that ran out of time, or failed, go on
+    for as much longer as the same decision would have given them."""
+    before_s = record.settings["budget_s"]
+    if record.rates is None or record.decision is None or options.budget_s <= before_s:
+        return record
+    way = "md" if record.decision.way == "md" else "surrogate"
+    longer = decide(record.rates, options.budget_s, way, save_every_ps=record.decision.save_every_ps)
+    if longer.way != record.decision.way:  # a surrogate that failed
+        return record
+    decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)
+    ended = tuple(entry for entry in record.stages if entry.status == "done" and entry.name != "report")
+    return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
 
 
 def _decide(record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, clock: Clock) -> RunRecord:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
+import threading
 import time
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,14 +36,15 @@ class Rolls:
 
 @dataclass(frozen=True)
 class Rates:
-    """What was measured. `others`: processes of others that share the `cores`. `step_s`: processor seconds of a step of
-    MD on one core, `md_ps_per_s`: of MD on all cores, with what the others leave, in a second of wall time; `dear`: it
-    is quantum mechanics. `rolls`: of weights that cover the scene, None where none do; `coverage`: why these, or none.
+    """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
+    other work shares them. `step_s`: processor seconds of a step of MD on one core, `md_ps_per_s`: of MD on all cores
+    in a second of wall time; `dear`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none
+    do; `coverage`: why these, or none.
     """
 
     n_atoms: int
     cores: int
-    others: float
+    stretch: float
     dear: bool
     md: str
     step_s: float
@@ -50,11 +52,6 @@ class Rates:
     md_ps_per_s: float
     coverage: str
     rolls: Rolls | None = None
-
-    @property
-    def stretch(self) -> float:
-        """Wall seconds of a second of processor time, with all cores in use."""
-        return (self.cores + self.others) / self.cores
 
 
 def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int | None = None) -> Rates:
@@ -67,21 +64,21 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
 
-    cores, others = cores or available_cores(), _other_processes()
+    cores = min(cores or available_cores(), available_cores())
+    stretch = measured_stretch(cores)
     plan = make_plan(scene, config, replicas=cores)
     assert plan.us_per_step is not None
     step_s = plan.us_per_step * 1e-6
-    share = cores / (cores + others)
     weights, coverage = _covering(scene, config, named)
     return Rates(
         n_atoms=scene.n_atoms,
         cores=cores,
-        others=others,
+        stretch=stretch,
         dear=config.force.force_field == QUANTUM,
         md=plan.line,
         step_s=step_s,
         timestep_ps=config.timestep_ps,
-        md_ps_per_s=cores * share * config.timestep_ps / step_s,
+        md_ps_per_s=cores * config.timestep_ps / step_s / stretch,
         coverage=coverage,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k),
     )
@@ -129,7 +126,7 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
         try:
             weights, why = choose_weights(scene, temperature_k=config.temperature_k)
         except OutOfDomainError as error:
-            return None, str(error)
+            return None, error.brief
     asked = {
         "force_field": config.force.force_field,
         "solvent": config.force.solvent,
@@ -145,9 +142,20 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
     return weights, why
 
 
-def _other_processes() -> float:
-    """Return how many processes computed on this machine over the last minute, on average."""
-    try:
-        return round(os.getloadavg()[0], 1)
-    except (OSError, AttributeError):
-        return 0.0
+def measured_stretch(cores: int, seconds: float = 0.5) -> float:
+    """Return the wall seconds of a second of processor time when so many threads compute at once; at least 1."""
+    block = bytes(2**20)
+    used_s = [0.0] * cores
+    began = time.perf_counter()
+
+    def compute(k: int) -> None:
+        while time.perf_counter() - began < seconds:
+            sha256(block)  # leaves the other threads alone
+        used_s[k] = time.thread_time()
+
+    threads = [threading.Thread(target=compute, args=(k,)) for k in range(cores)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return round(max(1.0, cores * (time.perf_counter() - began) / max(sum(used_s), 1e-3)), 2)

@@ -83,10 +83,11 @@ class RunRecord:
         return {"format": FORMAT, **asdict(self)}
 
     def check_same(self, settings: dict[str, Any], topology_hash: str, folder: Path) -> None:
-        """Raise InputError unless a run of these settings on this molecule may go on with this one."""
+        """Raise InputError unless a run of these settings, of this budget or a longer one, may go on with this one."""
         if self.topology_hash != topology_hash:
             raise InputError(f"{folder} is a run of another molecule ({self.scene}); name another folder.")
-        for key in sorted(settings.keys() | self.settings.keys()):
+        shorter = settings["budget_s"] < self.settings["budget_s"]
+        for key in sorted((settings.keys() | self.settings.keys()) - (set() if shorter else {"budget_s"})):
             was, now = self.settings.get(key), settings.get(key)
             if was != now:
                 raise InputError(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.verbs.options import PathLike, RunOptions
 from surrogate.verbs.run.decision import table
+from surrogate.verbs.run.many_scenes import molecules_in, run_many
 from surrogate.verbs.run.one_scene import describe_run, plan_scene, run_scene
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.telling import tell
@@ -29,14 +30,23 @@ def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOpt
     The folder `out` holds `report.html`, whose first line says what was achieved, the trajectory, `reference/`, the
     weights that were trained, `run.json` (the record that is returned: rates, decision, stages, seeds, versions) and
     `log.txt`. Ctrl-C and a kill lose nothing that was written; `resume` goes on, within the same budget.
+
+    Many molecules are a list of SMILES (.smi: one a line, a name behind it), a folder of structure files, or the
+    [[scenes]] of a campaign's TOML: they share the budget, a core each, on Dask's `workers`, and `out` holds a folder
+    for each and one table of results, index.html. What fails is listed with its reason.
     Raises InputError, PreparationError, OutOfDomainError (`weights` that do not cover the scene), SimulationError.
     """
+    molecules = molecules_in(scene)
+    if options.dry_run and molecules is not None:
+        raise InputError("`dry_run` takes one molecule: each is measured and decided by itself.")
     if options.dry_run:
         record = plan_scene(scene, options)
         return {"decision_table": decision_table(record, options), **record.to_dict()}
     if out is None:
         raise InputError("name a folder for the trajectory and the report with `out`.")
     folder = Path(out)
+    if molecules is not None:
+        return run_many(molecules, folder, options)
 
     def told(found: RunRecord) -> None:
         if not options.quiet:

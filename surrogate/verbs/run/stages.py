@@ -14,7 +14,7 @@ from surrogate.verbs.compare import compare
 from surrogate.verbs.options import BurstOptions, MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
 from surrogate.verbs.reference import reference
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.run.decision import Decision, table
+from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
 from surrogate.verbs.run.rates import REPLICAS, Rates, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 # A run may turn out faster than measured: the clock, not its length, ends it.
 _AMPLE = 3.0
 _LEAST_FRAMES = 20
+_OPTIMISING = 0.85
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
-_EQUILIBRATION_SHARE = 0.1
 WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
 
 
@@ -61,19 +61,19 @@ def _settled(record: RunRecord) -> tuple[Rates, Decision]:
     return record.rates, record.decision
 
 
-def _md_stage(name: str, place: str, seed: int, to: str) -> StageOf:
+def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     """Return a stage of MD into `place`, replicas on all cores."""
 
     def outs(site: Site, record: RunRecord) -> list[Path]:
         from systems.trajectory.claim import replica_paths
 
-        suffix = f".{site.options.format}" if to == "trajectory" else ".h5"
+        suffix = f".{site.options.format}" if name == "md" else ".h5"
         return replica_paths(site.folder / f"{place}{suffix}", _settled(record)[0].cores)
 
     def work(site: Site, record: RunRecord, seconds: float) -> RunRecord:
         rates, decision = _settled(record)
         every_ps = decision.save_every_ps
-        expected_ps = decision.seconds(name) * rates.md_ps_per_s / rates.cores  # type: ignore[arg-type]
+        expected_ps = md_ps(rates, decision, name) / rates.cores
         first = outs(site, record)
         out = site.folder / f"{place}{first[0].suffix}"
         out.parent.mkdir(exist_ok=True)
@@ -84,7 +84,7 @@ def _md_stage(name: str, place: str, seed: int, to: str) -> StageOf:
                 site.options,
                 time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * expected_ps / every_ps)),
                 save_every_ps=every_ps,
-                equilibrate_ps=min(site.config.equilibrate_ps, _EQUILIBRATION_SHARE * expected_ps),
+                equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
                 replicas=rates.cores,
                 seed=site.options.seed + seed * _SEEDS_APART,
                 resume=True,
@@ -99,9 +99,12 @@ def _md_stage(name: str, place: str, seed: int, to: str) -> StageOf:
         files = _with_frames(site.folder, outs(site, record))
         if not files:
             return None
-        if to == "held_out":
+        if name == "held-out md":
             return replace(record, held_out=files)
-        return replace(record, trajectory=files) if to == "trajectory" else record
+        if name == "md" and _settled(record)[0].cores > 1:
+            n_own = -(-len(files) // 2)
+            return replace(record, trajectory=files[:n_own], held_out=files[n_own:])
+        return replace(record, trajectory=files) if name == "md" else record
 
     return StageOf(work, found)
 
@@ -124,8 +127,8 @@ def _train(site: Site, record: RunRecord, seconds: float) -> RunRecord:
     dear = decision.way == "potential"
     options = TrainOptions(
         level=site.options.level if dear else None,
-        # What training does before and after it counts its seconds has to fit in as well.
-        budget_s=0.9 * decision.seconds("train"),
+        # A potential's budget covers all it does; others read frames before, and are tried out after.
+        budget_s=(1.0 if dear else _OPTIMISING) * decision.seconds("train"),
         seed=site.options.seed,
         resume=True,
         quiet=True,
@@ -195,14 +198,17 @@ def _report(site: Site, record: RunRecord, seconds: float) -> RunRecord:
     from surrogate.judge.report.report import write_report
 
     rates, decision = _settled(record)
+    if not record.held_out or not record.trajectory:
+        lacking = "the trajectory" if record.held_out else "MD to judge it by"
+        raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
     held = [site.folder / file for file in record.held_out]
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
     spent = {entry.name: entry.wall_s for entry in record.stages}
-    measured_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
+    held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     # The faster of what was measured before and what it came to: the gain is a lower bound.
-    md_ps_per_s = max(rates.md_ps_per_s, measured_ps / max(spent.get("held-out md", 0.0), 1e-9))
+    md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
     training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
     bursts_file = site.folder / BURSTS_NAME
     said = json.loads(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
@@ -223,9 +229,9 @@ def _nothing(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 STAGES: dict[str, StageOf] = {
-    "training md": _md_stage("training md", "reference/training", 2, ""),
-    "md": _md_stage("md", "trajectory/md", 0, "trajectory"),
-    "held-out md": _md_stage("held-out md", "reference/held_out", 1, "held_out"),
+    "training md": _md_stage("training md", "reference/training", 2),
+    "md": _md_stage("md", "trajectory/md", 0),
+    "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),
     "rollout": StageOf(_roll, _rolled, may_fail=True),
     "bursts": StageOf(_burst, _nothing, may_fail=True),

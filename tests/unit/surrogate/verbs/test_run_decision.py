@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 
+from md_reference.run.machine import available_cores
 from surrogate.verbs.run.decision import Decision, decide, table
-from surrogate.verbs.run.rates import Rates, Rolls
+from surrogate.verbs.run.rates import Rates, Rolls, measured_stretch
 from systems.errors import InputError
 
 # Alanine dipeptide on two cores: 20 ns of MD in a minute, and weights that roll five times as fast.
 FAST = Rolls("alanine-dipeptide", 1.0, 1600.0)
-COVERED = Rates(22, 2, 0.0, False, "OBC2; about 1", 25e-6, 0.004, 320.0, "trained on it", FAST)
+COVERED = Rates(22, 2, 1.0, False, "OBC2; about 1", 25e-6, 0.004, 320.0, "trained on it", FAST)
 UNCOVERED = replace(COVERED, rolls=None, coverage="elements: S not seen")
 DEAR = replace(UNCOVERED, dear=True, step_s=16e-3, timestep_ps=0.0005, md_ps_per_s=0.0625)
 
@@ -38,8 +39,9 @@ def test_weights_slower_than_md_are_not() -> None:
 
 def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
     found = decide(UNCOVERED, 600.0)
-    assert found.way == "md" and named(found) == ["md", "held-out md", "report"]
-    assert found.seconds("md") == found.seconds("held-out md")
+    assert found.way == "md" and named(found) == ["md", "report"], "replicas judge each other"
+    alone = decide(replace(UNCOVERED, cores=1), 600.0)
+    assert named(alone) == ["md", "held-out md", "report"] and alone.seconds("md") == alone.seconds("held-out md")
     assert "S not seen" in found.why[1]
     assert decide(UNCOVERED, 600.0, "surrogate").way == "trained"
 
@@ -53,10 +55,10 @@ def test_dear_truth_is_learned_where_there_is_time_to() -> None:
 
 @pytest.mark.parametrize("rates", [COVERED, UNCOVERED, DEAR])
 @pytest.mark.parametrize("way", ["auto", "md", "surrogate"])
-@pytest.mark.parametrize("budget_s", [20.0, 60.0, 600.0, 36_000.0])
+@pytest.mark.parametrize("budget_s", [30.0, 60.0, 600.0, 36_000.0])
 def test_stages_fill_the_budget(rates: Rates, way: str, budget_s: float) -> None:
     found = decide(rates, budget_s, way)
-    assert sum(stage.seconds for stage in found.stages) == pytest.approx(budget_s)
+    assert 0.95 * budget_s < sum(stage.seconds for stage in found.stages) <= budget_s
     assert min(stage.seconds for stage in found.stages) > 0.0
     assert ("bursts" in named(found)) == (found.n_bursts > 0)
     assert table(rates, found, budget_s)[-1][0] == "in all"
@@ -79,10 +81,17 @@ def test_frames_are_saved_no_more_often_than_the_judge_can_read() -> None:
 
 
 def test_other_work_on_the_machine_leaves_fewer_bursts() -> None:
-    busy = replace(COVERED, others=2.0, md_ps_per_s=160.0)
+    busy = replace(COVERED, stretch=2.0, md_ps_per_s=160.0)
     assert decide(busy, 60.0).n_bursts < decide(COVERED, 60.0).n_bursts
 
 
+def test_work_beside_us_stretches_time() -> None:
+    assert 1.0 <= measured_stretch(1, 0.05) < measured_stretch(4 * available_cores(), 0.2)
+
+
 def test_a_budget_in_which_nothing_can_be_judged_is_refused() -> None:
-    with pytest.raises(InputError, match="20"):
+    with pytest.raises(InputError, match="20 s it takes"):
         decide(COVERED, 5.0)
+    with pytest.raises(InputError, match="busy"):
+        decide(replace(COVERED, stretch=6.0), 60.0)
+    decide(COVERED, 60.0)

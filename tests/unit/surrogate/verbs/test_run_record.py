@@ -26,7 +26,7 @@ from surrogate.verbs.run.run_record import (
 )
 from systems.errors import InputError
 
-RATES = Rates(22, 2, 0.0, False, "OBC2", 25e-6, 0.004, 320.0, "trained on it", Rolls("alanine-dipeptide", 1.0, 1600.0))
+RATES = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 320.0, "", Rolls("alanine-dipeptide", 1.0, 1600.0))
 CHEAP = Costs(10.0, 0.0, 200.0)
 OPTIONS = RunOptions(budget_s=600.0, weights=Path("mine.safetensors"))
 
@@ -56,6 +56,9 @@ def test_only_the_same_run_goes_on(tmp_path: Path) -> None:
     record().check_same(same, "abc", tmp_path)
     with pytest.raises(InputError, match="seed = 0, not 3"):
         record().check_same(settings_of_run(replace(OPTIONS, seed=3)), "abc", tmp_path)
+    with pytest.raises(InputError, match=r"budget_s = 600\.0, not 60\.0"):
+        record().check_same(settings_of_run(replace(OPTIONS, budget_s=60.0)), "abc", tmp_path)
+    record().check_same(settings_of_run(replace(OPTIONS, budget_s=6000.0)), "abc", tmp_path)
     with pytest.raises(InputError, match="another molecule"):
         record().check_same(same, "other", tmp_path)
 

@@ -1,0 +1,113 @@
+"""Whole runs with rates that are made up, so that MD is short: folder, resume, longer budgets, a failed surrogate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from surrogate import api
+from surrogate.verbs.run import one_scene, stages
+from surrogate.verbs.run.many_scenes import molecules_in
+from surrogate.verbs.run.rates import Rates, Rolls
+from surrogate.verbs.run.results_page import write_results
+from systems.errors import InputError, SimulationError
+from systems.trajectory.codec import open_trajectory
+
+# As if a second of MD made a tenth of a ps: 150 ps a replica in ten minutes, which are over in a second.
+SLOW = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 0.2, "trained on it", Rolls("alanine-dipeptide", 1.0, 1.0))
+
+
+@pytest.fixture
+def slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: SLOW)
+
+
+def n_frames(folder: Path, names: list[str]) -> int:
+    total = 0
+    for name in names:
+        with open_trajectory(folder / name) as reader:
+            total += reader.n_frames
+    return total
+
+
+@pytest.mark.slow
+def test_a_run_leaves_its_folder_and_goes_on_with_a_longer_budget(tmp_path: Path, slow_machine: None) -> None:
+    folder = tmp_path / "run"
+    found = api.run("alanine-dipeptide", folder, budget_s=400.0, way="md", quiet=True)
+    assert found["decision"]["way"] == "md" and [stage["name"] for stage in found["stages"]] == ["md", "report"]
+    assert found["trajectory"] == ["trajectory/md_r0.h5"] and found["held_out"] == ["trajectory/md_r1.h5"]
+    page = (folder / "report.html").read_text("utf-8")
+    assert found["outcome"]["headline"] in page and "MD for the whole budget" in page
+    assert found["outcome"]["headline"] in (folder / "report.md").read_text("utf-8").replace("\\", "")
+    assert (folder / "log.txt").read_text("utf-8").count("\n") == 2
+    assert (
+        api.run("alanine-dipeptide", folder, budget_s=400.0, way="md", resume=True, quiet=True)["outcome"]
+        == found["outcome"]
+    )
+    frames = n_frames(folder, found["trajectory"])
+    longer = api.run("alanine-dipeptide", folder, budget_s=800.0, way="md", resume=True, quiet=True)
+    assert longer["settings"]["budget_s"] == 800.0 and len(longer["stages"]) == 2
+    assert n_frames(folder, longer["trajectory"]) >= frames
+    with pytest.raises(InputError, match="way"):
+        api.run("alanine-dipeptide", folder, budget_s=800.0, resume=True, quiet=True)
+
+
+def test_where_a_surrogate_fails_md_takes_the_rest(
+    tmp_path: Path, slow_machine: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("the guards let no frame through")
+
+    monkeypatch.setitem(stages.STAGES, "rollout", replace(stages.STAGES["rollout"], work=fail))
+    found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, quiet=True)
+    assert found["decision"]["way"] == "md" and "no frame through" in found["decision"]["why"][0]
+    assert found["stages"][0]["status"] == "failed"
+    assert found["outcome"]["notes"] and "no frame through" in (tmp_path / "run" / "report.html").read_text("utf-8")
+
+
+def test_molecules_are_a_list_a_folder_or_a_campaign(tmp_path: Path) -> None:
+    (tmp_path / "m.smi").write_text("# drugs\nCCO ethanol\nCC(=O)O\n\n")
+    found = molecules_in(tmp_path / "m.smi")
+    assert found is not None and [s.source for s in found.scenes] == ["smiles:CCO", "smiles:CC(=O)O"]
+    assert found.scenes[0].name == "ethanol" and found.scenes[1].name.startswith("CC_O_O-")
+    (tmp_path / "two.smi").write_text("CCO a\nCCC A\n")
+    with pytest.raises(InputError, match="called 'a'"):
+        molecules_in(tmp_path / "two.smi")
+    pdbs = tmp_path / "pdbs"
+    pdbs.mkdir()
+    with pytest.raises(InputError, match="no molecule"):
+        molecules_in(pdbs)
+    (pdbs / "mine.pdb").touch()
+    (pdbs / "notes.txt").touch()
+    found = molecules_in(pdbs)
+    assert found is not None and [s.name for s in found.scenes] == ["mine"]
+    (tmp_path / "c.toml").write_text('scenes = ["ethanol"]\ntime = "1ns"\n')
+    found = molecules_in(tmp_path / "c.toml")
+    assert found is not None and found.scenes[0].source == "ethanol"
+    assert molecules_in("smiles:CCO") is None and molecules_in(pdbs / "mine.pdb") is None
+
+
+@pytest.mark.slow
+def test_what_fails_among_many_is_listed_with_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "m.smi").write_text("C1CC broken\nC[Na] metal\n")
+    found = api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, workers=1, quiet=True)
+    assert found["failed"].keys() == {"broken", "metal"} and found["summary"] == "0 of 2 molecules judged"
+    assert "failed: " in (tmp_path / "runs" / "index.html").read_text("utf-8")
+    with pytest.raises(InputError, match=r"resume=True"):
+        api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, workers=1, quiet=True)
+    with pytest.raises(InputError, match="15 s each"):
+        api.run(tmp_path / "m.smi", tmp_path / "more", budget_s=30.0, workers=1, quiet=True)
+
+
+def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> None:
+    line = {
+        "name": "<b>", "scene": "smiles:C", "failed": "", "way": "md", "wall_s": 61.0, "rolled_ps": 1500.0,
+        "held_out_ps": 1234.0, "worth": "at least 1 ns", "gain": None, "verdict": "Close.",
+    }  # fmt: skip
+    write_results(tmp_path, [line, {"name": "x", "scene": "smiles:X", "failed": "no & such"}])
+    page = (tmp_path / "index.html").read_text("utf-8")
+    assert 'href="%3Cb%3E/report.html">&lt;b&gt;' in page and "1.2 ns" in page and "no &amp; such" in page
+    assert json.loads((tmp_path / "results.json").read_text())[0] == line
