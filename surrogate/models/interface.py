@@ -146,7 +146,8 @@ class Surrogate(nn.Module, ABC):
 
     def in_bath(self, changes: dict[str, Any]) -> Surrogate:
         """Return this model, its weights shared, integrating under other settings: `temperature_k`, `friction_per_ps`,
-        `timestep_ps`, `ensemble`. Raises InputError for a model that learned frames, and their bath with them."""
+        `timestep_ps`, `hydrogen_mass_da`, `ensemble`. Raises InputError for a model that learned frames, and their bath
+        with them."""
         raise InputError(
             f"{self.arch} learned its bath with its frames; leave {', '.join(f'`{k}`' for k in changes)} out."
         )

@@ -43,6 +43,7 @@ class RolloutConfig:
     temperature_k: float | None = option("Refused if it is not that of weights that learned frames.", None)
     friction_per_ps: float | None = option("Of the bath, of a learned potential.", None, within=(0.0, None))
     timestep_ps: float | None = option("Integration step, of a learned potential.", None)
+    hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
     ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
     solver: str | None = option(
         "multistep, fitted (for 2 to 10 steps), euler or dopri5.", None, unset="the one that suits", section="sampling"
@@ -60,7 +61,7 @@ class RolloutConfig:
     @property
     def bath(self) -> dict[str, Any]:
         """What is asked for of the integration, by the names of a potential's settings."""
-        names = ("temperature_k", "friction_per_ps", "timestep_ps", "ensemble")
+        names = ("temperature_k", "friction_per_ps", "timestep_ps", "hydrogen_mass_da", "ensemble")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property

@@ -44,7 +44,7 @@ def rollout(
     record (`interventions`) and in a column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy')
     say which atoms are written. `force` rolls a scene that leaves the training domain where that is possible.
     `temperature_k` is refused unless it is that of the weights; a learned potential takes any, and `friction_per_ps`,
-    `timestep_ps` and `ensemble`. `ph` to `cap_breaks`: see `systems.source.prepare`.
+    `timestep_ps`, `hydrogen_mass_da` and `ensemble`. `ph` to `cap_breaks`: see `systems.source.prepare`.
     Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
     guard cannot bring a chunk through), StorageError.
     """

@@ -94,6 +94,7 @@ def test_a_potential_is_rolled_in_the_bath_that_is_asked_for(tmp_path: Path) -> 
         "cold": {"temperature_k": 10.0},
         "hot": {"temperature_k": 600.0, "friction_per_ps": 2.0},
         "free": {"ensemble": "nve", "timestep_ps": 0.0005},
+        "heavy": {"ensemble": "nve", "timestep_ps": 0.0005, "hydrogen_mass_da": 3.0},
     }.items():
         out = tmp_path / f"{name}.h5"
         rollout(loaded.domain.scene, loaded, [out], RolloutConfig(time_ps=0.02, guard="off", **asked))
@@ -102,7 +103,10 @@ def test_a_potential_is_rolled_in_the_bath_that_is_asked_for(tmp_path: Path) -> 
     moved = {name: np.abs(x - x[0]).max() for name, x in frames.items()}
     assert moved["hot"] > 2.0 * moved["cold"]
     assert not np.allclose(frames["free"][1:], frames["hot"][1:], atol=1e-4)
+    assert not np.allclose(frames["heavy"][1:], frames["free"][1:], atol=1e-4)
     assert potential.config.temperature_k == 300.0
+    with pytest.raises(InputError, match="hydrogen"):
+        RolloutConfig(time_ps=0.02, hydrogen_mass_da=50.0)
 
 
 def test_models_of_frames_take_no_other_bath() -> None:

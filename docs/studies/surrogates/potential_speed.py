@@ -1,0 +1,71 @@
+"""What a force of PAINET as a potential costs, plain and compiled, alone and in batches, beside GFN2-xTB's, in
+processor time of one core (the least of several).
+
+    python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [--plain] [SMILES...]
+
+The weights are those that training begins with: the cost does not depend on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import torch
+
+from md_reference.forces.quantum import Potential
+from surrogate.models.compiling import with_compiled_parts
+from surrogate.models.interface import Molecule
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.model import PainetPotential
+from systems.prepare.molecule import scene_from_smiles
+
+# Glycol, aspirin, paracetamol.
+MOLECULES = ("OCCO", "CC(=O)Oc1ccccc1C(=O)O", "CC(=O)Nc1ccc(O)cc1")
+ROUNDS = 8
+
+
+def least_ms(call: Callable[[], object]) -> float:
+    """Return the least processor time of a call in ms, after two that do not count."""
+    times = []
+    for _ in range(2 + ROUNDS):
+        began = time.process_time()
+        call()
+        times.append(1e3 * (time.process_time() - began))
+    return min(times[2:])
+
+
+def ask(truth: Potential, frames: Iterator[torch.Tensor]) -> None:
+    """Have the truth answer at the next frame: at the one before it would begin where it ended."""
+    truth(next(frames).numpy())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("molecules", nargs="*", default=MOLECULES)
+    parser.add_argument("--batches", default="1,32,256")
+    parser.add_argument("--plain", action="store_true", help="compile nothing")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    plain = PainetPotential(PotentialConfig()).eval().requires_grad_(False)
+    for smiles in given.molecules:
+        scene = scene_from_smiles(smiles)
+        molecule, truth = Molecule.of(scene), Potential(scene)
+        at = torch.tensor(scene.positions_nm)[None]
+        moved = iter(at + 0.003 * torch.randn(2 + ROUNDS, *at.shape[1:], dtype=at.dtype))
+        line = [f"{smiles}, {scene.n_atoms} atoms: GFN2-xTB {least_ms(partial(ask, truth, moved)):.3g} ms"]
+        for rows in map(int, given.batches.split(",")):
+            x = at + 0.003 * torch.randn(rows, *at.shape[1:], dtype=at.dtype)
+            found = [plain] if given.plain else [plain, with_compiled_parts(plain)]
+            costs = [least_ms(partial(model.forces, x, molecule)) / rows for model in found]
+            line.append(f"batch {rows}: " + ", compiled ".join(f"{cost:.3g}" for cost in costs))
+        sys.stdout.write("; ".join(line) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
