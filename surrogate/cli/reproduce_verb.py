@@ -30,6 +30,7 @@ def reproduce(
     from surrogate.bench.reproduce.md17_data import MD17_MOLECULES
     from surrogate.bench.reproduce.md17_methods import METHODS as MOLECULE_METHODS
     from surrogate.bench.reproduce.n_body_methods import METHODS
+    from surrogate.models.particles.trainer import PAPER_STEPS
     from surrogate.progress import progress_bar
     from surrogate.training.devices import choose_device
 
@@ -41,10 +42,15 @@ def reproduce(
     else:
         bodies.check_names(name, chosen)
     folder = out or Path(f"surromd-{name}")
+    steps = options.steps
+    if options.paper_size and not of_molecules and steps is None:
+        steps = PAPER_STEPS
     settings = Settings(
         folder=folder,
-        budget_s=None if options.steps is not None else options.budget_s,
-        steps=options.steps,
+        budget_s=None if steps is not None else options.budget_s,
+        steps=steps,
+        call_s=options.call_s,
+        paper_size=options.paper_size,
         seed=options.seed,
         resume=options.resume,
         device=choose_device(options.device),

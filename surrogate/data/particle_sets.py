@@ -46,7 +46,11 @@ class ParticleSet:
 
     def first(self, n: int) -> ParticleSet:
         """Return the first n systems."""
-        arrays = {name: getattr(self, name)[:n] for name in _ARRAYS}
+        return self.rows(slice(n))
+
+    def rows(self, which: slice | npt.NDArray[np.int64]) -> ParticleSet:
+        """Return these systems."""
+        arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
         return ParticleSet(**arrays, lag_ps=self.lag_ps)
 
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,21 +34,25 @@ N_GIVEN, N_NEW, N_SAMPLES = 10, 20, 5
 
 @dataclass(frozen=True)
 class Settings:
-    """`budget_s` of wall time or `steps` for each method that is trained. `solver_steps` of LaM-SLidE: a single one,
+    """`budget_s` of wall time or `steps` for each method that is trained; `call_s`: end after so much wall time, saved.
+    `paper_size`: LaM-SLidE of the paper's sizes. `solver_steps` of LaM-SLidE: a single one,
     from noise straight to the predicted data, is the mean of what may come, nearer to what does come than a sample.
 
     Beyond the papers: `extrapolate`: LaM-SLidE learns what the polynomial extrapolation of the given frames
     misses, each predicted frame in units of its own size, instead of absolute positions; `any_start`: EGNN learns from
     every frame of a trajectory, not from the tenth alone; `from_velocity`: EGNN adds the motion at constant velocity;
-    `predicted_only`: LaM-SLidE's loss leaves out the given frames. Of molecules alone, `clean_conditioning`: in
-    LaM-SLidE given frames see neither flow time nor what follows, so that evaluations compute them once; `canonical`:
-    LaM-SLidE sees windows in the body frame instead of turned at random; there `extrapolate` is the best linear
-    forecast, and `any_start` takes every training window, not the protocol's 5,000.
+    `predicted_only`: LaM-SLidE's loss leaves out the given frames. Of particles as latents alone, `mirrored`: windows
+    are reflected and run backwards, too; `pair_messages`: layers pass messages along pairs. Of molecules alone,
+    `clean_conditioning`: in LaM-SLidE given frames see neither flow time nor what follows, so that evaluations compute
+    them once; `canonical`: LaM-SLidE sees windows in the body frame instead of turned at random; there `extrapolate` is
+    the best linear forecast, and `any_start` takes every training window, not the protocol's 5,000.
     """
 
     folder: Path
     budget_s: float | None = 600.0
     steps: int | None = None
+    call_s: float | None = None
+    paper_size: bool = False
     seed: int = 0
     resume: bool = False
     extrapolate: bool = True
@@ -55,10 +60,16 @@ class Settings:
     from_velocity: bool = True
     canonical: bool = True
     predicted_only: bool = True
+    mirrored: bool = True
+    pair_messages: bool = True
     clean_conditioning: bool = False
     device: str = "cpu"
     solver_steps: int = 10
     progress: ProgressFn | None = None
+
+    @cached_property
+    def _ends_at(self) -> float | None:
+        return None if self.call_s is None else time.monotonic() + self.call_s
 
     def training(self, name: str) -> Training:
         """Return the settings of one method's training. One thread: the tensors are small."""
@@ -69,28 +80,24 @@ class Settings:
         torch.set_num_threads(1)
         torch.manual_seed(self.seed)
         self.folder.mkdir(parents=True, exist_ok=True)
-        made = Training(name, self.folder, self.budget_s, self.steps, self.seed, self.resume,
-                        progress=self.progress, device=self.device)  # fmt: skip
+        # A call that ends early saves often enough to end in time.
+        every_s = 60.0 if self.call_s is None else min(60.0, self.call_s / 8)
+        made = Training(name, self.folder, self.budget_s, self.steps, self.seed, self.resume, every_s,
+                        progress=self.progress, device=self.device, ends_at=self._ends_at)  # fmt: skip
         if not self.resume:
             for path in (made.log, *self.folder.glob(f"{name}.*.train.safetensors")):
                 path.unlink(missing_ok=True)
         return made
 
 
-SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical", "predicted-only")
+SWITCHES = ("extrapolate", "any-start", "from-velocity", "canonical", "predicted-only", "mirrored", "pair-messages")
 
 
 def without_switches(settings: Settings, without: Sequence[str]) -> Settings:
     """Return the settings with these switches off. Raises UnknownNameError."""
     check_known(switch=(without, SWITCHES))
-    return replace(
-        settings,
-        extrapolate=settings.extrapolate and "extrapolate" not in without,
-        any_start=settings.any_start and "any-start" not in without,
-        from_velocity=settings.from_velocity and "from-velocity" not in without,
-        canonical=settings.canonical and "canonical" not in without,
-        predicted_only=settings.predicted_only and "predicted-only" not in without,
-    )
+    off: dict[str, Any] = {name.replace("-", "_"): False for name in without}
+    return replace(settings, **off)
 
 
 @dataclass(frozen=True)
@@ -183,9 +190,13 @@ def extrapolate(given: Array, weights: Array) -> Array:
 
 
 def latent_forecaster(
-    settings: Settings, autoencoder: AutoencoderConfig, *, latents_per_token: int, width: int, n_layers: int
-) -> LamSlide:
-    """Return LaM-SLidE for windows of this protocol: positions as the task's view makes them, no auxiliary losses."""
+    settings: Settings, autoencoder: AutoencoderConfig, *, latents_per_token: int, width: int, n_layers: int,
+    plain_flow: bool = False,
+) -> LamSlide:  # fmt: skip
+    """Return LaM-SLidE for windows of this protocol: positions as the task's view makes them, no auxiliary losses.
+
+    `plain_flow`: as in the paper, uniform flow times of weight one and no preconditioning.
+    """
     from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
     from surrogate.models.lam_slide.model import LamSlide
 
@@ -202,6 +213,8 @@ def latent_forecaster(
                 latents_per_token=latents_per_token,
                 width=width,
                 n_layers=n_layers,
+                precondition=not plain_flow,
+                uniform_tau=plain_flow,
                 position_weight=0.0,
                 distance_weight=0.0,
             ),
@@ -213,7 +226,8 @@ def sampled(
     model: LamSlide, known: torch.Tensor, n: int, n_samples: int, settings: Settings, generator: torch.Generator
 ) -> Array:
     """Draw frames to come after the latents `known` (b, n_given, n_latents, latent_dim) of systems of `n` entities, as
-    the model sees them: `(n_samples, b, n_new, n, 3)`. What is given is encoded once for all samples."""
+    the model sees them: `(n_samples, b, n_new, n, 3)`. What is given is encoded once for all samples. Without
+    preconditioning by Euler steps, as in the paper."""
     import torch
 
     from surrogate.models.lam_slide import flow
@@ -222,10 +236,11 @@ def sampled(
         with torch.autocast(known.device.type, dtype=torch.bfloat16):  # as it was trained
             return model.approximator(o, tau, known)
 
+    solve = flow.multistep if model.config.approximator.precondition else flow.euler
     samples = []
     for _ in range(n_samples):
         noise = torch.randn((len(known), *model.noise_shape(n)), generator=generator).to(known.device)
-        latents = flow.multistep(predict, noise, settings.solver_steps, "linear")
+        latents = solve(predict, noise, settings.solver_steps, "linear")
         samples.append(model.decode(latents[:, N_GIVEN:], n).double().cpu().numpy())
     return np.stack(samples)
 

@@ -127,7 +127,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
         for m in molecules
     }
     training, device = settings.training("lam-slide"), torch.device(settings.device)
-    model = lam_slide_model(settings, large=device.type == "cuda")
+    model = lam_slide_model(settings, large=settings.paper_size or device.type == "cuda")
 
     def seen(m: MoleculeWindows, windows: Array) -> tuple[torch.Tensor, torch.Tensor]:
         x = torch.from_numpy(views[m.name].to_model(windows)).float()

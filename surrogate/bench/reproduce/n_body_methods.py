@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +25,14 @@ from surrogate.bench.reproduce.forecast_methods import (
     polynomial_weights,
     sampled,
 )
+from surrogate.bench.reproduce.n_body_views import ParticleView, WindowView
 from surrogate.data.particle_sets import ParticleSet
+
+if TYPE_CHECKING:
+    from surrogate.models.lam_slide.model import LamSlide
+
+# Systems that are forecast at once.
+_BLOCK = 250
 
 
 def best_polynomial(data: ParticleSet) -> tuple[int, int, Array]:
@@ -93,31 +101,39 @@ def pair_forces(train: ParticleSet, validation: ParticleSet, settings: Settings)
 
 
 def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted[ParticleSet]:
-    """LaM-SLidE: ten given frames, random identifiers and rotations, loss on predicted frames; told of charges."""
+    """LaM-SLidE: ten given frames, random identifiers and rotations, loss on predicted frames; told of charges, which
+    its code of a frame must give back, or it would leave them out."""
     import torch
 
-    from surrogate.models.lam_slide.config import AutoencoderConfig
-    from surrogate.models.particles.trainer import encode_windows, train_lam_slide_on_windows, turned_windows
+    from surrogate.models.particles.trainer import (
+        PAPER_SIZES,
+        StageSizes,
+        encode_windows,
+        train_lam_slide_on_windows,
+        turned_windows,
+    )
 
     training = settings.training("lam-slide")
     degree, _, weights = best_polynomial(validation) if settings.extrapolate else (0, 0, None)
     view = WindowView.of(train, weights)
-    autoencoder = AutoencoderConfig(
-        n_latents=2, latent_dim=32, width=64, identifier_pool=train.n_particles, n_octaves=3, type_weight=0.0
-    )
-    model = latent_forecaster(settings, autoencoder, latents_per_token=2, width=128, n_layers=4)
+    model = set_forecaster(settings, train.n_particles)
     held = validation.first(min(100, len(validation)))
     seen = [(torch.from_numpy(view.to_model(s.positions_nm)).float(), torch.from_numpy(s.types)) for s in (train, held)]
-    seconds = train_lam_slide_on_windows(model, turned_windows(*seen[0]), [seen[1]], training)
-    model.cpu().eval()
+    sizes = PAPER_SIZES if settings.paper_size else StageSizes()
+    seconds = train_lam_slide_on_windows(model, turned_windows(*seen[0]), [seen[1]], training, sizes)
+    model.eval()
+    device = torch.device(settings.device)
 
     @torch.no_grad()
     def forecast(data: ParticleSet, given: Array, n_samples: int) -> Array:
-        n, types = data.n_particles, torch.from_numpy(data.types)
-        known = encode_windows(model, torch.from_numpy(view.given(given)).float(), types)
-        generator = torch.Generator().manual_seed(settings.seed)
-        seen_ahead = sampled(model, known, n, n_samples, settings, generator)
-        return np.stack([view.from_model(given, sample) for sample in seen_ahead])
+        generator, found = torch.Generator().manual_seed(settings.seed), []
+        for start in range(0, len(data), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            seen_given = torch.from_numpy(view.given(given[rows])).float().to(device)
+            known = encode_windows(model, seen_given, torch.from_numpy(data.types[rows]).to(device))
+            drawn = sampled(model, known, data.n_particles, n_samples, settings, generator)
+            found.append(np.stack([view.from_model(given[rows], sample) for sample in drawn]))
+        return np.concatenate(found, axis=1)
 
     more = beyond({f"corrects a polynomial of degree {degree}": settings.extrapolate,
                    "loss on predicted frames alone": settings.predicted_only})  # fmt: skip
@@ -126,45 +142,49 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
     )
 
 
-@dataclass(frozen=True, eq=False)
-class WindowView:
-    """How LaM-SLidE sees windows `(n, n_frames, n_particles, 3)`: given frames about the mean of the last one's
-    particles in units of `scale_nm`; those to predict likewise or, with `weights`, as the difference from the
-    extrapolation, frame by frame in units of `scales_nm` (n_new,)."""
+def set_forecaster(settings: Settings, n_particles: int) -> LamSlide:
+    """Return LaM-SLidE with a set of latents: of sizes for a CPU, or of the published ones (Table 10)."""
+    from surrogate.models.lam_slide.config import AutoencoderConfig
 
-    scale_nm: float
-    scales_nm: Array
-    weights: Array | None
-
-    @staticmethod
-    def of(data: ParticleSet, weights: Array | None) -> WindowView:
-        """Measure the scales on a set."""
-        x = data.positions_nm
-        about = x - _centre(x[:, :N_GIVEN])
-        scale = float(np.sqrt((about[:, :N_GIVEN] ** 2).mean()))
-        if weights is None:
-            return WindowView(scale, np.full(N_NEW, float(np.sqrt((about**2).mean()))), None)
-        left = x[:, N_GIVEN:] - extrapolate(x[:, :N_GIVEN], weights)
-        return WindowView(scale, np.sqrt((left**2).mean(axis=(0, 2, 3))), weights)
-
-    def given(self, given: Array) -> Array:
-        return (given - _centre(given)) / self.scale_nm
-
-    def to_model(self, windows: Array) -> Array:
-        given, ahead = windows[:, :N_GIVEN], windows[:, N_GIVEN:]
-        rest = (ahead - self._base(given)) / self.scales_nm[:, None, None]
-        return np.concatenate([self.given(given), rest], axis=1)
-
-    def from_model(self, given: Array, seen: Array) -> Array:
-        """Given frames and predicted ones as the model sees them -> predicted positions, nm."""
-        return self._base(given) + seen * self.scales_nm[:, None, None]
-
-    def _base(self, given: Array) -> Array:
-        return _centre(given) if self.weights is None else extrapolate(given, self.weights)
+    code = AutoencoderConfig(identifier_pool=n_particles, latent_dim=32, n_octaves=3, type_weight=0.1)
+    if settings.paper_size:
+        code = replace(code, identifier_pool=max(10, n_particles), n_latents=16, n_heads=2, head_dim=16,
+                       identifier_dim=128, n_decoder_layers=1, latent_noise=0.0, random_identifiers=1.0)  # fmt: skip
+        return latent_forecaster(settings, code, latents_per_token=1, width=256, n_layers=6, plain_flow=True)
+    code = replace(code, n_latents=2, width=64)
+    return latent_forecaster(settings, code, latents_per_token=2, width=128, n_layers=4, plain_flow=True)
 
 
-def _centre(given: Array) -> Array:
-    return given[:, -1:].mean(axis=2, keepdims=True)
+def lam_slide_particles(train: ParticleSet, validation: ParticleSet, settings: Settings) -> Fitted[ParticleSet]:
+    """LaM-SLidE with particles as their own latents, all that one will do in one token; told of charges and springs."""
+    import torch
+
+    from surrogate.models.particles.flow_trainer import sample_ahead, train_particle_flow
+    from surrogate.models.particles.particle_flow import ParticleFlow, ParticleFlowConfig
+
+    training = settings.training("lam-slide-particles")
+    degree, _, weights = best_polynomial(validation) if settings.extrapolate else (0, 0, None)
+    view = ParticleView.of(train, weights)
+    held = validation.first(min(100, len(validation)))
+    seen = view.to_model(held.positions_nm, held)
+    n_features = seen.given.features.shape[-1]
+    model = ParticleFlow(ParticleFlowConfig(n_features, n_new=N_NEW, pair_messages=settings.pair_messages))
+    draw = view.drawn(train, mirrored=settings.mirrored)
+    seconds = train_particle_flow(model, draw, [seen], training)
+    model.eval()
+
+    def forecast(data: ParticleSet, given: Array, n_samples: int) -> Array:
+        known = view.known(given, data).to(torch.device(settings.device))
+        generator = torch.Generator().manual_seed(settings.seed)
+        samples = [sample_ahead(model, known, settings.solver_steps, generator) for _ in range(n_samples)]
+        return np.stack([view.from_model(given, x.double().cpu().numpy()) for x in samples])
+
+    more = beyond({"particles are latents": True, f"corrects a polynomial of degree {degree}": settings.extrapolate,
+                   "mirrored in space and time": settings.mirrored,
+                   "messages along pairs": settings.pair_messages})  # fmt: skip
+    return Fitted(
+        forecast, f"positions, pair kinds, {settings.solver_steps} Euler steps{more}", seconds, n_parameters(model)
+    )
 
 
 METHODS: dict[str, Callable[[ParticleSet, ParticleSet, Settings], Fitted[ParticleSet]]] = {
@@ -173,5 +193,6 @@ METHODS: dict[str, Callable[[ParticleSet, ParticleSet, Settings], Fitted[Particl
     "polynomial": polynomial,
     "egnn": egnn,
     "lam-slide": lam_slide,
+    "lam-slide-particles": lam_slide_particles,
     "pair-forces": pair_forces,
 }

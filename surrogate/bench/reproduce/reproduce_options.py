@@ -18,7 +18,9 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
 
     budget_s: float = option("Wall time of each method's training.", 600.0)
     methods: Sequence[str] | None = option(
-        "Only this; may be repeated. Baselines, egnn, lam-slide, pair-forces (n-body).", None, words=("method",)
+        "Only this; may be repeated. Baselines, egnn, lam-slide, and (n-body) lam-slide-particles, pair-forces.",
+        None,
+        words=("method",),
     )
     n_train: int | None = option(_SIZE, None, within=(2, None), words=("train",))
     n_test: int | None = option(_SIZE, None, within=(2, None), words=("test",))
@@ -27,7 +29,9 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
     )
     plain: bool = option("Leave out what goes beyond the papers: all that can be left out.", False)
     without: Sequence[str] | None = option(
-        "Leave out: extrapolate, any-start, from-velocity, canonical, predicted-only. Repeatable.", None
+        "Leave out: extrapolate, any-start, from-velocity, canonical, predicted-only, mirrored, pair-messages. "
+        "Repeatable.",
+        None,
     )
     clean_conditioning: bool = option("md17: LaM-SLidE computes given frames once a chunk.", False)
     molecules: Sequence[str] | None = option(
@@ -36,6 +40,12 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
     time_ps: float = option("md17: trajectory of each molecule.", 200.0)
     md17_ethanol: Path | None = option("md17: an .npz of MD17's own ethanol to forecast as well.", None)
     steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
+    call_s: float | None = option(
+        "End this call at the first saved state after so long; `resume` goes on.", None, within=(0, None)
+    )
+    paper_size: bool = option(
+        "LaM-SLidE of the published sizes, n-body for the published epochs unless `steps` says otherwise.", False
+    )
     solver_steps: int = option("LaM-SLidE's; 1 gives its mean forecast instead of samples.", 10, within=(1, None))
     workers: int | None = option("n-body: processes that simulate.", None, within=(1, None), unset="one a core")
     device: str = option("Where to train: auto, cpu or cuda.", "auto")

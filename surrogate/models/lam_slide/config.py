@@ -58,7 +58,8 @@ class ApproximatorConfig:
     clean_conditioning: bool = False
     # Given frames count in the loss beside the predicted ones, as in the paper's code.
     loss_on_given: bool = False
-    # Flow times are logit-normal: a positive location draws more of them near the data end.
+    # Flow times are logit-normal: a positive location draws more of them near the data end. Uniform is the paper.
+    uniform_tau: bool = False
     tau_location: float = 0.5
     tau_scale: float = 1.4
     position_weight: float = 0.25

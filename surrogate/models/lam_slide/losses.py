@@ -62,8 +62,10 @@ def autoencoder_loss(
 
 
 def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> Tensor:
-    """Return logit-normal flow times `(batch,)` in (0, TAU_MAX]."""
+    """Return flow times `(batch,)` in [0, TAU_MAX], logit-normal or uniform."""
     c = model.config.approximator
+    if c.uniform_tau:
+        return torch.rand(batch, generator=generator).clamp(max=TAU_MAX)
     draws = torch.randn(batch, generator=generator) * c.tau_scale + c.tau_location
     return torch.sigmoid(draws).clamp(max=TAU_MAX)
 

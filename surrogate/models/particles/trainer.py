@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,8 @@ from surrogate.models.lam_slide.losses import (
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.particles.model import EgnnJump, PairForces
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
+from systems.errors import UnfinishedError
 
-# Share of LaM-SLidE's budget that the autoencoder gets.
-STAGE_ONE_SHARE = 0.35
 # Share of the pair forces' budget that coarse steps get.
 COARSE_SHARE = 0.4
 # Error of a particle's step beyond which it is left out of the fine part, nm/ps.
@@ -44,8 +44,12 @@ class Training:
     validate_every_s: float = 60.0
     progress: ProgressFn | None = None
     device: str = "cpu"
+    # Monotonic time after which the first saved state ends the call.
+    ends_at: float | None = None
 
-    def stage(self, part: str, share: float, *, batch: int, rate: float, bf16: bool) -> StageConfig:
+    def stage(
+        self, part: str, share: float, *, batch: int, rate: float, bf16: bool, ema_decay: float = 0.99
+    ) -> StageConfig:
         """Return the loop's settings for a part of the training that gets this share of it."""
         return StageConfig(
             part,
@@ -54,7 +58,7 @@ class Training:
             None if self.budget_s is None else self.budget_s * share,
             None if self.steps is None else max(1, round(self.steps * share)),
             warmup_steps=50,
-            ema_decay=0.99,
+            ema_decay=ema_decay,
             seed=self.seed,
             bf16=bf16,
             validate_every_s=self.validate_every_s,
@@ -66,6 +70,22 @@ class Training:
     @property
     def log(self) -> Path:
         return self.folder / f"{self.name}.csv"
+
+
+@dataclass(frozen=True)
+class StageSizes:
+    """Batches and learning rates of LaM-SLidE's two stages, the share of the training that the first one gets, and the
+    decay of the averaged weights."""
+
+    batches: tuple[int, int] = (256, 64)
+    rates: tuple[float, float] = (2e-3, 1e-3)
+    share: float = 0.35
+    ema_decay: float = 0.99
+
+
+# Table 10 and appendix E.5: 2,000 epochs and 1,000 of 3,000 windows, which are 47,000 steps of each stage.
+PAPER_SIZES = StageSizes((128, 64), (1e-3, 1e-3), 0.5, 0.999)
+PAPER_STEPS = 94_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +154,7 @@ def train_egnn(model: EgnnJump, draw: DrawJump, held: Sequence[Jump], training: 
         errors = [mean_distance(model.all_frames(j.x, j.v, j.types, j.pairs), j.truth) for j in held]
         return {"validation_ade": float(torch.stack(errors).mean())}
 
-    return _run(model, stage, loss_fn, validate, training)
+    return run_training(model, stage, loss_fn, validate, training)
 
 
 def jumps_of(data: ParticleSet, n_given: int, *, any_start: bool) -> DrawJump:
@@ -191,7 +211,7 @@ def train_pair_forces(model: PairForces, train: ParticleSet, validation: Particl
         def validate() -> dict[str, float]:
             return {"validation_step": float(one_step(held, rows_held, at_held, substeps).clamp(max=largest).mean())}
 
-        return _run(model, stage, loss_fn, validate, training)
+        return run_training(model, stage, loss_fn, validate, training)
 
     c = model.config
     spent = part("pair-forces", COARSE_SHARE, c.training_substeps, 1e-2, float("inf"))
@@ -199,7 +219,11 @@ def train_pair_forces(model: PairForces, train: ParticleSet, validation: Particl
 
 
 def train_lam_slide_on_windows(
-    model: LamSlide, draw: DrawWindows, held: Sequence[tuple[Tensor, Tensor]], training: Training
+    model: LamSlide,
+    draw: DrawWindows,
+    held: Sequence[tuple[Tensor, Tensor]],
+    training: Training,
+    sizes: StageSizes = StageSizes(),
 ) -> float:
     """Train both stages on windows in the model's units times its scale; return the seconds spent.
 
@@ -209,8 +233,9 @@ def train_lam_slide_on_windows(
     device = torch.device(training.device)
     model.to(device)
     held = [(x.to(device), kinds.to(device)) for x, kinds in held]
-    one = training.stage("autoencoder", STAGE_ONE_SHARE, batch=256, rate=2e-3, bf16=False)
-    two = training.stage("flow", 1.0 - STAGE_ONE_SHARE, batch=64, rate=1e-3, bf16=True)
+    more = {"ema_decay": sizes.ema_decay}
+    one = training.stage("autoencoder", sizes.share, batch=sizes.batches[0], rate=sizes.rates[0], bf16=False, **more)
+    two = training.stage("flow", 1.0 - sizes.share, batch=sizes.batches[1], rate=sizes.rates[1], bf16=True, **more)
 
     def drawn(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         x, kinds = draw(batch, generator)
@@ -226,8 +251,8 @@ def train_lam_slide_on_windows(
         errors = [mean_distance(model.decode(encode_windows(model, *pair), pair[0].shape[2]), pair[0]) for pair in held]
         return {"validation_distance": float(torch.stack(errors).mean())}
 
-    spent = _run(model.autoencoder, one, stage_one, reconstruction, training)
-    _normalise(model, drawn)
+    spent = run_training(model.autoencoder, one, stage_one, reconstruction, training)
+    normalise_latents(model, drawn)
     model.autoencoder.requires_grad_(False)
 
     def stage_two(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -246,7 +271,7 @@ def train_lam_slide_on_windows(
             losses.append(flow_loss(model, windows, tau, generator)[1]["flow"])
         return {"validation_flow": float(torch.stack(losses).mean())}
 
-    return spent + _run(model.approximator, two, stage_two, flow, training)
+    return spent + run_training(model.approximator, two, stage_two, flow, training)
 
 
 def turned_windows(windows: Tensor, types: Tensor) -> DrawWindows:
@@ -278,7 +303,7 @@ def mean_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _normalise(model: LamSlide, draw: DrawWindows, n_draws: int = 16, batch: int = 32) -> None:
+def normalise_latents(model: LamSlide, draw: DrawWindows, n_draws: int = 16, batch: int = 32) -> None:
     """Measure the latents' means and common scale."""
     model.latent_mean.zero_()
     model.latent_scale.fill_(1.0)
@@ -288,18 +313,30 @@ def _normalise(model: LamSlide, draw: DrawWindows, n_draws: int = 16, batch: int
     model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
 
 
-def _run(
+def run_training(
     module: torch.nn.Module,
     stage: StageConfig,
     loss_fn: Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]],
     validate: Callable[[], dict[str, float]],
     training: Training,
 ) -> float:
+    """Train a stage as `training` says; return the seconds spent. Raises UnfinishedError where the call has to end."""
+
+    def progress(name: str, share: float, metrics: dict[str, float]) -> None:
+        if training.progress is not None:
+            training.progress(name, share, metrics)
+        # With metrics the state has just been saved.
+        if metrics and share < 1.0 and training.ends_at is not None and time.monotonic() > training.ends_at:
+            raise UnfinishedError(
+                f"{training.name}: this call's time is up at {share:.0%} of stage {name!r}; give the same command "
+                "again with --resume."
+            )
+
     return run_stage(
         module,
         stage,
         loss_fn,
         validate,
         StagePlace(training.state(stage.name), training.log, torch.device(training.device), training.resume),
-        progress=training.progress,
+        progress=progress,
     )

@@ -15,13 +15,17 @@ from surrogate.bench.reproduce.forecast_errors import estimate, forecast_errors,
 from surrogate.bench.reproduce.forecast_methods import N_GIVEN, Settings, extrapolate, polynomial_weights
 from surrogate.bench.reproduce.n_body import reproduce, table_lines
 from surrogate.bench.reproduce.n_body_data import make_sets, make_systems, split_seeds
-from surrogate.bench.reproduce.n_body_methods import METHODS, WindowView, best_polynomial
+from surrogate.bench.reproduce.n_body_methods import METHODS, best_polynomial, set_forecaster
+from surrogate.bench.reproduce.n_body_views import ParticleView, WindowView
 from surrogate.bench.reproduce.published import PUBLISHED
 from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
-from surrogate.models.lam_slide.losses import random_rotations
+from surrogate.models.lam_slide.losses import autoencoder_loss, random_rotations
+from surrogate.models.particles.flow_trainer import sample_ahead
 from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
-from systems.errors import InputError, UnknownNameError
+from surrogate.models.particles.particle_flow import Given, ParticleFlow, ParticleFlowConfig
+from surrogate.models.particles.trainer import turned_windows
+from systems.errors import InputError, UnfinishedError, UnknownNameError
 
 COUNTS = {"train": 8, "validation": 3, "test": 4}
 
@@ -223,6 +227,105 @@ def test_the_velocity_of_a_pair_that_turns_between_two_frames_needs_more_than_tw
         model.last_velocity(given[:, :1], pairs)
 
 
+def test_particles_come_back_from_their_view_and_given_frames_carry_no_future(charges: ParticleSet) -> None:
+    x = charges.positions_nm
+    view = ParticleView.of(charges, polynomial_weights(1, 3))
+    seen = view.to_model(x, charges)
+    back = view.from_model(x[:, :N_GIVEN], seen.ahead.double().numpy())
+    np.testing.assert_allclose(back, x[:, N_GIVEN:], rtol=0, atol=1e-5)
+    other = x.copy()
+    other[:, N_GIVEN:] += 1.0
+    torch.testing.assert_close(view.to_model(other, charges).given.features, seen.given.features, rtol=0, atol=0)
+    # The last step stands where pair messages look for it, and its size is one.
+    step = x[:, 9] - x[:, 8]
+    step = (step - step.mean(1, keepdims=True)) / view.sizes_nm[1]
+    np.testing.assert_allclose(seen.given.features[..., 3:6].numpy(), step, rtol=0, atol=1e-5)
+    # Where the system is and how fast it moves as a whole is not told, and comes back all the same.
+    flown = x + 3.0 + 0.2 * np.arange(30)[:, None, None]
+    moved = view.to_model(flown, charges)
+    torch.testing.assert_close(moved.given.features, seen.given.features, rtol=0, atol=1e-4)
+    torch.testing.assert_close(moved.ahead, seen.ahead, rtol=0, atol=1e-4)
+
+
+def test_mirrored_windows_are_turned_reflected_and_run_backwards(charges: ParticleSet) -> None:
+    view = ParticleView.of(charges, polynomial_weights(1, 3))
+    one = charges.first(1)
+    forwards, backwards = (view.to_model(x, one).given.features for x in (one.positions_nm, one.positions_nm[:, ::-1]))
+
+    def lengths(features: torch.Tensor) -> torch.Tensor:
+        return features.unflatten(-1, (-1, 3)).norm(dim=-1)
+
+    for mirrored, n_kinds in ((True, 2), (False, 1)):
+        drawn = view.drawn(one, mirrored=mirrored)(64, torch.Generator().manual_seed(0)).given.features
+        ahead = (lengths(drawn) - lengths(forwards)).abs().amax((1, 2)) < 1e-3
+        back = (lengths(drawn) - lengths(backwards)).abs().amax((1, 2)) < 1e-3
+        assert (ahead | back).all()
+        assert bool(back.any()) == mirrored
+        # Handedness of the last positions and steps tells a reflection from a turn.
+        sense = torch.linalg.det(drawn[ahead, 0, :9].unflatten(-1, (3, 3))).sign()
+        assert len(sense.unique()) == n_kinds
+
+
+@pytest.mark.parametrize(("frames_per_token", "pair_messages"), [(20, True), (20, False), (5, True)])
+def test_particle_flow_permutes_with_its_particles(
+    charges: ParticleSet, frames_per_token: int, pair_messages: bool
+) -> None:
+    torch.manual_seed(0)
+    view = ParticleView.of(charges, polynomial_weights(1, 3))
+    given = view.known(charges.positions_nm[:, :N_GIVEN], charges)
+    n_features = given.features.shape[-1]
+    config = ParticleFlowConfig(
+        n_features, frames_per_token=frames_per_token, width=32, n_layers=2, pair_messages=pair_messages
+    )
+    model = ParticleFlow(config)
+    noise, tau = torch.randn(len(charges), 5, 20, 3), torch.rand(len(charges))
+    assert (model(noise, tau, given) == 0).all()  # a fresh network predicts the mean of what it learns
+    for p in model.parameters():
+        torch.nn.init.normal_(p, std=0.2)
+    plain = model(noise, tau, given)
+    order = torch.randperm(5)
+    turned = Given(given.features[:, order], given.types[:, order], given.pairs[:, order][:, :, order])
+    torch.testing.assert_close(model(noise[:, order], tau, turned), plain[:, order], rtol=0, atol=1e-4)
+    # Negative controls: kinds left behind, and what the flow time, the pairs and each given frame say.
+    assert (model(noise, tau, Given(given.features, given.types.flip(1), given.pairs)) - plain).abs().max() > 1e-3
+    assert (model(noise, 1 - tau, given) - plain).abs().max() > 1e-3
+    other = model(noise, tau, Given(given.features, given.types, 1 - given.pairs))
+    assert bool((other - plain).abs().max() > 1e-3) == pair_messages
+    features = given.features.clone()
+    features[..., -1] += 1.0
+    assert (model(noise, tau, Given(features, given.types, given.pairs)) - plain).abs().max() > 1e-3
+
+
+def test_samples_of_particles_in_blocks_are_those_of_each(charges: ParticleSet) -> None:
+    torch.manual_seed(0)
+    view = ParticleView.of(charges, polynomial_weights(1, 3))
+    given = view.known(charges.positions_nm[:, :N_GIVEN], charges)
+    model = ParticleFlow(ParticleFlowConfig(given.features.shape[-1], width=32, n_layers=1))
+    torch.nn.init.normal_(model.final.weight, std=0.2)
+    drawn = sample_ahead(model, given, 3, torch.Generator().manual_seed(1))
+    again = sample_ahead(model, given, 3, torch.Generator().manual_seed(1))
+    assert torch.equal(drawn, again)
+    assert not torch.equal(drawn, sample_ahead(model, given, 3, torch.Generator().manual_seed(2)))
+    with pytest.raises(InputError, match="frames_per_token = 7"):
+        ParticleFlowConfig(54, frames_per_token=7)
+
+
+def test_the_code_of_a_frame_is_asked_for_charges(charges: ParticleSet) -> None:
+    """Without it the code leaves them out, and the forecast does not know who attracts whom (results page)."""
+    seen = torch.from_numpy(WindowView.of(charges, None).to_model(charges.positions_nm)).float()
+    draw = turned_windows(seen, torch.from_numpy(charges.types))
+    for paper_size in (False, True):
+        model = set_forecaster(Settings(Path(), paper_size=paper_size), 5)
+        generator = torch.Generator().manual_seed(0)
+        x, kinds = draw(8, generator)
+        _, terms = autoencoder_loss(model, x[:, 0], kinds, generator)
+        assert "type" in terms
+        assert model.config.autoencoder.type_weight > 0
+    approximator = model.config.approximator
+    assert (model.config.autoencoder.n_latents, approximator.width, approximator.n_layers) == (16, 256, 6)  # Table 10
+    assert (approximator.uniform_tau, approximator.precondition) == (True, False)
+
+
 # ---- the whole way -------------------------------------------------------------------------------------------------
 
 
@@ -245,6 +348,26 @@ def test_the_whole_way_prints_our_rows_under_the_published(tmp_path: Path) -> No
     again = run(replace(settings, resume=True))
     for one, other in zip(result.rows, again.rows, strict=True):
         assert (one.method, one.ade, one.fde) == (other.method, other.ade, other.fde)
+
+
+@pytest.mark.parametrize("method", ["lam-slide", "lam-slide-particles"])
+def test_calls_that_end_early_go_on_to_the_same_numbers(method: str, tmp_path: Path) -> None:
+    sizes = {"train": 6, "validation": 2, "test": 3}
+    whole = Settings(tmp_path / "whole", budget_s=None, steps=4, solver_steps=2)
+    run = lambda s: reproduce("n-body-charged", s, methods=[method], sizes=sizes, workers=1)  # noqa: E731
+    expected = run(whole).rows[0]
+    parts = replace(whole, folder=tmp_path / "parts", call_s=1e-6)
+    ended = 0
+    for _ in range(10):
+        try:
+            found = run(parts).rows[0]
+            break
+        except UnfinishedError as error:
+            assert "--resume" in str(error)
+            ended += 1
+            parts = replace(parts, resume=True)
+    assert ended >= 2
+    assert (found.ade, found.fde) == (expected.ade, expected.fde)
 
 
 @pytest.mark.parametrize(
