@@ -72,8 +72,8 @@ CHANGES = (
     Change("set: and clean conditioning", flow={"clean_conditioning": True}),
     Change("set: regression instead of a flow", mean_only=True),
     Change("set: 16 trajectories by heart", n_train=16),
-    Change("set: 5 latents", {"n_latents": 5, "latent_dim": 16}, {"latents_per_token": 1}),
-    Change("set: 16 latents", {"n_latents": 16}, {"latents_per_token": 1}, steps=150),
+    Change("set: 5 latents", {"n_latents": 5, "latent_dim": 16}, {"latents_per_token": 1}, steps=300),
+    Change("set: 16 latents", {"n_latents": 16}, {"latents_per_token": 1}, steps=120),
     Change("particles: a token for 5 frames", particles={"frames_per_token": 5, "pair_messages": False}),
     Change("particles: a token each", particles={"pair_messages": False}),
     Change("particles: not told of charges", particles={"pair_messages": False}, told_charges=False),
@@ -121,7 +121,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
         sample = mean if change.mean_only else _errors(forecast, held, 2, 10)
         return {"mean_ade": mean[0], "sample_ade": sample[0], "sample_fde": sample[1]}
 
-    stage = StageConfig("flow", BATCH, 1e-3, None, steps, warmup_steps=50, ema_decay=0.99, validate_every_s=20.0)
+    stage = StageConfig("flow", BATCH, 2e-3, None, steps, warmup_steps=50, ema_decay=0.99, validate_every_s=20.0)
     seconds = run_stage(network, stage, loss, validate, place)
     place.state.unlink()
     return Found(change.name, steps, round(seconds, 1), **validate(), **code)
@@ -246,7 +246,7 @@ def _key(config: LamSlideConfig, change: Change) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--only", default="", help="lines whose name contains this")
     asked = parser.parse_args()
     torch.set_num_threads(1)
