@@ -33,7 +33,9 @@ class Conditions:
     ensemble: str = option("nvt, nve or npt.", "nvt")
     pressure_bar: float = option("Of the barostat (npt).", 1.0)
     seed: int = 0
-    platform: str = option("OpenMM platform; auto: the fastest, timed on the scene.", "auto")
+    platform: str = option(
+        "OpenMM platform; auto: the fastest, timed here; lanes: 16 replicas at once on a core.", "auto"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,9 +27,11 @@ import numpy.typing as npt
 
 from md_reference.forces.small_molecules.parameter_cache import cache_folder
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, hottest_k
-from systems.errors import SimulationError
+from systems.errors import InputError, SimulationError
 from systems.scene import FloatArray
 
+# What `platform` says for it; to OpenMM it is none.
+PLATFORM = "lanes"
 _SOURCE = Path(__file__).with_name("lanes.cpp")
 _FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-fPIC", "-shared")
 _COULOMB = 138.93545764438198
@@ -224,6 +226,20 @@ class Lanes:
         hottest = hottest_k(self.temperature_k, self.n_dof)
         if not (np.isfinite(self._positions).all() and self.temperatures_k().max() < hottest):
             raise SimulationError("a copy of the molecule blew up: it is hotter than the bath can make it")
+
+    def checkpoint(self) -> bytes:
+        """Return positions, velocities and random states: `restore` goes on as if nothing had been."""
+        return b"".join(array.tobytes() for array in (self._positions, self._velocities, self._random))
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a checkpoint. Raises InputError when it is of another molecule or number of lanes."""
+        arrays = (self._positions, self._velocities, self._random)
+        if len(blob) != sum(array.nbytes for array in arrays):
+            raise InputError("the checkpoint of these replicas is of another molecule or processor.")
+        at = 0
+        for array in arrays:
+            array[...] = np.frombuffer(blob, array.dtype, array.size, at).reshape(array.shape)
+            at += array.nbytes
 
     def _centred(self, positions_nm: FloatArray) -> FloatArray:
         """Far from the origin, where copies wander, single precision is too coarse for constraints."""

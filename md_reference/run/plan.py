@@ -7,6 +7,8 @@ import time
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
@@ -14,6 +16,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
+from md_reference.run.lanes import PLATFORM, Lanes, n_lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform
 from md_reference.run.timing import as_records
@@ -84,7 +87,10 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
     side_by_side = min(replicas, cores)
-    if measure_s > 0:
+    in_lanes = config.platform == PLATFORM
+    if in_lanes:
+        choice = lanes_choice()
+    elif measure_s > 0:
         choice = measured_platform(
             scene,
             config,
@@ -95,7 +101,9 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     else:
         choice = choose_platform(scene.n_atoms, config.platform, born=spec.solvent != "vacuum")
     planned = default = None
-    if measure_s > 0:
+    if measure_s > 0 and in_lanes:
+        planned = _time_lanes_s(scene, config, measure_s, system) / min(replicas, n_lanes())
+    elif measure_s > 0:
         planned, relaxed_nm = _time_step_s(scene, config, measure_s, choice)
         if spec.force_field not in ("gfn2-xtb", "model"):
             alone = PlatformChoice("CPU", 1, "OpenMM's own")
@@ -113,7 +121,9 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
         platform_reason=choice.reason,
         timings=tuple(as_records(list(choice.timings))),
         threads=choice.threads,
-        parallel=_parallel(replicas, cores, choice.threads),
+        parallel=f"{replicas} replicas, {n_lanes()} at once on a core"
+        if in_lanes
+        else _parallel(replicas, cores, choice.threads),
         hydrogen_mass="natural"
         if spec.hydrogen_mass_da is None
         else f"{spec.hydrogen_mass_da:g} Da, taken from the atom it is bonded to",
@@ -126,6 +136,30 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
         skipped=_skips(scene, config, n_constraints, planned, default),
         warnings=(*spec.warnings, *_warnings(scene, spec, config.timestep_ps)),
     )
+
+
+def lanes_choice() -> PlatformChoice:
+    return PlatformChoice(PLATFORM, 1, f"{n_lanes()} replicas at once on a core")
+
+
+def _time_lanes_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> float:
+    """Return the seconds of processor time of one step of all lanes, the fastest of all batches measured."""
+    run = Lanes(
+        system,
+        temperature_k=config.temperature_k,
+        friction_per_ps=config.friction_per_ps,
+        timestep_ps=min(config.timestep_ps, 0.001),
+        seed=config.seed,
+    )
+    run.set_positions(np.repeat(scene.positions_nm[None], run.n_lanes, axis=0))
+    run.step(20)
+    fastest = math.inf
+    began = time.perf_counter()
+    while math.isinf(fastest) or time.perf_counter() - began < wall_s:
+        start = time.process_time()
+        run.step(100)
+        fastest = min(fastest, (time.process_time() - start) / 100)
+    return fastest
 
 
 def _time_step_s(
@@ -163,7 +197,8 @@ def _wall_s(config: MDConfig, replicas: int, step_s: float | None) -> float | No
     """Return the seconds of all replicas, as many at once as there are cores, equilibration included."""
     if step_s is None:
         return None
-    rounds = math.ceil(replicas / available_cores())
+    at_once = n_lanes() if config.platform == PLATFORM else 1
+    rounds = math.ceil(math.ceil(replicas / at_once) / available_cores()) * min(replicas, at_once)
     return rounds * (config.time_ps + config.equilibrate_ps) / config.timestep_ps * step_s
 
 

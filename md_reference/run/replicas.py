@@ -13,11 +13,13 @@ from typing import Any
 
 from md_reference.forces.forcefield import resolve
 from md_reference.run.config import MDConfig, check_run
+from md_reference.run.lanes import PLATFORM, n_lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.parent_watch import end_with_parent
-from md_reference.run.plan import line_of_run
+from md_reference.run.plan import lanes_choice, line_of_run
 from md_reference.run.platforms import measured_platform
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
+from md_reference.run.simulate_lanes import simulate_batch
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -25,7 +27,7 @@ from systems.scene import Scene
 
 @dataclass(frozen=True)
 class _Board:
-    """What replicas write and their parent reads: frames done, shares equilibrated (both by replica), last words."""
+    """What processes write and their parent reads: frames done, shares equilibrated (both by process), last words."""
 
     done: Any
     equilibrated: Any
@@ -46,31 +48,40 @@ def simulate_replicas(
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
-    small scenes the fastest use of them. The platform is measured once, for all, and `announce` gets the plan in
-    one line; `progress` counts the frames of all replicas. Ctrl-C and SIGTERM stop them all with checkpoints:
-    KeyboardInterrupt. When this process is killed outright they stop by themselves. Raises SimulationError with the
-    first replica's reason when the others have ended; finished replicas stay on disk.
+    small scenes the fastest use of them. On platform lanes up to sixteen replicas share a process. The platform is
+    measured once, for all, and `announce` gets the plan in one line; `progress` counts the frames of all replicas.
+    Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
+    by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
+    stay on disk.
     """
     for out in outs:
         check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
-    width = workers or min(len(outs), available_cores())
+    jobs = [[k] for k in range(len(outs))]
+    if config.platform == PLATFORM:
+        size = n_lanes()
+        jobs = [list(range(k, min(k + size, len(outs)))) for k in range(0, len(outs), size)]
+    width = workers or min(len(jobs), available_cores())
     # What goes on keeps its platform.
     fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
     choice = None
-    if fresh:
+    if fresh and config.platform == PLATFORM:
+        if announce is not None:
+            announce(line_of_run(scene, config, lanes_choice(), replicas=len(outs)))
+    elif fresh:
         settled = replace(config, force=resolve(scene, config.force))
         choice = measured_platform(scene, settled, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
             announce(line_of_run(scene, config, choice, replicas=len(outs)))
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
-    if len(outs) == 1:
-        return [simulate(scene, configs[0], outs[0], progress=progress, **how)]
+    if len(jobs) == 1:
+        _run(scene, [configs[k] for k in jobs[0]], list(outs), how, progress)
+        return list(outs)
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
-    board = _Board(context.Array("Q", len(outs), lock=False), context.Array("d", len(outs), lock=False),
+    board = _Board(context.Array("Q", len(jobs), lock=False), context.Array("d", len(jobs), lock=False),
                    context.Queue())  # fmt: skip
-    waiting = list(range(len(outs)))
+    waiting = list(range(len(jobs)))
     running: dict[int, Any] = {}
     failures: dict[int, str] = {}
     reasons: dict[int, str] = {}
@@ -79,15 +90,16 @@ def simulate_replicas(
             while waiting or running:
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
-                    args = (scene.to_dict(), configs[k], str(outs[k]), how, board, k)
-                    running[k] = context.Process(target=_replica, args=args, name=f"replica-{k}")
+                    of_job = [configs[i] for i in jobs[k]], [outs[i] for i in jobs[k]]
+                    args = (scene.to_dict(), *of_job, how, board, k)
+                    running[k] = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
                     running[k].start()
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
                 n_done = int(sum(board.done[:]))
                 if n_done == 0:
-                    tell_preparing(progress, sum(board.equilibrated[:]) / len(outs))
+                    tell_preparing(progress, sum(board.equilibrated[:]) / len(jobs))
                 elif progress is not None:
                     progress(n_done, config.n_frames * len(outs))
                 for k in [k for k, process in running.items() if not process.is_alive()]:
@@ -103,7 +115,8 @@ def simulate_replicas(
                 process.join()
     if failures:
         k = min(failures)
-        raise SimulationError(f"{len(failures)} of {len(outs)} replicas failed; replica {k}: {failures[k]}")
+        failed = sum(len(jobs[i]) for i in failures)
+        raise SimulationError(f"{failed} of {len(outs)} replicas failed; replica {jobs[k][0]}: {failures[k]}")
     return list(outs)
 
 
@@ -117,8 +130,20 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
         pass
 
 
-def _replica(scene: dict[str, Any], config: MDConfig, out: str, how: dict[str, Any], board: _Board, k: int) -> None:
-    """Run replica `k` in a process of its own; `how`: what else `simulate` takes."""
+def _run(
+    scene: Scene, configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], progress: ProgressFn | None
+) -> None:
+    """Run one replica, or on platform lanes a batch of them; `how`: what else `simulate` takes."""
+    if configs[0].platform == PLATFORM:
+        simulate_batch(scene, configs[0], outs, resume=how["resume"], overwrite=how["overwrite"], progress=progress)
+    else:
+        simulate(scene, configs[0], outs[0], progress=progress, **how)
+
+
+def _replicas(
+    scene: dict[str, Any], configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], board: _Board, k: int
+) -> None:
+    """Run the k-th job in a process of its own."""
     end_with_parent()
     os.environ["OPENMM_CPU_THREADS"] = "1"
 
@@ -129,7 +154,7 @@ def _replica(scene: dict[str, Any], config: MDConfig, out: str, how: dict[str, A
             board.equilibrated[k] = done / total
 
     try:
-        simulate(Scene.from_dict(scene), config, out, progress=report, **how)
+        _run(Scene.from_dict(scene), configs, outs, how, report)
     except SurromdError as error:
         board.errors.put((k, str(error)))
         raise SystemExit(1) from None

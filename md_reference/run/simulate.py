@@ -103,7 +103,7 @@ def simulate(
 
 
 @dataclass(frozen=True)
-class _Stand:
+class Stand:
     """Where a run stands, as its checkpoint says beside what all of them do; while it equilibrates, so far."""
 
     config: dict[str, Any] = field(default_factory=dict)
@@ -112,6 +112,15 @@ class _Stand:
     threads: Annotated[int, range(1, 1025)] = 1
     steps_into_frame: Annotated[int, range(2**63)] = 0
     equilibrated_steps: Annotated[int, range(2**63)] | None = None
+
+
+def stand_of(header: dict[str, Any], out: Path) -> Stand:
+    """Return where the header of a checkpoint says that a run stands. Raises InputError."""
+    own = {key: header[key] for key in header.keys() & Stand.__annotations__.keys()}
+    try:
+        return built(Stand, own)
+    except ValueError as error:
+        raise InputError(f"checkpoint {checkpoint_path(out)} cannot be gone on from ({error}).") from error
 
 
 class _Run:
@@ -130,11 +139,7 @@ class _Run:
         self.scene, self.config, self.out = scene, config, out
         self.checkpoint_every_s, self.resumed = checkpoint_every_s, kept is not None
         self.header, self.blob = kept or (new_header(1, overwrite=overwrite), b"")
-        own = {key: self.header[key] for key in self.header.keys() & _Stand.__annotations__.keys()}
-        try:
-            self.stand = built(_Stand, own)
-        except ValueError as error:
-            raise InputError(f"checkpoint {checkpoint_path(out)} cannot be gone on from ({error}).") from error
+        self.stand = stand_of(self.header, out)
         if kept is not None:
             check_same_run(self.stand.config, config, out)
         self.checkpoint = CheckpointFile(checkpoint_path(out), kept)

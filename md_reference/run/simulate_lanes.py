@@ -1,0 +1,241 @@
+"""Up to sixteen replicas of one run at once, in the lanes of one core's vector registers (`run.lanes`).
+
+Files, records, equilibration and resuming are those of `run.simulate`; one checkpoint, beside the first file, stands
+for all replicas of a batch.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from md_reference.forces.forcefield import build_system
+from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
+from md_reference.run.engine import Engine
+from md_reference.run.integrators import integrator_name
+from md_reference.run.lanes import PLATFORM, Lanes, n_lanes
+from md_reference.run.run_summary import summarise
+from md_reference.run.simulate import ProgressFn, stand_of, tell_preparing
+from systems.errors import InputError, SimulationError
+from systems.interrupts import deferred_interrupt
+from systems.scene import Scene
+from systems.trajectory.base import TrajectoryWriter
+from systems.trajectory.checkpoint import (
+    Checkpoint,
+    CheckpointFile,
+    checkpoint_path,
+    claimed_outputs,
+    last_supported,
+    new_header,
+    writer_at,
+)
+from systems.trajectory.codec import open_trajectory
+from systems.units import format_time_ps
+
+# Frames are computed for about so long, then written and checkpointed.
+_BLOCK_S = 2.0
+
+
+def simulate_batch(
+    scene: Scene,
+    config: MDConfig,
+    outs: Sequence[Path],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: ProgressFn | None = None,
+) -> None:
+    """Run a replica for each of `outs`, at most `n_lanes()`; all have `config.seed` and their number in the batch.
+
+    Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
+    Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
+    Raises LanesUnavailableError for what lanes cannot do, SimulationError when a replica blows up (the frames before
+    stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
+    """
+    config = check_run(scene, config, outs[0])
+    if config.ensemble != "nvt" or config.columns:
+        raise InputError("platform lanes runs in a bath (nvt) and keeps positions alone; take another platform.")
+    if len(outs) > n_lanes():
+        raise InputError(f"{len(outs)} replicas are more than the {n_lanes()} lanes.")
+    state_path = checkpoint_path(outs[0])
+    with deferred_interrupt() as asked_to_stop, claimed_outputs(list(outs), may_exist=resume or overwrite):
+        if resume and not state_path.exists() and any(out.exists() for out in outs):
+            _refuse_unfinished(outs, config)
+            return
+        kept = last_supported(state_path, list(outs)) if resume and state_path.exists() else None
+        batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
+        batch.start(asked_to_stop, progress)
+        with ExitStack() as stack:
+            record = batch.record()
+            writers = [
+                stack.enter_context(
+                    writer_at(
+                        out, scene, {**record, "lane": k, "of_lanes": len(outs)}, batch.header, k, resumed=batch.resumed
+                    )
+                )
+                for k, out in enumerate(outs)
+            ]
+            batch.produce(writers, asked_to_stop, progress)
+        state_path.unlink(missing_ok=True)
+
+
+def _refuse_unfinished(outs: Sequence[Path], config: MDConfig) -> None:
+    """Without a checkpoint all files must be complete. Raises InputError."""
+    for out in outs:
+        if not out.exists():
+            raise InputError(f"{out} is not there, and no checkpoint of its batch is; start again with `overwrite`.")
+        with open_trajectory(out) as reader:
+            record, n_frames = reader.record, reader.n_frames
+        check_same_run(record, config, out)
+        if not record.get("completed") or n_frames != config.n_frames:
+            raise InputError(
+                f"{out} holds {n_frames} of {config.n_frames} frames but the checkpoint of its batch is gone; start "
+                "again with `overwrite`, or keep it under another name."
+            )
+
+
+class _Batch:
+    """Replicas on their way: what is done, since when, and where their checkpoint goes."""
+
+    def __init__(
+        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
+    ) -> None:
+        self.scene, self.config, self.outs = scene, config, outs
+        self.resumed = kept is not None
+        self.header, self.blob = kept or (new_header(len(outs), overwrite=overwrite), b"")
+        self.stand = stand_of(self.header, outs[0])
+        if kept is not None:
+            check_same_run(self.stand.config, config, outs[0])
+        self.began = time.monotonic()
+        self.done = int(self.header["files"][0]["n_frames"])
+        self.file = CheckpointFile(checkpoint_path(outs[0]), kept)
+        self.system = build_system(scene, config.force)
+        self.lanes = Lanes(
+            self.system,
+            temperature_k=config.temperature_k,
+            friction_per_ps=config.friction_per_ps,
+            timestep_ps=config.timestep_ps,
+            seed=config.seed,
+        )
+
+    @property
+    def wall_s(self) -> float:
+        return self.stand.wall_s + time.monotonic() - self.began
+
+    def start(self, asked_to_stop: Callable[[], bool], progress: ProgressFn | None) -> None:
+        """Go to where the batch was left, or minimise and equilibrate. Raises SimulationError, KeyboardInterrupt."""
+        if self.resumed:
+            self.lanes.restore(self.blob)
+            return
+        tell_preparing(progress, 0.0)
+        with Engine(self.scene, replace(self.config, platform="Reference"), system=self.system) as engine:
+            engine.minimise()
+            start = engine.positions()
+        self.lanes.check(self.system, start)
+        self.lanes.set_positions(np.repeat(start[None], self.lanes.n_lanes, axis=0))
+        self.lanes.thermalise()
+        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
+        piece = max(1, min(1000, n_steps))
+        for done in range(0, n_steps, piece):
+            if asked_to_stop():
+                raise KeyboardInterrupt
+            self.lanes.step(min(piece, n_steps - done))
+            tell_preparing(progress, min(1.0, (done + piece) / n_steps))
+        self.save()
+
+    def save(self) -> None:
+        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": PLATFORM}
+        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
+        self.file.write(self.header, self.lanes.checkpoint())
+
+    def produce(
+        self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
+    ) -> None:
+        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
+        config, n = self.config, len(writers)
+        while self.done < config.n_frames:
+            frames, failure = self._frames(asked_to_stop)
+            if frames:
+                positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+                times = (self.done + 1 + np.arange(len(frames))) * config.save_every_ps
+                for k, writer in enumerate(writers):
+                    scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+                    writer.append(positions[k], times, scalars=scalars)
+                self.done += len(frames)
+                self.header["files"] = [{"n_frames": self.done, "digest": w.digest()} for w in writers]
+            if failure:
+                for writer in writers:
+                    writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+                raise SimulationError(
+                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
+                    f"{self.done} good frames are in {self.outs[0]} and each other file of this batch."
+                )
+            if self.done < config.n_frames:
+                self.save()
+            if progress is not None:
+                progress(n * self.done, n * config.n_frames)
+            if asked_to_stop() and self.done < config.n_frames:
+                for writer in writers:
+                    writer.update_record({"cost": self.cost()})
+                raise KeyboardInterrupt
+        for writer in writers:
+            time_ps, scalars = writer.series()
+            summary = summarise(
+                time_ps,
+                scalars,
+                mass_da=float(self.scene.masses_da.sum()),
+                ensemble=config.ensemble,
+                temperature_k=config.temperature_k,
+                n_dof=self.lanes.n_dof,
+            )
+            writer.update_record(
+                {"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary}
+            )
+
+    def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
+        """Return the frames of the next seconds, each positions, energies and temperatures of all lanes."""
+        found: list[tuple[Any, Any, Any]] = []
+        until = time.monotonic() + _BLOCK_S
+        while self.done + len(found) < self.config.n_frames and not (found and time.monotonic() > until):
+            if asked_to_stop() and found:
+                break
+            try:
+                self.lanes.step(self.config.steps_per_frame)
+            except SimulationError as error:
+                return found, str(error)
+            positions = self.lanes.positions_nm.astype(np.float32)
+            found.append((positions, self.lanes.energies(), self.lanes.temperatures_k()))
+        return found, ""
+
+    def cost(self) -> dict[str, float]:
+        """Return each replica's share of the cost; a core runs all of them at once."""
+        simulated_ps = self.done * self.config.save_every_ps
+        wall_s = self.wall_s / len(self.outs)
+        return {
+            "wall_s": wall_s,
+            "energy_evaluations": self.done * self.config.steps_per_frame,
+            "ns_per_day": simulated_ps * 1e-3 / wall_s * 86400.0,
+        }
+
+    def record(self) -> dict[str, Any]:
+        import openmm
+
+        return {
+            "kind": "reference",
+            "integrator": integrator_name(self.config.ensemble, self.scene),
+            "program": {"openmm": openmm.__version__},
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "completed": False,
+            **settings_of(self.config),
+            "platform": PLATFORM,
+            "threads": 1,
+            "platform_reason": "replicas in the lanes of one core, energies and forces checked against OpenMM's",
+        }
