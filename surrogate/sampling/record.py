@@ -80,22 +80,24 @@ def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: 
 
 def close_account(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSampler,
                    writers: Sequence[TrajectoryWriter], *, completed: bool) -> None:  # fmt: skip
-    """Enter what was done and, of a complete rollout, what it cost."""
+    """Enter what was done and what it cost, by now or in all."""
     for writer, tally in zip(writers, state.tallies, strict=True):
-        entries: dict[str, Any] = {"interventions": _interventions(plan, tally, state.seconds, checks)}
-        if completed:
-            entries |= {"completed": True, "cost": _cost(plan, state, tally, sampler, len(writers))}
-        writer.update_record(entries)
+        done = {"completed": True} if completed else {}
+        account = _interventions(plan, tally, state.seconds, checks)
+        writer.update_record(
+            {"interventions": account, "cost": _cost(plan, state, tally, sampler, len(writers)), **done}
+        )
 
 
 def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_replicas: int) -> dict[str, Any]:
     """A replica's share of the batch: wall seconds and network evaluations divided by the replicas."""
-    wall_s = state.wall_s / n_replicas
+    wall_s = max(state.wall_s, 1e-9) / n_replicas
+    n_frames = min(state.steps // plan.stride, plan.n_frames)
     return {
         "wall_s": wall_s,
         "batch_wall_s": state.wall_s,
         "network_evaluations": round((state.chunks + tally.draws) * sampler.evaluations_per_chunk),
-        "ns_per_day": plan.n_frames * plan.save_every_ps * 1e-3 / wall_s * 86400.0,
+        "ns_per_day": n_frames * plan.save_every_ps * 1e-3 / wall_s * 86400.0,
         "guard_share": sum(v for k, v in state.seconds.items() if k != "draw") / max(state.wall_s, 1e-9),
         "batch": sampler.batch or n_replicas,
     }

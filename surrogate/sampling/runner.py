@@ -182,6 +182,7 @@ def rollout(
                 done = min(state.steps // plan.stride, plan.n_frames)
                 progress(done, plan.n_frames, speed.describe(plan, state, len(outs)))
             if stopping and not complete:
+                close_account(plan, state, checks, sampler, writers, completed=False)
                 raise KeyboardInterrupt
         state.wall_s = time.monotonic() - started
         close_account(plan, state, checks, sampler, writers, completed=True)

@@ -18,14 +18,14 @@ WAYS: dict[Way, str] = {
     "potential": "a potential that learns from GFN2-xTB, checked by MD",
     "trained": "weights trained on MD made here, checked by other MD",
 }
-# Shares of what is left when the report is paid for. MD that judges itself is split by replicas, or by stages if it has
-# one core.
+# Shares of what is left when the report is paid for; MD that is held out comes last, and takes what others leave. MD
+# that judges itself is split by replicas, or by stages if it has one core.
 _BY_STAGES: tuple[tuple[Stage, float], ...] = (("md", 0.5), ("held-out md", 0.5))
 _SHARES: dict[Way, tuple[tuple[Stage, float], ...]] = {
     "md": (("md", 1.0),),
-    "rollout": (("rollout", 0.3), ("held-out md", 0.5), ("bursts", 0.2)),
-    "potential": (("train", 0.6), ("held-out md", 0.25), ("rollout", 0.1), ("bursts", 0.05)),
-    "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("held-out md", 0.15), ("bursts", 0.05)),
+    "rollout": (("rollout", 0.3), ("bursts", 0.2), ("held-out md", 0.5)),
+    "potential": (("train", 0.6), ("rollout", 0.1), ("bursts", 0.05), ("held-out md", 0.25)),
+    "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("bursts", 0.05), ("held-out md", 0.15)),
 }
 LEAST_BUDGET_S = 20.0
 # Of a budget: what is planned with, for stages take a while to stop and estimates are none of the best.
@@ -41,7 +41,7 @@ MOST_BURSTS, _LEAST_BURSTS = 300, 60
 # Of a burst: relaxing the frame that it starts from, in steps of MD, and what the estimate is less sure of.
 _RELAXING_STEPS, _SURE = 150, 0.7
 # The judge: processor seconds at all, and of an atom in a frame.
-_JUDGE_S, _JUDGE_ATOM_S = 8.0, 3e-6
+_JUDGE_S, _JUDGE_ATOM_S = 4.0, 3e-6
 _JUDGE_SHARE = 0.1
 _MOST_FRAMES, _LEAST_FRAMES = 400_000, 4_000
 _MD_STAGES: tuple[Stage, ...] = ("training md", "md", "held-out md")
@@ -90,8 +90,20 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
             f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and judge anything on this machine, as "
             f"busy as it is: {format_wall(least_s)} it takes. Use a longer `budget_s`."
         )
-    frames = _frames(rates, budget_s)
     budget_s *= _AIM
+    most = _frames(rates, budget_s)
+    found = _divided(rates, chosen, why, shares, budget_s, most)
+    every_ps = save_every_ps or _interval(rates, max(found.expected_md_ps, found.expected_rollout_ps) / most)
+    # Of a slow scene fewer frames come together than the judge could read.
+    frames = min(most, int((found.expected_md_ps + found.expected_rollout_ps) / every_ps))
+    return replace(_divided(rates, chosen, why, shares, budget_s, frames), save_every_ps=every_ps)
+
+
+def _divided(
+    rates: Rates, way: Way, why: tuple[str, ...], shares: dict[Stage, float], budget_s: float, frames: int
+) -> Decision:
+    """Return the decision for a way: the budget divided by its `shares`, when so many frames are read at the end."""
+    shares = dict(shares)
     report_s = min(0.5 * budget_s, (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * rates.stretch)
     left_s = budget_s - report_s
     n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
@@ -104,20 +116,17 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
             del shares["bursts"]
         else:
             shares["bursts"] = n_bursts * burst_s / _SURE / left_s
-    others = sum(share for name, share in shares.items() if name != "bursts")
-    scale = (1.0 - shares.get("bursts", 0.0)) / others
+    scale = (1.0 - shares.get("bursts", 0.0)) / sum(share for name, share in shares.items() if name != "bursts")
     stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
               for name, share in shares.items()]  # fmt: skip
-    found = Decision(chosen, why, (*stages, PlannedStage("report", report_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
+    found = Decision(way, why, (*stages, PlannedStage("report", report_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
     expected_ps = {name: md_ps(rates, found, name) for name in shares if name in _MD_STAGES}
-    found = replace(
+    return replace(
         found,
         equilibrate_ps=_EQUILIBRATION_SHARE * min(expected_ps.values()) / rates.cores,
         expected_md_ps=sum(expected_ps.values()),
         expected_rollout_ps=found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0),
     )
-    every_ps = save_every_ps or _interval(rates, max(found.expected_md_ps, found.expected_rollout_ps) / frames)
-    return replace(found, save_every_ps=every_ps)
 
 
 def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:

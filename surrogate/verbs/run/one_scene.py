@@ -60,9 +60,8 @@ def run_scene(
     before = _open_folder(folder, options)
     try:
         with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
-            saved = [before] if before is not None else []
-            clock = Clock(options.budget_s, before.spent_s if before else 0.0, lambda s: _keep(folder, saved, s),
-                          advance)  # fmt: skip
+            kept = _Kept(folder, before)
+            clock = Clock(options.budget_s, before.spent_s if before else 0.0, kept.beat, advance)
             settled = clock.work("preparing", options.budget_s, lambda: _settled(scene, options)).result
             if settled is None:
                 raise InputError("the budget is spent before the scene is prepared; give more `budget_s`.")
@@ -72,11 +71,12 @@ def run_scene(
             else:
                 before.check_same(settings_of_run(options), molecule.topology_hash, folder)
                 record = _taken_up(before, options)
+            kept.keep(record, clock.spent_s)
             if record.decision is None:
                 record = _decide(record, molecule, config, options, clock)
             tell_decision(record)
-            run = _Run(folder, molecule, config, options, record, clock, saved)
-            return run.to_the_end()
+            kept.keep(record, clock.spent_s)
+            return _Run(Site(folder, molecule, config, options), kept, clock).to_the_end()
     except KeyboardInterrupt as stop:
         if not (folder / RUN_NAME).exists():
             raise
@@ -84,34 +84,56 @@ def run_scene(
         raise KeyboardInterrupt(f"{said}{folder} keeps what was done; {_GOES_ON}") from None
 
 
-class _Run:
-    """A run under way: every change of its record is on disk before the next stage."""
+class _Kept:
+    """The record of a run as it is on disk: every change is there before the next stage, and every few seconds what is
+    spent, in all and in the stage under way, so that a kill costs no more."""
 
-    def __init__(self, folder: Path, scene: Scene, config: MDConfig, options: RunOptions, record: RunRecord,
-                 clock: Clock, saved: list[RunRecord]) -> None:  # fmt: skip
-        self.site = Site(folder, scene, config, options)
-        self.clock, self.saved, self.quiet = clock, saved, options.quiet
-        self.record = record
-        self.keep(record)
+    def __init__(self, folder: Path, record: RunRecord | None) -> None:
+        self._folder, self.record = folder, record
+        self.stage = ""
+
+    def keep(self, record: RunRecord, spent_s: float) -> None:
+        """Make `record` the run's, here and on disk."""
+        self.record = replace(record, spent_s=round(spent_s, 1))
+        write_run(self._folder, self.record)
+
+    def beat(self, spent_s: float) -> None:
+        """Note what is spent by now."""
+        if self.record is None:
+            return
+        spent_in = dict(self.record.spent_in)
+        if self.stage:
+            more_s = spent_s - self.record.spent_s
+            spent_in[self.stage] = round(spent_in.get(self.stage, 0.0) + more_s, 1)
+        self.keep(replace(self.record, spent_in=spent_in), spent_s)
+
+
+class _Run:
+    """A run under way."""
+
+    def __init__(self, site: Site, kept: _Kept, clock: Clock) -> None:
+        self.site, self.kept, self.clock = site, kept, clock
+
+    @property
+    def record(self) -> RunRecord:
+        assert self.kept.record is not None
+        return self.kept.record
 
     def keep(self, record: RunRecord) -> None:
-        """Make `record` the run's, here and on disk."""
-        self.record = replace(record, spent_s=round(self.clock.spent_s, 1))
-        self.saved[:] = [self.record]
-        write_run(self.site.folder, self.record)
+        """Make `record` the run's; what was spent is known already."""
+        self.kept.keep(record, self.record.spent_s)
 
     def say(self, line: str) -> None:
         """Write a line into the log, and show it."""
         with open(self.site.folder / LOG_NAME, "a", encoding="utf-8") as log:
             log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
-        if not self.quiet:
+        if not self.site.options.quiet:
             tell(self.site.scene.name, line)
 
     def to_the_end(self) -> RunRecord:
         """Do the stages that have not ended and return the record."""
         while (name := self._next()) is not None:
             self._do(name)
-        self.keep(self.record)
         return self.record
 
     @property
@@ -125,33 +147,37 @@ class _Run:
     def _do(self, name: str) -> None:
         pending = [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]
         later_s = sum(stage.seconds for stage in pending[1:])
-        # A minute more is better than no report.
+        # The report is made however long it takes: without it all else was in vain.
         seconds = max(self.clock.budget_s - self.clock.spent_s - later_s, 2.0) if name != "report" else 86_400.0
-        began = self.clock.spent_s
         self.say(f"{name}: for {seconds:.0f} s" if name != "report" else name)
-        stage = STAGES[name]
-        record = self.record
+        stage, record = STAGES[name], self.record
+        self.kept.stage = name
         try:
-            ended = self.clock.work(name, seconds, lambda: stage.work(self.site, record, seconds))
+            ended = self.clock.work(name, seconds, lambda: stage.work(self.site, record))
         except SurromdError as error:
             if not stage.may_fail:
                 raise
-            self._failed(name, str(error), self.clock.spent_s - began)
+            self._failed(name, str(error))
             return
-        wall_s = round(self.clock.spent_s - began, 1)
+        finally:
+            self.kept.stage = ""
         found = stage.found(self.site, record) if ended.result is None else ended.result
         if found is None:
-            self._failed(name, "nothing came of it in its time", wall_s)
+            self._failed(name, "nothing came of it in its time")
             return
-        entry = StageEntry(name, "done" if ended.result is not None else "out of time", wall_s)
-        self.keep(found.with_stage(entry))
+        self._ended(found, StageEntry(name, "done" if ended.result is not None else "out of time", 0.0))
 
-    def _failed(self, name: str, reason: str, wall_s: float) -> None:
+    def _failed(self, name: str, reason: str) -> None:
         self.say(f"{name} failed: {reason}")
-        found = STAGES[name].found(self.site, self.record) or self.record
-        self.keep(found.with_stage(StageEntry(name, "failed", round(wall_s, 1), reason)))
+        self._ended(STAGES[name].found(self.site, self.record) or self.record, StageEntry(name, "failed", 0.0, reason))
         if name in _OF_SURROGATE and not self.record.trajectory and self.decision.way != "md":
             self._by_md(f"{name} failed ({reason})")
+
+    def _ended(self, found: RunRecord, entry: StageEntry) -> None:
+        """Enter what a stage came to, and how it ended."""
+        now = self.record  # with what is spent
+        entry = replace(entry, wall_s=now.spent_in.get(entry.name, 0.0))
+        self.keep(replace(found.with_stage(entry), spent_s=now.spent_s, spent_in=now.spent_in))
 
     def _by_md(self, why: str) -> None:
         """Spend what is left on MD."""
@@ -226,11 +252,6 @@ def _new_record(scene: str | Path | Scene, molecule: Scene, options: RunOptions)
 
 def _named(scene: str | Path | Scene) -> str:
     return str(scene) if isinstance(scene, str | Path) else scene.name
-
-
-def _keep(folder: Path, saved: list[RunRecord], spent_s: float) -> None:
-    if saved:
-        write_run(folder, replace(saved[0], spent_s=round(spent_s, 1)))
 
 
 def _open_folder(folder: Path, options: RunOptions) -> RunRecord | None:

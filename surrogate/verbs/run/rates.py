@@ -22,6 +22,7 @@ REPLICAS = 8
 # Weights for several lags step so far, or as near to it as they can.
 LONG_LAG_PS = 10.0
 _CHUNKS = 4
+_LONGEST_STRETCH = 10.0
 _SAME = ("force_field", "solvent", "temperature_k")
 
 
@@ -143,7 +144,8 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
 
 
 def measured_stretch(cores: int, seconds: float = 0.5) -> float:
-    """Return the wall seconds of a second of processor time when so many threads compute at once; at least 1."""
+    """Return the wall seconds of a second of processor time when so many threads compute at once; at least 1, and at
+    most ten, beyond which so short a look tells no more."""
     block = bytes(2**20)
     used_s = [0.0] * cores
     began = time.perf_counter()
@@ -158,4 +160,5 @@ def measured_stretch(cores: int, seconds: float = 0.5) -> float:
         thread.start()
     for thread in threads:
         thread.join()
-    return round(max(1.0, cores * (time.perf_counter() - began) / max(sum(used_s), 1e-3)), 2)
+    found = cores * (time.perf_counter() - began) / max(sum(used_s), 1e-3)
+    return round(min(max(found, 1.0), _LONGEST_STRETCH), 2)

@@ -51,8 +51,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget; `trajectory`,
-    `held_out`: files, relative to the folder; `weights`: a file there, or the name of shipped ones."""
+    """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget, `spent_in` each
+    stage; `trajectory`, `held_out`: files, relative to the folder; `weights`: a file there, or the name of shipped
+    ones."""
 
     scene: str
     molecule: str
@@ -62,6 +63,7 @@ class RunRecord:
     programs: dict[str, str] = field(default_factory=dict)
     started: str = ""
     spent_s: float = 0.0
+    spent_in: dict[str, float] = field(default_factory=dict)
     rates: Rates | None = None
     decision: Decision | None = None
     stages: tuple[StageEntry, ...] = ()

@@ -14,7 +14,7 @@ from systems.units import format_wall
 
 T = TypeVar("T")
 _TICK_S = 0.2
-_SAVE_EVERY_S = 5.0
+_SAVE_EVERY_S = 2.0
 
 
 class Ended(Generic[T]):

@@ -48,10 +48,10 @@ class Site:
 
 @dataclass(frozen=True)
 class StageOf:
-    """`work(site, record, seconds)` does a stage and returns the record with what it made; `found(site, record)`
+    """`work(site, record)` does a stage and returns the record with what it made; `found(site, record)`
     returns it with what there is after a stop, None for nothing. `may_fail`: a run goes on without it."""
 
-    work: Callable[[Site, RunRecord, float], RunRecord]
+    work: Callable[[Site, RunRecord], RunRecord]
     found: Callable[[Site, RunRecord], RunRecord | None]
     may_fail: bool = False
 
@@ -70,7 +70,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         suffix = f".{site.options.format}" if name == "md" else ".h5"
         return replica_paths(site.folder / f"{place}{suffix}", _settled(record)[0].cores)
 
-    def work(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+    def work(site: Site, record: RunRecord) -> RunRecord:
         rates, decision = _settled(record)
         every_ps = decision.save_every_ps
         expected_ps = md_ps(rates, decision, name) / rates.cores
@@ -121,7 +121,7 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
     return tuple(str(path.relative_to(folder)) for path in paths if path.exists() and frames_in(path))
 
 
-def _train(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
     _, decision = _settled(record)
     dear = decision.way == "potential"
@@ -155,7 +155,7 @@ def _rolled_paths(site: Site) -> list[Path]:
     return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", REPLICAS)
 
 
-def _roll(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+def _roll(site: Site, record: RunRecord) -> RunRecord:
     rates, decision = _settled(record)
     assert rates.rolls is not None
     every_ps = rates.rolls.lag_ps * math.ceil(decision.save_every_ps / rates.rolls.lag_ps - 1e-6)
@@ -185,7 +185,7 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
     return replace(record, trajectory=files) if files else None
 
 
-def _burst(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+def _burst(site: Site, record: RunRecord) -> RunRecord:
     _, decision = _settled(record)
     options = BurstOptions(n_bursts=decision.n_bursts, burst_ps=decision.burst_ps, seed=site.options.seed, quiet=True)
     check = bursts([site.folder / file for file in record.trajectory], options=options)
@@ -194,7 +194,7 @@ def _burst(site: Site, record: RunRecord, seconds: float) -> RunRecord:
     return record
 
 
-def _report(site: Site, record: RunRecord, seconds: float) -> RunRecord:
+def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.judge.report.report import write_report
 
     rates, decision = _settled(record)
@@ -205,7 +205,7 @@ def _report(site: Site, record: RunRecord, seconds: float) -> RunRecord:
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
-    spent = {entry.name: entry.wall_s for entry in record.stages}
+    spent = record.spent_in
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     # The faster of what was measured before and what it came to: the gain is a lower bound.
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
@@ -213,7 +213,9 @@ def _report(site: Site, record: RunRecord, seconds: float) -> RunRecord:
     bursts_file = site.folder / BURSTS_NAME
     said = json.loads(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
-    found = outcome(decision.way, comparison, Costs(spent.get("rollout", 0.0), training_s, md_ps_per_s), said, notes)
+    # What reading weights takes is no part of it: a longer rollout does it once, too.
+    rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
+    found = outcome(decision.way, comparison, Costs(rolling_s, training_s, md_ps_per_s), said, notes)
     lines = [f"{name}: {text}" for name, text in table(rates, decision, site.options.budget_s)]
     write_report(
         comparison,

@@ -25,7 +25,7 @@ def named(decision: Decision) -> list[str]:
 def test_weights_that_outrun_md_are_rolled_and_checked_by_bursts() -> None:
     found = decide(COVERED, 600.0)
     assert found.way == "rollout"
-    assert named(found) == ["rollout", "held-out md", "bursts", "report"]
+    assert named(found) == ["rollout", "bursts", "held-out md", "report"]
     assert found.n_bursts >= 60
     assert found.expected_rollout_ps == pytest.approx(1600.0 * found.seconds("rollout"))
 

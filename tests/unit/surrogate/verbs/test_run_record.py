@@ -33,8 +33,8 @@ OPTIONS = RunOptions(budget_s=600.0, weights=Path("mine.safetensors"))
 
 def record() -> RunRecord:
     return RunRecord(
-        "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, RATES,
-        decide(RATES, 600.0), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
+        "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
+        RATES, decide(RATES, 600.0), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
         outcome=Outcome("head", "close", "verdict", 10.0, 20.0, "at least 10 ns", None, "", ("a note",)),
     )  # fmt: skip
 
