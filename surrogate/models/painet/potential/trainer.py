@@ -171,7 +171,8 @@ class Learner:
 
     def errors(self) -> dict[str, float]:
         """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
-        absolute force, and of energies (less their mean) in kJ/mol; how many states have been asked for."""
+        absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
+        have been asked for."""
         held = self.samples.where(self.samples.held)
         found = self._measured(held)
         self.error_kj_mol_nm = found["force_mae"]
@@ -187,6 +188,7 @@ class Learner:
             "force_rms": float(wrong.square().mean().sqrt()),
             "mean_force": float(forces.abs().mean()),
             "energy_mae": float((off - off.mean()).abs().mean()),
+            "energy_spread": float(torch.cat([part.members_kj_mol for part in parts]).std(-1, correction=0).mean()),
         }
 
     def _ask_if_due(self, generator: torch.Generator) -> None:

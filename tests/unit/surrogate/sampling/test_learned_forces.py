@@ -128,7 +128,7 @@ def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(
     domain = replace(given.domain, lag_ps=0.002, conditions=bath)
     frames, flags = {}, {}
     for error_kj_mol in (1e-3, 1e9):
-        loaded = replace(given, domain=domain, provenance={"energy_mae": error_kj_mol})
+        loaded = replace(given, domain=domain, provenance={"energy_mae": error_kj_mol, "energy_spread": error_kj_mol})
         out = tmp_path / f"{error_kj_mol}.h5"
         rollout(domain.scene, loaded, [out], RolloutConfig(time_ps=0.032, guard="off", energy_every=1))
         with open_trajectory(out) as reader:
