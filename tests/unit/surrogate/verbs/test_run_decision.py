@@ -86,7 +86,8 @@ def test_other_work_on_the_machine_leaves_fewer_bursts() -> None:
 
 
 def test_work_beside_us_stretches_time() -> None:
-    assert 1.0 <= measured_stretch(1, 0.05) < measured_stretch(4 * available_cores(), 0.2)
+    assert 1.0 <= measured_stretch(1, 0.05) <= 10.0
+    assert measured_stretch(4 * available_cores(), 0.2) > 2.0, "four threads on each core"
 
 
 def test_a_budget_in_which_nothing_can_be_judged_is_refused() -> None:
