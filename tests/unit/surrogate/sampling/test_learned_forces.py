@@ -122,15 +122,16 @@ def test_models_of_frames_take_no_other_bath() -> None:
 def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(tmp_path: Path) -> None:
     """A model that knows nothing: every difference is large, and its members differ from each other."""
     pytest.importorskip("tblite")
+    torch.manual_seed(0)
     given = weights(PainetPotential(replace(SMALL, n_new=4, lag_ps=0.002)))
     bath = {"force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": 300.0, "timestep_ps": 0.001,
             "hydrogen_mass_da": None, "constrain_hydrogens": False}  # fmt: skip
     domain = replace(given.domain, lag_ps=0.002, conditions=bath)
     frames, flags = {}, {}
-    for error_kj_mol in (1e-3, 1e9):
+    for error_kj_mol in (1e-6, 1e9):
         loaded = replace(given, domain=domain, provenance={"energy_mae": error_kj_mol, "energy_spread": error_kj_mol})
         out = tmp_path / f"{error_kj_mol}.h5"
-        rollout(domain.scene, loaded, [out], RolloutConfig(time_ps=0.032, guard="off", energy_every=1))
+        rollout(domain.scene, loaded, [out], RolloutConfig(time_ps=0.024, guard="off", energy_every=1))
         with open_trajectory(out) as reader:
             frames[error_kj_mol], flags[error_kj_mol] = reader.read(), np.asarray(reader.flags)
             differences = reader.scalars[DIFFERENCE_COLUMN]
@@ -144,4 +145,4 @@ def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(
     # A frame that is caught already is not asked about.
     assert not (poor & np.uint16(ENERGY)).any()
     (note,) = [note for note in load_ensemble([out]).notes if "Reweighted" in note]
-    assert "asked about 16 frames" in note and "of 16 frames are effective" in note
+    assert "asked about 12 frames" in note and "of 12 frames are effective" in note
