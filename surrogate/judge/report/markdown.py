@@ -14,11 +14,11 @@ from systems.files.outside import printable
 from systems.units import format_time_ps
 
 
-def to_markdown(comparison: Comparison, *, command: str, foreword: Sequence[str] = ()) -> str:
-    """Return the report as Markdown text: the foreword, verdicts, one table per candidate, what was left out, costs."""
+def to_markdown(comparison: Comparison, *, command: str, headline: str = "") -> str:
+    """Return the report as Markdown text: a headline, verdicts, one table per candidate, what was left out, costs."""
     title = f"{comparison.scene_name} ({comparison.formula}, {comparison.n_atoms} atoms)"
     parts = [f"# {_text(title)} against {_text(comparison.reference.label)}"]
-    parts += [_text(line) for line in foreword]
+    parts += [_text(headline)] if headline else []
     for judgement in comparison.judgements:
         mark = STATUS_MARKS[judgement.status]
         parts.append(f"**{mark} {_text(judgement.account.label)}**: {_text(judgement.verdict)}")

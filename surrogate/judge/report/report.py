@@ -37,6 +37,15 @@ _STYLES = ("report.css", "viewer.css")
 _SCRIPTS = ("viewer.js", "tables.js")
 
 
+class Foreword(NamedTuple):
+    """What whoever had the trajectories made says of them: a `headline`, before everything else, and how they came
+    about, lines of a name and a text, under `title`."""
+
+    headline: str
+    title: str
+    lines: Sequence[tuple[str, str]]
+
+
 class Written(NamedTuple):
     """The files of one report."""
 
@@ -46,12 +55,11 @@ class Written(NamedTuple):
 
 
 def write_report(
-    comparison: Comparison, path: str | Path, *, command: str | None = None, foreword: Sequence[str] = ()
+    comparison: Comparison, path: str | Path, *, command: str | None = None, foreword: Foreword | None = None
 ) -> Written:
     """Write `path` (HTML), and the JSON and the Markdown beside it; return the three paths.
 
-    `command` is printed as the way to reproduce the report (by default one is put together from the file names);
-    `foreword`: lines of whoever had the trajectories made, which stand before everything else.
+    `command` is printed as the way to reproduce the report (by default one is put together from the file names).
     All files appear whole or not at all. Raises InputError for a name that does not end in .html, StorageError when
     they cannot be written.
     """
@@ -63,12 +71,12 @@ def write_report(
     said = command or _command(comparison, target)
     text = json.dumps(comparison.to_dict(), indent=1, allow_nan=False, ensure_ascii=False)
     page = render(comparison, command=said, foreword=foreword)
-    prose = to_markdown(comparison, command=said, foreword=foreword)
+    prose = to_markdown(comparison, command=said, headline=foreword.headline if foreword else "")
     _write_together({written.json: text + "\n", written.markdown: prose, written.html: page})
     return written
 
 
-def render(comparison: Comparison, *, command: str, foreword: Sequence[str] = ()) -> str:
+def render(comparison: Comparison, *, command: str, foreword: Foreword | None = None) -> str:
     """Return the report as HTML text."""
     from jinja2 import DictLoader, Environment, StrictUndefined
     from markupsafe import Markup

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from surrogate.judge.remarks import LEAST_SAMPLES
 from surrogate.verbs.run.decision import Way
 from surrogate.verbs.run.run_record import Outcome
 from systems.units import format_time_ps, format_wall
@@ -17,11 +18,12 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Costs:
     """Wall seconds of a candidate: of rolling it, and of training its weights here; `md_ps_per_s`: what MD simulates in
-    such a second."""
+    such a second; `budget_s`: of all."""
 
     rolling_s: float
     training_s: float
     md_ps_per_s: float
+    budget_s: float
 
 
 def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", notes: tuple[str, ...] = ()) -> Outcome:
@@ -45,6 +47,11 @@ def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", no
             f"{held}; the {_short(rolled_ps)} of the surrogate are worth {worth.in_words()} of MD by its "
             f"{worth.measure}; {_gain_words(worth, gain, costs)}"
         )
+    if judged.status == "undecided" and 0.0 < judged.effective_samples < LEAST_SAMPLES:
+        n = judged.effective_samples
+        longer = format_wall(float(f"{costs.budget_s * LEAST_SAMPLES / n:.2g}"))
+        head += f" Of the slowest motion {n:.2g} independent samples were seen, of {LEAST_SAMPLES} that it takes: "
+        head += f"a budget of about {longer} would tell."
     if bursts:
         head += f" Beyond that, by bursts of MD, it {bursts}."
     return Outcome(head, judged.status, judged.verdict, held_ps, rolled_ps, worth.in_words() if worth else "", gain,

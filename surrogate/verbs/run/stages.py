@@ -195,7 +195,7 @@ def _burst(site: Site, record: RunRecord) -> RunRecord:
 
 
 def _report(site: Site, record: RunRecord) -> RunRecord:
-    from surrogate.judge.report.report import write_report
+    from surrogate.judge.report.report import Foreword, write_report
 
     rates, decision = _settled(record)
     if not record.held_out or not record.trajectory:
@@ -215,13 +215,14 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
     # What reading weights takes is no part of it: a longer rollout does it once, too.
     rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
-    found = outcome(decision.way, comparison, Costs(rolling_s, training_s, md_ps_per_s), said, notes)
-    lines = [f"{name}: {text}" for name, text in table(rates, decision, site.options.budget_s)]
+    costs = Costs(rolling_s, training_s, md_ps_per_s, site.options.budget_s)
+    found = outcome(decision.way, comparison, costs, said, notes)
+    lines = [*table(rates, decision, site.options.budget_s), *(("note", note) for note in notes)]
     write_report(
         comparison,
         site.folder / REPORT_NAME,
         command=f"surromd run {record.scene!r} -o {site.folder.name}",
-        foreword=(found.headline, "; ".join(lines), *notes),
+        foreword=Foreword(found.headline, "How the budget was spent, and why", lines),
     )
     return replace(record, outcome=found)
 

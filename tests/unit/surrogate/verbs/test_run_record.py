@@ -27,7 +27,7 @@ from surrogate.verbs.run.run_record import (
 from systems.errors import InputError
 
 RATES = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 320.0, "", Rolls("alanine-dipeptide", 1.0, 1600.0))
-CHEAP = Costs(10.0, 0.0, 200.0)
+CHEAP = Costs(10.0, 0.0, 200.0, 60.0)
 OPTIONS = RunOptions(budget_s=600.0, weights=Path("mine.safetensors"))
 
 
@@ -86,8 +86,9 @@ def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth
 
 def told(way: Way, found: Worth | None, costs: Costs = CHEAP, bursts: str = "") -> Outcome:
     account = SimpleNamespace(total_ps=50_000.0)
-    judged = SimpleNamespace(account=account, worth=(found,) if found else (), worth_words="words" if found else "",
-                             status="close", verdict="Close.")  # fmt: skip
+    status, worths = ("close", (found,)) if found else ("undecided", ())
+    judged = SimpleNamespace(account=account, worth=worths, worth_words="words" if found else "", status=status,
+                             verdict="Close.", effective_samples=4.0)  # fmt: skip
     half = SimpleNamespace(total_ps=6_000.0)
     comparison: Any = SimpleNamespace(judgements=(judged,), reference=half, replicate=half)
     return outcome(way, comparison, costs, bursts)
@@ -107,7 +108,7 @@ def test_a_capped_worth_is_at_least_what_md_there_is() -> None:
 
 
 def test_where_md_was_the_better_choice_it_is_said() -> None:
-    dear = Costs(10.0, 90.0, 200.0)
+    dear = Costs(10.0, 90.0, 200.0, 60.0)
     found = told("potential", worth(), dear)
     assert found.gain == pytest.approx(0.4)
     assert "MD was the better choice" in found.headline and "training included" in found.headline
@@ -120,4 +121,5 @@ def test_where_md_was_the_better_choice_it_is_said() -> None:
 def test_md_claims_no_gain_and_what_has_no_worth_says_so() -> None:
     found = told("md", worth())
     assert found.gain is None and "62 ns to use" in found.headline
-    assert "tell no worth" in told("rollout", None).headline
+    untold = told("rollout", None).headline
+    assert "tell no worth" in untold and "a budget of about 5 min would tell" in untold

@@ -21,7 +21,7 @@ from surrogate.judge.report import report, wording
 from surrogate.judge.report.cards import side_by_side
 from surrogate.judge.report.markdown import to_markdown
 from surrogate.judge.report.pictures import Album, albums
-from surrogate.judge.report.report import write_report
+from surrogate.judge.report.report import Foreword, write_report
 from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
 
@@ -90,6 +90,15 @@ def test_verdict_stands_before_everything_else(written: tuple[str, dict[str, obj
     assert first < html.index("<svg") and first < html.index("<table")
     assert comparison.judgements[1].status == "broken"
     assert "Broken: 2 % of frames have coordinates that are not finite" in html
+
+
+def test_a_foreword_stands_before_the_verdict(comparison: Comparison, tmp_path: Path) -> None:
+    said = Foreword("worth <b>much</b>", "How", [("way", "MD & more")])
+    files = write_report(comparison, tmp_path / "r.html", foreword=said)
+    page = files.html.read_text("utf-8")
+    assert page.index("worth &lt;b&gt;much&lt;/b&gt;") < page.index("MD &amp; more") < page.index('class="verdict')
+    assert "worth &lt;b>much" in files.markdown.read_text("utf-8")
+    assert '<p class="foreword">' not in write_report(comparison, tmp_path / "s.html").html.read_text("utf-8")
 
 
 def test_names_from_outside_are_escaped(written: tuple[str, dict[str, object]]) -> None:
