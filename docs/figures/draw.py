@@ -62,6 +62,19 @@ def draw_cost_error(table: dict[str, Any], out: Path) -> None:
     plt.close(figure)
 
 
+def draw_n_body(table: dict[str, Any], out: Path) -> None:
+    """Draw the error of samples on held-out charged particles against steps, of lines that differ in one thing."""
+    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    for name, curve in table["curves"].items():
+        steps, ades = np.array([point[:2] for point in curve]).T
+        axes.plot(steps, ades, "--" if name.startswith("set") else "-", marker=".", lw=1, label=name)
+    axes.axhline(table["baseline"], color="black", lw=0.8, ls=":", label="the polynomial alone")
+    axes.set(xlabel="steps of 64 windows", ylabel="ADE of samples", ylim=(0, 0.9))
+    axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(out, metadata={"Date": None})
+    plt.close(figure)
+
+
 def dihedrals(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
     """Return φ and ψ (n_frames,) in degrees of all frames of trajectories of one peptide with one residue of each."""
     from systems.chemistry.geometry import torsion

@@ -8,6 +8,7 @@ curves go to FOLDER/causes/*.csv, the table to FOLDER/causes.json. What is there
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import sys
 from collections.abc import Callable
@@ -19,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from md_reference.run.machine import machine_name
 from surrogate.bench.reproduce.forecast_errors import forecast_errors
 from surrogate.bench.reproduce.forecast_methods import N_GIVEN, Array, Settings, sampled
 from surrogate.bench.reproduce.n_body import SIZES
@@ -27,8 +29,15 @@ from surrogate.bench.reproduce.n_body_methods import best_polynomial, set_foreca
 from surrogate.bench.reproduce.n_body_views import ParticleView, WindowView
 from surrogate.data.particle_sets import ParticleSet, read_set
 from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.codes.base import Code, Decoded
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, draw_flow_times, flow_loss
+from surrogate.models.lam_slide.losses import (
+    FlowWindows,
+    autoencoder_loss,
+    draw_flow_times,
+    flow_loss,
+    random_rotations,
+)
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.particles.flow_trainer import ParticleWindows, sample_ahead
 from surrogate.models.particles.particle_flow import ParticleFlow, ParticleFlowConfig
@@ -48,6 +57,7 @@ Loss = Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]]
 @dataclass(frozen=True)
 class Change:
     """One line: `code` and `flow` replace settings of the set of latents, `particles` those of particles as latents.
+    `exact`: coordinates themselves for a code. `motion`: of given frames steps and their changes, else positions alone.
     `mean_only`: a plain regression, flow time 0 and no noise. `n_train`: so few trajectories, not turned, to be learned
     by heart. `steps`: fewer, where a step is dear."""
 
@@ -55,7 +65,10 @@ class Change:
     code: dict[str, Any] = field(default_factory=dict)
     flow: dict[str, Any] = field(default_factory=dict)
     particles: dict[str, Any] | None = None
+    exact: bool = False
+    motion: bool = True
     polynomial: bool = True
+    fixed_order: bool = False
     told_charges: bool = True
     mean_only: bool = False
     n_train: int | None = None
@@ -63,6 +76,7 @@ class Change:
 
 
 _AS_IT_WAS: dict[str, Any] = {"precondition": True, "uniform_tau": False}
+_EXACT: dict[str, Any] = {"n_latents": 5, "latent_dim": 3}
 CHANGES = (
     Change("set: as it was", {"type_weight": 0.0}, _AS_IT_WAS),
     Change("set: flow times and weights of the paper", {"type_weight": 0.0}),
@@ -72,9 +86,13 @@ CHANGES = (
     Change("set: and clean conditioning", flow={"clean_conditioning": True}),
     Change("set: regression instead of a flow", mean_only=True),
     Change("set: 16 trajectories by heart", n_train=16),
-    Change("set: 5 latents", {"n_latents": 5, "latent_dim": 16}, {"latents_per_token": 1}, steps=300),
+    Change("set: identifiers in one order", fixed_order=True),
+    Change("exact code: a token for all particles of a frame", _EXACT, {"latents_per_token": 5}, exact=True),
+    Change("exact code: a token for each particle of a frame", _EXACT, {"latents_per_token": 1}, exact=True),
+    Change("set: 5 latents", {"n_latents": 5, "latent_dim": 16}, {"latents_per_token": 1}),
     Change("set: 16 latents", {"n_latents": 16}, {"latents_per_token": 1}, steps=120),
     Change("particles: a token for 5 frames", particles={"frames_per_token": 5, "pair_messages": False}),
+    Change("particles: a token each, positions given", particles={"pair_messages": False}, motion=False),
     Change("particles: a token each", particles={"pair_messages": False}),
     Change("particles: not told of charges", particles={"pair_messages": False}, told_charges=False),
     Change("particles: absolute positions", particles={"pair_messages": False}, polynomial=False),
@@ -107,7 +125,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
         held = train = train.first(change.n_train)
     steps = min(steps, change.steps or steps)
     place = StagePlace(
-        folder / f"{_slug(change)}.train.safetensors", folder / f"{_slug(change)}.csv", torch.device("cpu")
+        folder / f"{_slug(change.name)}.train.safetensors", folder / f"{_slug(change.name)}.csv", torch.device("cpu")
     )
     place.log.unlink(missing_ok=True)
     code: dict[str, float] = {}
@@ -138,9 +156,16 @@ def _of_a_set(
         approximator=replace(config.approximator, **change.flow),
     )
     view, model = WindowView.of(train, weights), LamSlide(config)
+    if change.exact:
+        model.autoencoder = ExactCode(config.autoencoder.n_latents)
     seen, types = torch.from_numpy(view.to_model(train.positions_nm)).float(), torch.from_numpy(train.types)
     draw = turned_windows(seen, types) if change.n_train is None else _as_they_are(seen, types)
-    _code(model, draw, folder / f"code-{_key(config, change)}.train.safetensors")
+    if change.fixed_order:
+        draw = _turned_alone(seen, types)
+    if not change.exact:
+        _code(model, draw, folder / f"code-{_key(config, change)}.train.safetensors")
+    normalise_latents(model, draw)
+    model.autoencoder.requires_grad_(False)
 
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         x, kinds = draw(BATCH, generator)
@@ -165,6 +190,7 @@ def _of_particles(change: Change, train: ParticleSet, weights: Array | None) -> 
         return data if change.told_charges else replace(data, types=0 * data.types, pairs=0 * data.pairs)
 
     view, train = ParticleView.of(train, weights), told(train)
+    view = view if change.motion else PositionsView(view.window, view.sizes_nm)
     n_features = view.given(train.positions_nm[:1, :N_GIVEN]).shape[-1]
     model = ParticleFlow(ParticleFlowConfig(n_features, **(change.particles or {})))
     turned = view.drawn(train, mirrored=False)
@@ -192,6 +218,35 @@ def _of_particles(change: Change, train: ParticleSet, weights: Array | None) -> 
     return model, loss, forecast
 
 
+class ExactCode(Code):
+    """Particles' coordinates as they are: what stage two could do if stage one lost nothing."""
+
+    latent_dim = 3
+
+    def __init__(self, n_particles: int) -> None:
+        super().__init__()
+        self.n_latents = n_particles
+
+    def n_entities(self, n_atoms: int) -> int:
+        return n_atoms
+
+    def types(self, elements: Tensor) -> Tensor:
+        return elements
+
+    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
+        return x
+
+    def decode(self, latents: Tensor, identifiers: Tensor, *, with_types: bool = False) -> Decoded:
+        return Decoded(latents, None)
+
+
+class PositionsView(ParticleView):
+    """Given frames as positions alone, about the centre of the last."""
+
+    def given(self, given: Array) -> Array:
+        return self.window.given(given).swapaxes(1, 2).reshape(len(given), given.shape[2], -1)
+
+
 def _code(model: LamSlide, draw: DrawWindows, state: Path) -> None:
     """Train the code of a frame, or take it where a line before has trained the same."""
 
@@ -203,8 +258,6 @@ def _code(model: LamSlide, draw: DrawWindows, state: Path) -> None:
     stage = StageConfig("code", CODE_BATCH, 2e-3, None, CODE_STEPS, warmup_steps=50, ema_decay=0.99, bf16=False)
     place = StagePlace(state, state.with_suffix("").with_suffix(".csv"), torch.device("cpu"), resume=True)
     run_stage(model.autoencoder, stage, loss, dict, place)
-    normalise_latents(model, draw)
-    model.autoencoder.requires_grad_(False)
 
 
 @torch.no_grad()
@@ -218,6 +271,16 @@ def _code_errors(model: LamSlide, view: WindowView, held: ParticleSet) -> dict[s
         "code_ade": float(np.linalg.norm(ahead - x[:, N_GIVEN:], axis=-1).mean()),
         "code_step": float(np.linalg.norm(steps, axis=-1).mean()),
     }
+
+
+def _turned_alone(windows: Tensor, types: Tensor) -> DrawWindows:
+    plain = _as_they_are(windows, types)
+
+    def draw(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        x, kinds = plain(batch, generator)
+        return x @ random_rotations(batch, generator)[:, None].mT, kinds
+
+    return draw
 
 
 def _as_they_are(windows: Tensor, types: Tensor) -> DrawWindows:
@@ -234,19 +297,42 @@ def _errors(forecast: Forecast, data: ParticleSet, n_samples: int, solver_steps:
     return float(ade.mean()), float(fde.mean())
 
 
-def _slug(change: Change) -> str:
-    return "-".join("".join(c if c.isalnum() else " " for c in change.name).split())
+def _slug(name: str) -> str:
+    return "-".join("".join(c if c.isalnum() else " " for c in name).split())
 
 
 def _key(config: LamSlideConfig, change: Change) -> str:
     c = config.autoencoder
-    return f"{c.n_latents}x{c.latent_dim}-type{c.type_weight:g}-poly{change.polynomial:d}-n{change.n_train or 0}"
+    seen = f"poly{change.polynomial:d}-order{change.fixed_order:d}-n{change.n_train or 0}"
+    return f"{c.n_latents}x{c.latent_dim}-type{c.type_weight:g}-{seen}"
+
+
+def table_of(rows: list[Found], folder: Path) -> dict[str, Any]:
+    """Return the manual's table of these lines, with their curves: [step, samples' ADE, mean forecast's ADE]."""
+    curves = {}
+    for row in rows:
+        with (folder / f"{_slug(row.name)}.csv").open(newline="") as handle:
+            points = list(csv.DictReader(handle))
+        curves[row.name] = [
+            [int(p["step"]), *(round(float(p[k]), 4) for k in ("sample_ade", "mean_ade"))] for p in points
+        ]
+    return {
+        "command": "python docs/studies/surrogates/n_body_causes.py FOLDER",
+        "machine": f"one core, busy with others' work ({machine_name()})",
+        "columns": ["", "mean forecast", "samples", "code's own error", "of a step", "steps"],
+        "rows": [
+            [row.name, *("" if x is None else f"{x:.3f}" for x in (row.mean_ade, row.sample_ade, row.code_ade)),
+             "" if row.code_step is None else f"{row.code_step:.4f}", f"{row.steps:,}"] for row in rows
+        ],
+        "curves": curves,
+    }  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--table", type=Path, help="where to write the manual's table")
     parser.add_argument("--only", default="", help="lines whose name contains this")
     asked = parser.parse_args()
     torch.set_num_threads(1)
@@ -263,6 +349,8 @@ def main() -> None:
         rows.append(asdict(found))
         create_whole(table, json.dumps(rows, indent=1))
         sys.stdout.write(f"{found}\n")
+    if asked.table is not None:
+        create_whole(asked.table, json.dumps(table_of([Found(**row) for row in rows], folder), indent=1))
 
 
 if __name__ == "__main__":
