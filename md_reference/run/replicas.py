@@ -15,13 +15,13 @@ from md_reference.forces.forcefield import resolve
 from md_reference.run.config import MDConfig, check_run
 from md_reference.run.lanes import PLATFORM, n_lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.parent_watch import end_with_parent
 from md_reference.run.plan import lanes_choice, line_of_run
 from md_reference.run.platforms import measured_platform
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.run.simulate_lanes import simulate_batch
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
+from systems.parent_watch import end_with_parent
 from systems.scene import Scene
 
 

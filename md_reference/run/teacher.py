@@ -19,9 +19,9 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
-from md_reference.run.parent_watch import end_with_parent
 from systems.chemistry.graph import bonded_graph, rotatable_torsions
 from systems.errors import PreparationError, SimulationError
+from systems.parent_watch import end_with_parent
 from systems.scene import FloatArray, Scene
 
 

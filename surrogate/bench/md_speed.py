@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from md_reference.run.machine import available_cores
-from md_reference.run.parent_watch import end_with_parent
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.md_setups import CASES, Case, Setup, ours, plain
 from systems.errors import InputError, SimulationError, SurromdError, nearest
+from systems.parent_watch import end_with_parent
 
 MODES = ("ours", "plain, all cores", "plain, one a core", "ours, 4 fs and 3 Da")
 _OURS, _ALL_CORES, _PER_CORE, _LONG = MODES

@@ -34,10 +34,10 @@ from md_reference.run.engine import Engine
 from md_reference.run.integrators import integrator_name
 from md_reference.run.lanes import Lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.parent_watch import end_with_parent
 from surrogate.bench.recipes.peptide_list import Peptide, held_out_peptides, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
+from systems.parent_watch import end_with_parent
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer

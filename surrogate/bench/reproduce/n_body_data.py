@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from md_reference.run.machine import available_cores
-from md_reference.run.parent_watch import end_with_parent
 from surrogate.data.particle_sets import SPLITS, ParticleSet, append_systems, create_sets, n_complete
 from systems.library.particles import N_BODY
+from systems.parent_watch import end_with_parent
 
 if TYPE_CHECKING:
     from surrogate.progress import ProgressFn
