@@ -96,6 +96,8 @@ def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
     times = torch.arange(1.0, 6.0).expand(2, -1)
     tau = torch.full((2,), 0.5)
     base = model.flow(o, tau, known, times, chain.places)
+    told = model.flow.told(known, times, chain.places)
+    assert torch.equal(base, model.flow(o, tau, known, times, chain.places, told))
     swapped = chain.places.clone()
     swapped[1, 2] = swapped[2, 2]
     for other in (

@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -111,6 +111,19 @@ class TypedLinear(nn.Module):
         return self.shared(x) + own
 
 
+class Told(NamedTuple):
+    """What the evaluations of a chunk have in common: `types` (r,), `of_type` (r, width), `given` (b, 1, r, width) the
+    embedded frame, `of_times` (b, t, 1, width), `rope` of the frames, and of each layer the `biases` between residues.
+    """
+
+    types: Tensor
+    of_type: Tensor
+    given: Tensor
+    of_times: Tensor
+    rope: tuple[Tensor, Tensor]
+    biases: list[Tensor]
+
+
 class PeptideLayer(nn.Module):
     """One block over the residues of a frame, one over the frames of a residue (Algorithm 5)."""
 
@@ -120,9 +133,8 @@ class PeptideLayer(nn.Module):
         self.temporal = ParallelBlock(width, n_heads)
         self.of_distance = nn.Embedding(2 * _FAR + 1, n_heads)
 
-    def forward(self, h: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor], apart: Tensor) -> Tensor:
-        """`h` (b, r, t, width); `apart` (r, r): places in the chain, one less the other, as rows of `of_distance`."""
-        bias = self.of_distance(apart).permute(2, 0, 1)
+    def forward(self, h: Tensor, modulation: Tensor, rope: tuple[Tensor, Tensor], bias: Tensor) -> Tensor:
+        """`h` (b, r, t, width); `bias` (n_heads, r, r): of scores, by how far apart residues are (`of_distance`)."""
         h = self.spatial(h.transpose(1, 2), modulation[:, :3], None, bias=bias)[0].transpose(1, 2)
         return self.temporal(h, modulation[:, 3:], rope)[0]
 
@@ -152,27 +164,41 @@ class PeptideFlow(nn.Module):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
 
-    def forward(self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor) -> Tensor:
-        """`o` (b, t, r, slots), `tau` (b,), `known` (b, r, slots), `times_ps` (b, t), `places` (r, 3) -> like `o`."""
+    def forward(
+        self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor, told: Told | None = None
+    ) -> Tensor:
+        """`o` (b, t, r, slots), `tau` (b,), or (1,) of all, `known` (b, r, slots), `times_ps` (b, t), `places` (r, 3)
+        -> like `o`. `told` is what the method of that name returned, so that a chunk's evaluations compute it once."""
+        told = self.told(known, times_ps, places) if told is None else told
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
-        return skip * o + out * self._network(o * scale_in, tau, known, times_ps, places)
+        return skip * o + out * self._network(o * scale_in, tau, told)
 
-    def _network(self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor) -> Tensor:
+    def told(self, known: Tensor, times_ps: Tensor, places: Tensor) -> Told:
+        """Return what all evaluations of a chunk have in common; shapes as for `forward`."""
         types = places[:, 0]
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
-        given = self.of_known(known[:, None], types) + self.of_given
-        h = torch.cat([given, self.of_noisy(o, types) + self._of_times(times_ps)[:, :, None]], dim=1) + of_type
+        angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
+        place = torch.arange(len(types), device=known.device)
+        apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
+        return Told(
+            types,
+            of_type,
+            self.of_known(known[:, None], types) + self.of_given,
+            self._of_times(times_ps)[:, :, None],
+            (angles.cos(), angles.sin()),
+            [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
+        )
+
+    def _network(self, o: Tensor, tau: Tensor, told: Told) -> Tensor:
+        h = torch.cat([told.given, self.of_noisy(o, told.types) + told.of_times], dim=1) + told.of_type
         time = F.silu(self.embed_tau(tau))
         modulation = self.modulation(time).unflatten(-1, (6, -1))
-        angles = rotary_angles(h.shape[1], self.config.width // self.config.n_heads).to(h.device)
-        place = torch.arange(len(types), device=h.device)
-        apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
         h = h.transpose(1, 2)
-        for layer in self.layers:
-            h = layer(h, modulation, (angles.cos(), angles.sin()), apart)
+        for layer, bias in zip(self.layers, told.biases, strict=True):
+            h = layer(h, modulation, told.rope, bias)
         shift, scale = self.final_modulation(time)[:, None, None, :].chunk(2, dim=-1)
         h = F.layer_norm(h.transpose(1, 2)[:, 1:], h.shape[-1:]) * (1.0 + scale) + shift
-        found: Tensor = self.final(h, types)
+        found: Tensor = self.final(h, told.types)
         return found.float()
 
     def _of_times(self, times_ps: Tensor) -> Tensor:
@@ -290,8 +316,10 @@ class PeptideSlide(Surrogate):
         drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
 
+        told = self.flow.told(known, times, chain.places)
+
         def predict(o: Tensor, tau: Tensor) -> Tensor:
-            return torch.where(filled, self.flow(o, tau, known, times, chain.places), 0.0)
+            return torch.where(filled, self.flow(o, tau, known, times, chain.places, told), 0.0)
 
         y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
         return Chunk(self.frames_of(self.from_innovations(y, known, times, types), chain))
