@@ -1,7 +1,7 @@
 """Draw the figures of README and manual: `python docs/figures/draw.py [DEMO_FOLDER]`.
 
-`cost_error.svg` is made of docs/results/tables/cost_error.json; `overlay.png` of the trajectories that `surromd demo`
-left in DEMO_FOLDER, and left as it is without one.
+`effective_samples.svg` is made of docs/results/tables/effective_samples.json; `overlay.png` of the trajectories that
+`surromd demo` left in DEMO_FOLDER, and left as it is without one.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-TABLE = HERE.parent / "results" / "tables" / "cost_error.json"
-# of one core, from the same measurement (docs/results/alanine_dipeptide.md)
-ROLLED_NS, FLOOR = 20.0, 0.058
+TABLE = HERE.parent / "results" / "tables" / "effective_samples.json"
 KT_KJ_PER_MOL = 2.494
 
 
@@ -30,34 +28,30 @@ def numbers(cell: str) -> list[float]:
     return [float(n) for n in re.findall(r"\d+(?:\.\d+)?", cell)]
 
 
-def draw_cost_error(table: dict[str, Any], out: Path) -> None:
-    """Draw distance to the truth against processor seconds: the surrogate's settings, and MD after as many seconds."""
+def draw_effective(table: dict[str, Any], out: Path) -> None:
+    """Draw distance to the truth against effective samples a second, of the surrogate's settings and of OpenMM."""
     rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
-    seconds = np.array([ROLLED_NS * numbers(row["s/ns"])[0] for row in rows])
-    md = np.array([numbers(row["MD, same seconds"])[0] for row in rows])
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    order = np.argsort(seconds)
-    # the table rounds to two digits
-    axes.plot(seconds[order], md[order], "x:", color="black", lw=0.9, label="OpenMM, the same seconds")
-    for solver, colour in (("fitted", "#d62728"), ("multistep", "#1f77b4")):
-        axes.plot([], [], "o", color=colour, label=f"surrogate, solver {solver}")
-        for x, row in zip(seconds, rows, strict=True):
-            name = row["solver, steps"].replace("`", "")
-            if not name.startswith(solver):
-                continue
-            y, low, high = numbers(row["distance"])
-            axes.errorbar(x, y, [[y - low], [high - y]], color=colour, marker="o", capsize=2, lw=1)
-            steps = int(numbers(name)[0])
-            where = {"xytext": (6, -11), "textcoords": "offset points", "fontsize": 8}
-            axes.annotate(f"{steps} steps", (x, y), color=colour, **where)
-    axes.axhline(FLOOR, color="black", lw=0.8, ls=":", label="two runs of 100 ns of MD (12 min each)")
+    for row in rows:
+        rate, (y, *ends) = numbers(row["effective samples/s"])[0], numbers(row["distance"])
+        ours = row["what"].startswith("surrogate")
+        colour = "#d62728" if ours else "black"
+        error = [[y - ends[0]], [ends[1] - y]] if ends else None
+        axes.errorbar(rate, y, error, color=colour, marker="o" if ours else "s", capsize=2, lw=1, ms=5)
+        name = row["what"].removeprefix("surrogate, ").removeprefix("OpenMM, ")
+        first = name.startswith("fitted") or name.endswith("plain")
+        where = {"xytext": (4, -12 if first else 5), "textcoords": "offset points", "fontsize": 8}
+        axes.annotate(name, (rate, y), color=colour, **where)
+    axes.plot([], [], "s", color="black", label="OpenMM, by time step")
+    axes.plot([], [], "o", color="#d62728", label="surrogate, by solver and steps")
     axes.set(
-        xlabel=f"processor seconds of one core ({ROLLED_NS:g} ns of rollout)",
+        xscale="log",
+        xlabel="effective samples of cos ψ a processor second (one core)",
         ylabel="Jensen-Shannon distance of φ/ψ maps",
-        ylim=(0, 0.3),
-        xlim=(10, 29),
+        ylim=(0, 0.22),
+        xlim=(0.12, 130),
     )
-    axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 0.2))
+    axes.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(out, metadata={"Date": None})
     plt.close(figure)
 
@@ -125,6 +119,6 @@ def draw_overlay(demo: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    draw_cost_error(json.loads(TABLE.read_text(encoding="utf-8")), HERE / "cost_error.svg")
+    draw_effective(json.loads(TABLE.read_text(encoding="utf-8")), HERE / "effective_samples.svg")
     if len(sys.argv) > 1:
         draw_overlay(Path(sys.argv[1]), HERE / "overlay.png")

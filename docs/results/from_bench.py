@@ -1,14 +1,16 @@
 """Make a table of the manual of what a benchmark wrote: `python docs/results/from_bench.py NAME FILE.json`.
 
-NAME is `reference_speed` (FILE of `surromd bench reference -o FILE`), `cost_error` (FILE of `surromd bench
-cost-error`) or `peptide_lags` (FILE lag.json of `python -m surrogate.bench.recipes.peptide_gates lag`). The table goes
-to docs/results/tables/NAME.json with the machine that the benchmark names, and replaces the one there.
+NAME is `reference_speed` (FILE of `surromd bench reference -o FILE`), `cost_error` or `effective_samples` (FILE of
+`surromd bench cost-error`) or `peptide_lags` (FILE lag.json of `python -m surrogate.bench.recipes.peptide_gates lag`).
+The table goes to docs/results/tables/NAME.json with the machine that the benchmark names, and replaces the one there.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
+from bisect import bisect_left
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,6 +72,35 @@ def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def effective_samples(measured: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of effective samples a processor second, of MD and of the settings that were judged."""
+    md, slow = measured["md"], measured["md"]["slowest"]
+    ns = 1e-3 * min(measured["config"]["time_ps"], md["lengths_ps"][-1])
+    near = math.exp(_between(math.log(1e3 * ns), [math.log(x) for x in md["lengths_ps"]], md["errors"]))
+    rates = {cost["label"]: 1e3 / cost["cpu_s_per_ns"]["mean"] / (2.0 * slow["tau_ps"]) for cost in md["cost"]}
+    best = max(rates.values())
+    rows = [[name, significant(rate), f"{rate / best:.2g}", f"{near:.3f}"] for name, rate in rates.items()]
+    for row in (row for row in measured["rows"] if row.get("effective_per_s")):
+        rate = row["effective_per_s"]
+        rows.append([f"surrogate, {row['label']}", significant(rate), f"{rate / best:.2g}", interval(row["jsd"])])
+    asked = " ".join(dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"]))
+    return {
+        "command": f"surromd bench cost-error HELD1 HELD2 {asked}",
+        "machine": measured["machine"].get("about", measured["machine"]["name"]),
+        "note": f"Simulated time over 2 max(τ, τ of MD) of {slow['name']} ({slow['tau_ps']:.1f} ps in MD), a processor "
+        f"second; distances of φ/ψ maps after {ns:g} ns. Plain: OpenMM's own files and defaults.",
+        "columns": ["what", "effective samples/s", "over the fastest MD", "distance"],
+        "rows": rows,
+    }
+
+
+def _between(x: float, known: list[float], errors: list[float]) -> float:
+    """Return the logarithm of the error at `x`, linear between those known."""
+    at = min(max(bisect_left(known, x), 1), len(known) - 1)
+    share = (x - known[at - 1]) / (known[at] - known[at - 1])
+    return (1 - share) * math.log(errors[at - 1]) + share * math.log(errors[at])
+
+
 def peptide_lags(measured: dict[str, Any]) -> dict[str, Any]:
     """Return the table of a model of peptides started from held-out frames, at each lag."""
     rows = [
@@ -113,6 +144,7 @@ def interval(found: dict[str, Any]) -> str:
 KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "reference_speed": reference_speed,
     "cost_error": cost_error,
+    "effective_samples": effective_samples,
     "peptide_lags": peptide_lags,
 }
 
