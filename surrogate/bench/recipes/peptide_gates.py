@@ -10,8 +10,11 @@ one of 100 ps, beside two halves of MD. `--plain` trains without innovations, th
 energy of phi > 0 of many more and longer rollouts, beside that which a Markov model finds in the short runs alone. How
 likely phi > 0 is, `free-energy`'s files in FOLDER tell the training: short runs leave that state and never enter it.
 
-`pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (a folder of `peptide_runs`), the
-model rolls each molecule below `--test` (a campaign's folder) as long and as often as MD did. Distances over MD's own
+`code`: how far frames of the molecules below `--test`, coded by residues as in training and rebuilt, lie from
+themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numbers is that of the monomers in `--train`.
+
+`pairs`: trained on the monomers and the first `--pairs` capped pairs below `--train` (`train` in a folder of
+`peptide_runs`), the model rolls each molecule below `--test` as long and as often as MD did. Distances over MD's own
 scatter, beside the library of monomers' torsions (`peptide_scores`).
 
 `free-energy`: of phi > 0 of a capped residue, in kT, by two well-tempered metadynamics runs, which must agree, and by
@@ -268,7 +271,7 @@ def pairs_gate(a: argparse.Namespace) -> None:
         train_on_pairs(a.train, out, n_pairs, steps=a.steps)
         weights = load_weights(out)
         for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
-            runs = sorted(molecule.rglob("*_r?.h5"))
+            runs = sorted(molecule.rglob("*.h5"))
             if len(runs) < 2:
                 continue
             for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name):
@@ -276,6 +279,26 @@ def pairs_gate(a: argparse.Namespace) -> None:
             sys.stderr.write(f"{n_pairs} pairs: {molecule.name} measured\n")
     (a.folder / "pairs.json").write_text(json.dumps(rows, indent=1))
     sys.stdout.write(pairs_table(rows) + "\n")
+
+
+def code_gate(a: argparse.Namespace) -> None:
+    """Code and rebuild frames of every test molecule, print and keep what is lost."""
+    from surrogate.bench.recipes.peptide_scores import rebuilt
+    from surrogate.data.frames import collect_frames
+    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.trainer import with_scale
+
+    monomers = [p for p in training_peptides() if len(p.residues) == 1]
+    files = [sorted((a.train / p.name).glob("run_*.h5"))[:2] for p in monomers]
+    config = with_scale(PeptideConfig(), [collect_frames(some) for some in files if some])
+    record = {}
+    for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
+        runs = sorted(molecule.rglob("*.h5"))
+        if runs:
+            scene, frames, _ = _thinned(runs[:1])
+            record[molecule.name] = rebuilt(scene, frames[0], config)
+    (a.folder / "code.json").write_text(json.dumps(record, indent=1))
+    sys.stdout.write(json.dumps(record, indent=1) + "\n")
 
 
 def free_energy_gate(a: argparse.Namespace) -> None:
@@ -338,8 +361,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     gates = parser.add_subparsers(dest="gate", required=True)
-    lag, seeds, pairs, energy = (gates.add_parser(name) for name in ("lag", "seeds", "pairs", "free-energy"))
-    for gate in (lag, seeds, pairs, energy):
+    names = ("lag", "seeds", "code", "pairs", "free-energy")
+    lag, seeds, code, pairs, energy = (gates.add_parser(name) for name in names)
+    for gate in (lag, seeds, code, pairs, energy):
         gate.add_argument("folder", type=Path)
     for gate in (lag, seeds, pairs):
         gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
@@ -349,15 +373,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seeds.add_argument("--runs", type=Path, required=True, help="folder of short runs of the same peptide")
     lag.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
     lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
-    pairs.add_argument("--train", type=Path, required=True, help="folder of `peptide_runs`")
-    pairs.add_argument("--test", type=Path, required=True, help="folder of a campaign of molecules never trained on")
+    for gate in (code, pairs):
+        gate.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
+        gate.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")
     energy.add_argument("--md", type=Path, nargs="*", default=(), help="long runs of the same molecule")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
-    {"lag": lag_gate, "seeds": seeds_gate, "pairs": pairs_gate, "free-energy": free_energy_gate}[a.gate](a)
+    gate_of = dict(zip(names, (lag_gate, seeds_gate, code_gate, pairs_gate, free_energy_gate), strict=True))
+    gate_of[a.gate](a)
 
 
 if __name__ == "__main__":

@@ -12,15 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.distributions import distance
 from surrogate.judge.measure.torsions import find_torsions
-from systems.chemistry.geometry import torsion
+from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from surrogate.models.peptides.model import PeptideConfig
 
 FloatArray = npt.NDArray[np.float64]
 _BINS, _JOINT_BINS = 50, 36
@@ -137,3 +141,25 @@ def _distance_1d(a: FloatArray, b: FloatArray) -> float:
 def _distance_2d(a: FloatArray, b: FloatArray) -> float:
     edges = np.linspace(-np.pi, np.pi, _JOINT_BINS + 1)
     return float(distance(*(np.histogram2d(x[:, 0], x[:, 1], (edges, edges))[0].ravel() for x in (a, b))))
+
+
+def rebuilt(scene: Scene, frames_nm: FloatArray, config: PeptideConfig) -> dict[str, float]:
+    """Return how far frames `(n, n_atoms, 3)` coded by residues and rebuilt lie from themselves: heavy atoms (RMSD, Å),
+    mean and most, and the most that a torsion differs (degrees)."""
+    import torch
+
+    from surrogate.data.features.peptide_chains import chain_features
+
+    code = chain_features(scene, config).code
+    found = code.decode(code.encode(torch.from_numpy(frames_nm).float())).double().numpy()
+    heavy = scene.heavy_idx
+    laid = np.stack([superpose(x[None], y, idx=heavy)[0] for x, y in zip(found, frames_nm, strict=True)])
+    rmsd = np.sqrt(((laid - frames_nm)[:, heavy] ** 2).sum(-1).mean(-1)) * 10
+    turns = turns_of(scene)
+    turned = np.angle(np.exp(1j * (angles(turns, found) - angles(turns, frames_nm))))
+    return {
+        "frames": len(frames_nm),
+        "rmsd_angstrom": float(rmsd.mean()),
+        "rmsd_angstrom_most": float(rmsd.max()),
+        "torsions_degrees_most": float(np.degrees(np.abs(turned)).max()),
+    }

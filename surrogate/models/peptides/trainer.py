@@ -74,7 +74,7 @@ def train_peptides(
     """
     out = Path(out)
     torch.manual_seed(training.seed)
-    config = _with_scale(config, sets)
+    config = with_scale(config, sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (
@@ -140,7 +140,8 @@ def _strides(config: PeptideConfig, frames: TrainingFrames) -> tuple[int, ...]:
     return tuple(sorted(set(whole.tolist())))
 
 
-def _with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> PeptideConfig:
+def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> PeptideConfig:
+    """Return the configuration with the types and scales of residues that frames show, where it has none."""
     if config.scale is not None:
         return config
     layouts = [chain_layout(frames.scene) for frames in sets]

@@ -15,7 +15,7 @@ from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.trainer import PeptideTraining, _with_scale, normalise, train_peptides
+from surrogate.models.peptides.trainer import PeptideTraining, normalise, train_peptides, with_scale
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
@@ -41,7 +41,7 @@ def frames() -> TrainingFrames:
 
 @pytest.fixture(scope="module")
 def config(frames: TrainingFrames) -> PeptideConfig:
-    return _with_scale(SMALL, [frames])
+    return with_scale(SMALL, [frames])
 
 
 @pytest.mark.parametrize("validation", [False, True])
@@ -124,7 +124,7 @@ def test_positive_phi_weighs_what_metadynamics_says() -> None:
     )
     posed = canonicalise(x.reshape(-1, scene.n_atoms, 3), scene)
     frames = TrainingFrames(scene, quantise(posed), np.arange(9) * 100, 1.0, True, CONDITIONS, (), split=Split(0.2))
-    subject = PeptideSubject(frames, chain_features(scene, _with_scale(SMALL, [frames])))
+    subject = PeptideSubject(frames, chain_features(scene, with_scale(SMALL, [frames])))
     weights = subject.in_equilibrium({"ALA": 1.0, "VAL": 2.0}).weights
     assert weights is not None
     of_run = weights.reshape(8, 100)

@@ -16,7 +16,7 @@ from surrogate.data.splits import Split
 from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.trainer import _with_scale, normalise
+from surrogate.models.peptides.trainer import normalise, with_scale
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.provenance import training_domain
@@ -41,7 +41,7 @@ def trembling(name: str) -> TrainingFrames:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Weights:
     sets = [trembling(name) for name in TRAINED]
-    config = _with_scale(SMALL, sets)
+    config = with_scale(SMALL, sets)
     torch.manual_seed(0)
     model = PeptideSlide(config)
     normalise(model, [PeptideSubject(f, chain_features(f.scene, config)) for f in sets], 0)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogate.bench.recipes.peptide_scores import FloatArray, angles, floor, library, score, turns_of
+from surrogate.bench.recipes.peptide_scores import FloatArray, angles, floor, library, rebuilt, score, turns_of
+from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.splits import Split
+from surrogate.models.peptides.chains import ChainCode
+from surrogate.models.peptides.model import PeptideConfig
+from surrogate.models.peptides.trainer import with_scale
 from systems.prepare.peptide import build_peptide
 
 
@@ -25,6 +30,21 @@ def test_angles_are_those_of_the_frames() -> None:
     assert values[0] == pytest.approx(-values[1], abs=1e-6), "a mirror image turns all signs"
     by_kind = {t.kind: np.degrees(values[0, k]) for k, t in enumerate(turns)}
     assert by_kind["phi"] == pytest.approx(-140, abs=15) and by_kind["psi"] == pytest.approx(140, abs=15)
+
+
+def test_what_a_code_loses_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = build_peptide("ACE-SER-LEU-NME")
+    frames = scene.positions_nm + np.random.default_rng(0).normal(0.0, 0.003, (5, scene.n_atoms, 3))
+    known = TrainingFrames(
+        scene, quantise(canonicalise(frames, scene)), np.array([0, 5]), 1.0, True, {}, (), split=Split(0.2)
+    )
+    config = with_scale(PeptideConfig(), [known])
+    found = rebuilt(scene, frames, config)
+    assert found["rmsd_angstrom_most"] < 1e-4 and found["torsions_degrees_most"] < 0.05
+    decode = ChainCode.decode
+    monkeypatch.setattr(ChainCode, "decode", lambda self, tokens: decode(self, tokens + 0.02))
+    worse = rebuilt(scene, frames, config)
+    assert worse["rmsd_angstrom"] > 0.01 and worse["torsions_degrees_most"] > 0.5
 
 
 @pytest.fixture(scope="module")
