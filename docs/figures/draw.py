@@ -39,9 +39,10 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         error = [[y - ends[0]], [ends[1] - y]] if ends else None
         axes.errorbar(rate, y, error, color=colour, marker="o" if ours else "s", capsize=2, lw=1, ms=5)
         name = row["what"].removeprefix("surrogate, ").removeprefix("OpenMM, ")
-        first = name.startswith("fitted") or name.endswith("plain")
-        where = {"xytext": (4, -12 if first else 5), "textcoords": "offset points", "fontsize": 8}
-        axes.annotate(name, (rate, y), color=colour, **where)
+        left, below = name.endswith("10"), name.startswith("fitted") or name.endswith("plain")
+        where = {"xytext": (-5 if left else 5, -12 if below else 5), "ha": "right" if left else "left"}
+        where |= {"textcoords": "offset points", "fontsize": 8, "va": "top" if "plain" in name else "baseline"}
+        axes.annotate(name.replace(", ", "\n"), (rate, y), color=colour, **where)
     axes.plot([], [], "s", color="black", label="OpenMM, by time step")
     axes.plot([], [], "o", color="#d62728", label="surrogate, by solver and steps")
     axes.set(

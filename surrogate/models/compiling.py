@@ -20,9 +20,9 @@ _Model = TypeVar("_Model", bound=nn.Module)
 def with_compiled_parts(model: _Model) -> _Model:
     """Return a copy whose networks are compiled when they are first called, for arrays of one shape.
 
-    Weights become constants of what is compiled (freezing), which packs them as the processor multiplies them: half of
-    an evaluation's time for a single replica. What torch compiles is kept on disk and found by the next process. Parts
-    that are not called as a network, such as encoder and decoder, are the lean ones (`models.lean`).
+    Weights become constants of what is compiled (freezing), which packs them as the processor multiplies them: for a
+    single replica an evaluation takes a quarter to a half less time. What torch compiles it keeps on disk for the next
+    process. Parts that are not called as a network, such as encoder and decoder, are the lean ones (`models.lean`).
     Raises InputError where there is no C++ compiler.
     """
     if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
