@@ -7,8 +7,9 @@ one of 100 ps, beside two halves of MD. `--plain` trains without innovations, th
 
 `seeds`: another model of the same peptide, trained on short runs from many starts (`--runs`, a folder of
 `peptide_runs`), and the one of `lag` roll as long and as often as `--test` did: joint phi/psi distances, and the free
-energy of phi > 0 of many more and longer rollouts, beside that which a Markov model finds in the short runs alone. How
-likely phi > 0 is, `free-energy`'s files in FOLDER tell the training: short runs leave that state and never enter it.
+energy of phi > 0 of many more and longer rollouts, how often they enter and leave that state, beside what the short
+runs and a Markov model of them say. How likely phi > 0 is, the records of `peptide_energies` or `free-energy` in FOLDER
+tell the training: short runs leave that state and never enter it.
 
 `code`: how far frames of the molecules below `--test`, coded by residues as in training and rebuilt, lie from
 themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numbers is that of the monomers in `--train`.
@@ -224,6 +225,7 @@ def lag_gate(a: argparse.Namespace) -> None:
 
 def seeds_gate(a: argparse.Namespace) -> None:
     """Train on seeded runs, roll both models, print and keep distances and free energies."""
+    from surrogate.bench.recipes.peptide_scores import crossings
     from surrogate.data.weights import load_weights
 
     runs = sorted(a.runs.glob("run_*.h5"))
@@ -232,19 +234,22 @@ def seeds_gate(a: argparse.Namespace) -> None:
     )  # fmt: skip
     scene, truth, time_ps = _thinned(a.test)
     angles = [torsions(scene, x) for x in truth]
-    record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)]}}
+    md = crossings([x[:, 0] for x in angles], FRAMES_PS)
+    record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)], **md}}
     for name in ("lag", "seeds"):
         weights, folder = load_weights(a.folder / f"{name}.safetensors"), a.folder / f"{name}-rollouts"
         same = _rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(truth))], time_ps, FRAMES_PS)
         found = [joint_distance(torsions(scene, x), y) for x in same for y in angles]
         many = [folder / f"long_{k:02d}.h5" for k in range(_REPLICAS)]
         long = _rolled(weights, scene, many, _REPLICA_PS, _REPLICA_LAG_PS)
-        shares = [float((torsions(scene, x)[:, 0] > 0).mean()) for x in long]
-        record[name] = {"distance": found, **_free_energy(shares)}
+        phi = [torsions(scene, x)[:, 0] for x in long]
+        record[name] = {"distance": found, **_free_energy([float((x > 0).mean()) for x in phi]),
+                        **crossings(phi, _REPLICA_LAG_PS)}  # fmt: skip
     _, short, _ = _thinned(runs)
     both = [torsions(scene, x) for x in short]
     share = float(_weights(both)[np.concatenate(both)[:, 0] > 0].sum())
-    record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None}
+    record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None,
+                              **crossings([x[:, 0] for x in both], FRAMES_PS)}  # fmt: skip
     (a.folder / "seeds.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(json.dumps({k: {x: np.round(y, 3).tolist() for x, y in v.items() if y is not None}
                                  for k, v in record.items()}, indent=1) + "\n")  # fmt: skip

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 _BINS, _JOINT_BINS = 50, 36
+_POSITIVE_CORE, _NEGATIVE_CORE = (30.0, 90.0), (-175.0, -45.0)  # of phi, degrees
 
 
 @dataclass(frozen=True)
@@ -163,3 +164,26 @@ def rebuilt(scene: Scene, frames_nm: FloatArray, config: PeptideConfig) -> dict[
         "rmsd_angstrom_most": float(rmsd.max()),
         "torsions_degrees_most": float(np.degrees(np.abs(turned)).max()),
     }
+
+
+def crossings(phi: Sequence[FloatArray], apart_ps: float) -> dict[str, float]:
+    """Return how often runs of phi `(n,)`, rad, enter phi > 0 and leave it, and the rates per ns spent on the other
+    side.
+
+    Between the cores of both basins the last one counts, so that nothing is counted for a frame on a barrier.
+    """
+    moves, spent_ns = np.zeros(2, dtype=int), np.zeros(2)
+    for run in phi:
+        degrees = np.degrees(run)
+        positive = (degrees > _POSITIVE_CORE[0]) & (degrees < _POSITIVE_CORE[1])
+        negative = (degrees > _NEGATIVE_CORE[0]) & (degrees < _NEGATIVE_CORE[1])
+        seen = np.flatnonzero(positive | negative)
+        if len(seen):
+            state = positive[seen].astype(int)
+            spent_ns += [np.diff(np.append(seen, len(run)))[state == k].sum() * apart_ps * 1e-3 for k in (0, 1)]
+            moves += [int(((state[1:] == k) & (state[:-1] != k)).sum()) for k in (0, 1)]
+    per_ns = moves[::-1] / np.maximum(spent_ns, 1e-12)
+    return {
+        "entries": int(moves[1]), "exits": int(moves[0]),
+        "entries_per_ns": float(per_ns[0]), "exits_per_ns": float(per_ns[1]),
+    }  # fmt: skip

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogate.bench.recipes.peptide_scores import FloatArray, angles, floor, library, rebuilt, score, turns_of
+from surrogate.bench.recipes.peptide_scores import (
+    FloatArray,
+    angles,
+    crossings,
+    floor,
+    library,
+    rebuilt,
+    score,
+    turns_of,
+)
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.models.peptides.chains import ChainCode
@@ -30,6 +39,16 @@ def test_angles_are_those_of_the_frames() -> None:
     assert values[0] == pytest.approx(-values[1], abs=1e-6), "a mirror image turns all signs"
     by_kind = {t.kind: np.degrees(values[0, k]) for k, t in enumerate(turns)}
     assert by_kind["phi"] == pytest.approx(-140, abs=15) and by_kind["psi"] == pytest.approx(140, abs=15)
+
+
+def test_crossings_count_whole_ways_between_cores() -> None:
+    run = np.radians([-80.0, -80, 10, -80, 10, 60, 60, 10, 60, -80, -80, -20])
+    found = crossings([run, run[::-1]], 100.0)
+    assert (found["entries"], found["exits"]) == (2, 2), "turning back on the barrier is no crossing"
+    # Frames on the barrier belong to the core before: 8 and 6 are below, 4 and 5 above.
+    assert found["entries_per_ns"] == pytest.approx(2 / 1.4, rel=0.01)
+    assert found["exits_per_ns"] == pytest.approx(2 / 0.9, rel=0.01)
+    assert crossings([np.radians([10.0, 20.0])], 1.0)["entries"] == 0
 
 
 def test_what_a_code_loses_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
