@@ -44,6 +44,7 @@ _RELAXING_STEPS, _SURE = 150, 0.7
 _JUDGE_S, _JUDGE_ATOM_S = 4.0, 3e-6
 _JUDGE_SHARE = 0.1
 _MOST_FRAMES, _LEAST_FRAMES = 400_000, 4_000
+_MOST_STRETCH_FORESEEN = 2.0
 _MD_STAGES: tuple[Stage, ...] = ("training md", "md", "held-out md")
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -84,7 +85,8 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
     chosen, why = _choose(rates, budget_s, way)
     shares = dict(_BY_STAGES if chosen == "md" and rates.cores == 1 else _SHARES[chosen])
     n_md = sum(name in _MD_STAGES for name in shares)
-    least_s = max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * rates.stretch)
+    # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
+    least_s = max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * min(rates.stretch, _MOST_STRETCH_FORESEEN))
     if budget_s < least_s:
         raise InputError(
             f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and judge anything on this machine, as "

@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 REPLICAS = 8
 # Weights for several lags step so far, or as near to it as they can.
 LONG_LAG_PS = 10.0
-_CHUNKS = 4
+_CHUNKS = 6
 _LONGEST_STRETCH = 10.0
 _SAME = ("force_field", "solvent", "temperature_k")
 
@@ -81,12 +82,12 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         timestep_ps=config.timestep_ps,
         md_ps_per_s=cores * config.timestep_ps / step_s / stretch,
         coverage=coverage,
-        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k),
+        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch),
     )
 
 
-def rollout_rate(scene: Scene, weights: Weights, temperature_k: float) -> Rolls:
-    """Return how weights roll a scene that they cover, by a few chunks of it."""
+def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float) -> Rolls:
+    """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`: see `Rates`."""
     from surrogate.data.shipped import shipped_weights
     from surrogate.sampling.runner import RolloutConfig, rollout
 
@@ -107,10 +108,11 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float) -> Rolls:
             progress=lambda done, total, note: seen.append((time.monotonic(), done)),
             flush_every_s=3600.0,
         )
-    # The first chunk makes what all others use again, the last one is flushed.
-    (began, first), (ended, last) = seen[0], seen[-2]
+    # As of MD the fastest batch counts: the first chunk makes what all others use again, the last one is flushed.
+    times = [time for time, _ in seen[:-1]]
+    fastest_s = max(min(after - before for before, after in pairwise(times)), 1e-6)
     name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
-    return Rolls(name, lag_ps, REPLICAS * (last - first) * lag_ps / max(ended - began, 1e-6))
+    return Rolls(name, lag_ps, REPLICAS * weights.model.n_new * lag_ps / fastest_s / stretch)
 
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:

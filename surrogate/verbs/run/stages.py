@@ -145,7 +145,7 @@ def _trained(site: Site, record: RunRecord) -> RunRecord | None:
     if not out.exists():
         return None
     rates, _ = _settled(record)
-    rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k)
+    rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
 
 
