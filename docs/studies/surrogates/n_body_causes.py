@@ -309,7 +309,8 @@ def _key(config: LamSlideConfig, change: Change) -> str:
 
 def table_of(rows: list[Found], folder: Path) -> dict[str, Any]:
     """Return the manual's table of these lines, with their curves: [step, samples' ADE, mean forecast's ADE]."""
-    curves = {}
+    curves, places = {}, [change.name for change in CHANGES]
+    rows = sorted(rows, key=lambda row: places.index(row.name))
     for row in rows:
         with (folder / f"{_slug(row.name)}.csv").open(newline="") as handle:
             points = list(csv.DictReader(handle))

@@ -135,10 +135,10 @@ def table_lines(result: Reproduction) -> list[str]:
     lines = [
         f"{result.name}: ADE and FDE, {N_GIVEN} frames given, 20 predicted, mean of {N_SAMPLES} samples; "
         f"{sizes} training / validation / test trajectories",
-        f"{'':<18} {'ADE':>24} {'FDE':>24} {'median':>8} {'ADE/our EGNN':>20} {'training':>9}",
+        f"{'':<20} {'ADE':>24} {'FDE':>24} {'median':>8} {'ADE/our EGNN':>20} {'training':>9}",
         "published (3,000 / 2,000 / 2,000)",
     ]
-    lines += [f"  {method:<18}{ade:>22} {fde:>24}" for method, (ade, fde) in PUBLISHED[result.name].items()]
+    lines += [f"  {method:<20}{ade:>22} {fde:>24}" for method, (ade, fde) in PUBLISHED[result.name].items()]
     return [*lines, "ours", *(row_line(row) for row in result.rows)]
 
 
@@ -147,4 +147,4 @@ def row_line(row: Row) -> str:
     over = "" if row.over_egnn is None else str(row.over_egnn)
     cost = f"{row.account.training_s:.0f} s" if row.account.n_parameters else "-"
     figures = f"{row.ade!s:>22} {row.fde!s:>24} {row.median_ade:>#8.3g} {over:>20} {cost:>9}"
-    return f"  {row.method:<18}{figures}  {row.account.note}"
+    return f"  {row.method:<20}{figures}  {row.account.note}"
