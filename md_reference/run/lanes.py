@@ -71,9 +71,10 @@ def _program() -> ctypes.CDLL:
     compiler = next((c for c in ("g++", "c++") if shutil.which(c)), None)
     if compiler is None:
         raise LanesUnavailableError("no C++ compiler (g++) was found, which molecular dynamics in lanes needs")
-    version = subprocess.run([compiler, "--version"], capture_output=True, check=False).stdout
-    target = subprocess.run([compiler, "-march=native", "-Q", "--help=target"], capture_output=True, check=False).stdout
-    key = hashlib.sha256(b"\0".join([_SOURCE.read_bytes(), version, target, repr(_FLAGS).encode()])).hexdigest()[:16]
+    # What the compiler says that it is and calls this processor.
+    asked = [compiler, "-march=native", "-v", "-E", "-x", "c++", os.devnull]
+    said = subprocess.run(asked, capture_output=True, check=False).stderr
+    key = hashlib.sha256(b"\0".join([_SOURCE.read_bytes(), said, repr(_FLAGS).encode()])).hexdigest()[:16]
     path = cache_folder() / f"lanes-{key}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)

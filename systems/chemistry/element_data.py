@@ -7,6 +7,7 @@ from typing import Any
 
 from systems.chemistry.residues import template_for
 from systems.elements import ATOMIC_NUMBERS
+from systems.interrupts import deferred_interrupt
 
 # Standard atomic weights in Da, IUPAC 2021 abridged. gemmi's are older (sulfur 32.065, not 32.06), and the masses of
 # these elements are inputs of shipped weights.
@@ -55,11 +56,19 @@ def is_metal(symbol: str) -> bool:
 
 @cache
 def _element(symbol: str) -> Any:
-    from gemmi import Element
-
     if not is_element(symbol):
         raise KeyError(symbol)
-    return Element(symbol)
+    return _element_class()(symbol)
+
+
+@cache
+def _element_class() -> Any:
+    # A Ctrl-C while gemmi is imported would abort the process.
+    with deferred_interrupt() as asked:
+        from gemmi import Element
+    if asked():
+        raise KeyboardInterrupt
+    return Element
 
 
 def is_lone_ion(symbol: str) -> bool:

@@ -329,7 +329,7 @@ def run_training(
         if metrics and share < 1.0 and training.ends_at is not None and time.monotonic() > training.ends_at:
             raise UnfinishedError(
                 f"{training.name}: this call's time is up at {share:.0%} of stage {name!r}; give the same command "
-                "again with --resume."
+                "again with `resume=True`."
             )
 
     return run_stage(

@@ -20,6 +20,7 @@ from surrogate.verbs.run.rates import REPLICAS, Rates, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
 from systems.errors import InputError
+from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.preparation import Preparation
 
@@ -211,7 +212,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
     training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
     bursts_file = site.folder / BURSTS_NAME
-    said = json.loads(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
+    said = parsed(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
     # What reading weights takes is no part of it: a longer rollout does it once, too.
     rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
