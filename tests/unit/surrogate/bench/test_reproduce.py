@@ -363,7 +363,7 @@ def test_calls_that_end_early_go_on_to_the_same_numbers(method: str, tmp_path: P
             found = run(parts).rows[0]
             break
         except UnfinishedError as error:
-            assert "--resume" in str(error)
+            assert "resume=True" in str(error)
             ended += 1
             parts = replace(parts, resume=True)
     assert ended >= 2
