@@ -70,7 +70,9 @@ def _program() -> ctypes.CDLL:
     """Compile `lanes.cpp` for this processor, once for each version of it, and load it."""
     compiler = next((c for c in ("g++", "c++") if shutil.which(c)), None)
     if compiler is None:
-        raise LanesUnavailableError("no C++ compiler (g++) was found, which molecular dynamics in lanes needs")
+        raise LanesUnavailableError(
+            "no C++ compiler (g++) was found, which platform lanes needs; take another platform."
+        )
     # What the compiler says that it is and calls this processor.
     asked = [compiler, "-march=native", "-v", "-E", "-x", "c++", os.devnull]
     said = subprocess.run(asked, capture_output=True, check=False).stderr
@@ -180,7 +182,7 @@ class Lanes:
             if not (off < _FORCE_TOLERANCE and wrong < _ENERGY_TOLERANCE_KJ_MOL):
                 raise SimulationError(
                     f"molecular dynamics in lanes differs from OpenMM by {off:.2g} of the root mean square force and "
-                    f"{wrong:.2g} kJ/mol; simulate this molecule by OpenMM"
+                    f"{wrong:.2g} kJ/mol; take another platform."
                 )
 
     def energies_and_forces(self, positions_nm: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -282,7 +284,7 @@ def _terms(system: Any) -> dict[str, Any]:
 
     n = system.getNumParticles()
     if any(system.isVirtualSite(k) or system.getParticleMass(k)._value <= 0 for k in range(n)):
-        raise LanesUnavailableError("molecular dynamics in lanes knows no virtual sites or fixed atoms")
+        raise LanesUnavailableError("platform lanes knows no virtual sites or fixed atoms; take another platform.")
     terms: dict[str, Any] = {
         "bonds": [], "bond_terms": [], "angles": [], "angle_terms": [], "born": False, "surface": 0.0,
         "pairs": np.zeros((n * (n - 1) // 2, 4)), "atoms": np.zeros((n, 6)),
@@ -304,7 +306,9 @@ def _terms(system: Any) -> dict[str, Any]:
             for k in range(force.getNumTorsions()):
                 *quad, period, phase, stiff = force.getTorsionParameters(k)
                 if period > _PERIODS:
-                    raise LanesUnavailableError(f"molecular dynamics in lanes knows no torsion of period {period}")
+                    raise LanesUnavailableError(
+                        f"platform lanes knows no torsion of period {period}; take another platform."
+                    )
                 quad = min(tuple(quad), tuple(quad[::-1]))
                 torsions[quad][0] += stiff._value
                 torsions[quad][2 * period - 1] += stiff._value * math.cos(phase._value)
@@ -314,7 +318,8 @@ def _terms(system: Any) -> dict[str, Any]:
         elif isinstance(force, openmm.GBSAOBCForce) and force.getNonbondedMethod() == force.NoCutoff:
             _born(force, terms)
         elif not isinstance(force, openmm.CMMotionRemover):
-            raise LanesUnavailableError(f"molecular dynamics in lanes knows no {kind}")
+            cut = " with a cutoff" if kind in ("NonbondedForce", "GBSAOBCForce") else ""
+            raise LanesUnavailableError(f"platform lanes knows no {kind}{cut}; take another platform.")
     constraints = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     terms["torsions"] = np.reshape(list(torsions), (-1, 4))
     terms["torsion_terms"] = np.reshape(list(torsions.values()), (-1, 1 + 2 * _PERIODS))

@@ -141,6 +141,10 @@ def test_what_it_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     system.addForce(openmm.CustomBondForce("r"))
     with pytest.raises(LanesUnavailableError, match="CustomBondForce"):
         _lanes(system)
+    watery = build_system(build_peptide("ACE-ALA-NME"), ForceFieldSpec("ff14SB", "vacuum"))
+    next(f for f in watery.getForces() if isinstance(f, openmm.NonbondedForce)).setNonbondedMethod(1)
+    with pytest.raises(LanesUnavailableError, match="NonbondedForce with a cutoff; take another"):
+        _lanes(watery)
     monkeypatch.setattr(lanes.shutil, "which", lambda _: None)
-    with pytest.raises(LanesUnavailableError, match="molecular dynamics in lanes needs"):
+    with pytest.raises(LanesUnavailableError, match="which platform lanes needs"):
         lanes._program.__wrapped__()
