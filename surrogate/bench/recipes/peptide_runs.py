@@ -177,16 +177,14 @@ def simulate(
 
 
 def _order() -> list[tuple[Peptide, bool]]:
-    """Return all molecules and whether each is for training: monomers, what is tested, pairs, chains."""
+    """Return all molecules and whether each is for training: monomers, pairs, what is tested, chains."""
     training, tested = training_peptides(), held_out_peptides()
-    monomers = [p for p in training if len(p.residues) == 1]
-    short = [p for p in tested if len(p.residues) <= 2]
-    rest = [p for p in training if len(p.residues) > 1]
+    short = [p for p in training if p.capped and len(p.residues) <= 2]
     return [
-        *((p, True) for p in monomers),
-        *((p, False) for p in short),
-        *((p, True) for p in rest),
-        *((p, False) for p in tested if p not in short),
+        *((p, True) for p in short),
+        *((p, False) for p in tested if len(p.residues) <= 2),
+        *((p, True) for p in training if p not in short),
+        *((p, False) for p in tested if len(p.residues) > 2),
     ]
 
 
