@@ -170,8 +170,10 @@ def format_quantity(name: str, value: float) -> str:
     return f"{value:g}{unit_of(name)}"
 
 
-def format_time_ps(time_ps: float) -> str:
-    """Return a duration with the largest unit that keeps it at or above one: 1500.0 -> '1.5 ns'."""
+def format_time_ps(time_ps: float, digits: int = 6) -> str:
+    """Return a duration, rounded to so many digits, with the largest unit that keeps it at or above one: 1500.0 ->
+    '1.5 ns'."""
+    time_ps = float(f"{time_ps:.{digits}g}")
     for unit in ("us", "ns", "ps", "fs"):
         if time_ps >= _TIME_PS[unit] or unit == "fs":
             return f"{time_ps / _TIME_PS[unit]:.6g} {unit}"

@@ -252,7 +252,7 @@ class _Job:
         if self._state.futures.get(name) is not future:
             return
         del self._state.futures[name]
-        result = _result_of(future)
+        result = result_of(future)
         kind, _, scene = name.partition("/")
         is_scene = kind == "scene" and bool(scene)
         if result["status"] == "complete":
@@ -299,7 +299,7 @@ class _Job:
         self._state.changed = True
 
 
-def _result_of(future: Any) -> dict[str, Any]:
+def result_of(future: Any) -> dict[str, Any]:
     """Return what a task returned; one that Dask itself gave up counts as failed, and may be tried again."""
     if future.status == "cancelled":
         raise SimulationError("the Dask scheduler is gone; the same command goes on with another.")

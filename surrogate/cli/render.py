@@ -91,7 +91,8 @@ def print_run(record: dict[str, Any], *, as_json: bool) -> None:
         print_json(record)
     elif "molecules" in record:
         for result in record["molecules"]:
-            _say(f"{result['name']}: {(result['failed'] and 'failed: ' + result['failed']) or result['headline']}")
+            came = f"failed: {result['failed']}" if result["failed"] else result["headline"]
+            _say(f"{result['name']}: {came}")
         _say(f"{record['summary']}: {Path(record['file']) / 'index.html'}")
     elif (outcome := record.get("outcome")) is None:
         print_pairs(record["decision_table"])

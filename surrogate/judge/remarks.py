@@ -39,7 +39,7 @@ def doubts(trio: Trio, correlation: float) -> verdict.Doubts:
     samples = effective_samples(round(trio.compared_ps / lag_ps), correlation)
     if samples < LEAST_SAMPLES:
         short = (
-            f"the slowest motion is remembered for {format_time_ps(float(f'{correlation * lag_ps:.2g}'))}, which "
+            f"the slowest motion is remembered for {format_time_ps(correlation * lag_ps, 2)}, which "
             f"makes {samples:.2g} independent samples, too few to judge by ({LEAST_SAMPLES} are needed)"
         )
     apart = rarely_crossed((trio.reference.features, trio.replicate.features), trio.candidate.features)

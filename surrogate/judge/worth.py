@@ -53,7 +53,7 @@ class Worth:
 
     def in_words(self) -> str:
         """Return such as '38 ns [25 ns, 60 ns]', 'at least 100 ns' or 'less than 0.8 ns'."""
-        length = format_time_ps(_round(self.worth_ps))
+        length = format_time_ps(self.worth_ps, 2)
         if self.bound == "less than" or (self.bound == "at least" and self.low_ps is None):
             return f"{self.bound} {length}"
         longest = self.worth_ps if self.bound else self.lengths_ps[-1] if self.high_ps is None else self.high_ps
@@ -230,10 +230,6 @@ def _crossing(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> f
     return float(math.exp(_length_at(log_error, log_lengths, curve)))
 
 
-def _round(time_ps: float) -> float:
-    return float(f"{time_ps:.2g}")
-
-
 def headline(found: Sequence[Worth], cost_ratio: Callable[[Worth], float | None], length_ps: float) -> str:
     """Return 'Worth 38 ns [25 ns, 60 ns] of MD by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns [...].'
 
@@ -248,9 +244,7 @@ def headline(found: Sequence[Worth], cost_ratio: Callable[[Worth], float | None]
     ratio = cost_ratio(first)
     if ratio is not None and first.bound != "less than":
         part = (
-            ""
-            if first.share >= 1.0
-            else f" for the {format_time_ps(_round(first.share * length_ps))} of it that this takes"
+            "" if first.share >= 1.0 else f" for the {format_time_ps(first.share * length_ps, 2)} of it that this takes"
         )
         text += f", at {_cost_words(ratio)} its cost{part}"
     moving = next((w for w in found if w.kind == "kinetics"), None)

@@ -186,7 +186,7 @@ def too_short(trajectories: Sequence[Features], lag_frames: float) -> str:
     if longest >= LEAST_LAGS * lag_frames:
         return ""
     lag_ps = trajectories[0].lag_ps
-    needed, held = (format_time_ps(float(f"{n * lag_ps:.3g}")) for n in (LEAST_LAGS * lag_frames, longest))
+    needed, held = (format_time_ps(n * lag_ps, 3) for n in (LEAST_LAGS * lag_frames, longest))
     return f"it takes {needed} without a break, {LEAST_LAGS} lags, and one of the trajectories holds {held}"
 
 

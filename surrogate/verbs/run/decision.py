@@ -38,8 +38,10 @@ _EQUILIBRATION_SHARE = 0.1
 LEAST_TRAINING_S = 240.0
 BURST_PS = 10.0
 MOST_BURSTS, _LEAST_BURSTS = 300, 60
-# Of a burst: relaxing the frame that it starts from, in steps of MD, and what the estimate is less sure of.
-_RELAXING_STEPS, _SURE = 150, 0.7
+# Of a burst: relaxing the frame that it starts from, in steps of MD.
+_RELAXING_STEPS = 150
+# Of their share, what bursts are planned to take: their estimate is the least sure.
+_BURSTS_AIM = 0.7
 # The judge: processor seconds at all, and of an atom in a frame.
 _JUDGE_S, _JUDGE_ATOM_S = 4.0, 3e-6
 _JUDGE_SHARE = 0.1
@@ -111,13 +113,13 @@ def _divided(
     n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
     if "bursts" in shares:
         burst_s = (burst_ps / rates.timestep_ps + _RELAXING_STEPS) * rates.step_s * rates.stretch
-        n_bursts = min(MOST_BURSTS, int(_SURE * shares["bursts"] * left_s / burst_s))
+        n_bursts = min(MOST_BURSTS, int(_BURSTS_AIM * shares["bursts"] * left_s / burst_s))
         if n_bursts < _LEAST_BURSTS:
             why += (f"no bursts: one of {burst_ps:g} ps takes {format_wall(burst_s)}, and {_LEAST_BURSTS} are needed",)
             n_bursts = 0
             del shares["bursts"]
         else:
-            shares["bursts"] = n_bursts * burst_s / _SURE / left_s
+            shares["bursts"] = n_bursts * burst_s / _BURSTS_AIM / left_s
     scale = (1.0 - shares.get("bursts", 0.0)) / sum(share for name, share in shares.items() if name != "bursts")
     stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
               for name, share in shares.items()]  # fmt: skip
@@ -154,7 +156,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         return "md", (f"a potential needs {least} or more to learn in: MD, however little", none)
     if way == "surrogate":
         return "trained", ("asked for; MD is cheap, and what it is trained on would answer by itself", none)
-    day = format_time_ps(float(f"{rates.md_ps_per_s * 86_400:.2g}"))
+    day = format_time_ps(rates.md_ps_per_s * 86_400, 2)
     return "md", (f"MD is cheap ({day} a day) and nothing covers the scene: no surrogate would pay", none)
 
 
@@ -174,7 +176,7 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
     """Return the decision and what it rests on, as lines of a name and a text."""
 
     def per_day(ps_per_s: float) -> str:
-        return f"{format_time_ps(float(f'{ps_per_s * 86_400:.3g}'))} a day"
+        return f"{format_time_ps(ps_per_s * 86_400, 3)} a day"
 
     busy = f", of which other work takes {1.0 - 1.0 / rates.stretch:.0%}" if rates.stretch > 1.1 else ""
     lines = [
@@ -195,7 +197,7 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
 def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
     """Return what a stage is expected to come to."""
     if name in _MD_STAGES:
-        return f", about {format_time_ps(float(f'{md_ps(rates, decision, name):.2g}'))}"
+        return f", about {format_time_ps(md_ps(rates, decision, name), 2)}"
     if name == "rollout" and decision.expected_rollout_ps:
-        return f", about {format_time_ps(float(f'{decision.expected_rollout_ps:.2g}'))}"
+        return f", about {format_time_ps(decision.expected_rollout_ps, 2)}"
     return f", {decision.n_bursts} of {decision.burst_ps:g} ps" if name == "bursts" else ""

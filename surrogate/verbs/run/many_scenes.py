@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from md_reference.campaign.campaign_file import SCENE_FILES, ClusterSpec, SceneSpec, name_of, read_campaign
 from md_reference.campaign.cluster import open_client
+from md_reference.campaign.scheduler import result_of
 from md_reference.campaign.worker import guarded, poll, stop
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
@@ -20,7 +21,7 @@ from surrogate.verbs.run.one_scene import describe_run, run_scene
 from surrogate.verbs.run.results_page import write_results
 from surrogate.verbs.run.run_record import RUN_NAME, read_run
 from surrogate.verbs.telling import tell
-from systems.errors import InputError
+from systems.errors import InputError, SimulationError
 from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import deferred_interrupt
@@ -159,9 +160,7 @@ def run_molecule(task: MoleculeTask) -> dict[str, Any]:
     return guarded(task.token, Path(task.witness), work)
 
 
-def _hand_out(
-    specs: list[SceneSpec], folder: Path, options: RunOptions, client: Any, advance: Any
-) -> dict[str, str]:  # fmt: skip
+def _hand_out(specs: list[SceneSpec], folder: Path, options: RunOptions, client: Any, advance: Any) -> dict[str, str]:
     """Run molecules on the client's workers and return the reasons of those that failed."""
     token, ended = uuid.uuid4().hex, queue.SimpleQueue[tuple[str, Any]]()
     if options.overwrite:
@@ -205,12 +204,10 @@ def _forget(specs: list[SceneSpec], folder: Path) -> None:
 
 def _reason(future: Any) -> str:
     """Return why a task failed, empty where it did not."""
-    if future.status == "error":
-        error = future.exception()
-        return f"{type(error).__name__}: {error}"
-    if future.status == "cancelled":
-        return "the Dask scheduler is gone"
-    result = future.result()
+    try:
+        result = result_of(future)
+    except SimulationError as error:
+        return str(error)
     return "" if result["status"] == "complete" else str(result.get("reason", "stopped"))
 
 

@@ -35,16 +35,18 @@ def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", no
     rolled_ps = judged.account.total_ps
     worth = next((w for w in judged.worth if w.kind == "distribution"), None) if judged.worth_words else None
     gain = _least_gain(worth, costs) if way != "md" else None
-    held = f"{_short(held_ps)} of held-out MD"
+    held = f"{format_time_ps(held_ps, 2)} of held-out MD"
     if way == "md":
-        head = f"{_short(rolled_ps)} of MD, and {held} that judges it"
+        head = f"{format_time_ps(rolled_ps, 2)} of MD, and {held} that judges it"
         head += f": worth {worth.in_words()} of MD by its {worth.measure}." if worth else f": {judged.status}."
-        head += f" With the held-out half there are {_short(rolled_ps + held_ps)} to use."
+        head += f" With the held-out half there are {format_time_ps(rolled_ps + held_ps, 2)} to use."
     elif worth is None:
-        head = f"{held} tell no worth of the {_short(rolled_ps)} of the surrogate, which are {judged.status}."
+        head = (
+            f"{held} tell no worth of the {format_time_ps(rolled_ps, 2)} of the surrogate, which are {judged.status}."
+        )
     else:
         head = (
-            f"{held}; the {_short(rolled_ps)} of the surrogate are worth {worth.in_words()} of MD by its "
+            f"{held}; the {format_time_ps(rolled_ps, 2)} of the surrogate are worth {worth.in_words()} of MD by its "
             f"{worth.measure}; {_gain_words(worth, gain, costs)}"
         )
     if judged.status == "undecided" and 0.0 < judged.effective_samples < LEAST_SAMPLES:
@@ -81,7 +83,7 @@ def _gain_words(worth: Worth, gain: float | None, costs: Costs) -> str:
         return "what MD of it would cost is not known."
     spent_s = costs.training_s + worth.share * costs.rolling_s
     training = f", training included ({format_wall(costs.training_s)})" if costs.training_s else ""
-    bought = _short(costs.md_ps_per_s * spent_s)
+    bought = format_time_ps(costs.md_ps_per_s * spent_s, 2)
     if gain >= 1.0:
         return f"gain at least {gain:.2g}: in the {format_wall(spent_s)} that took{training}, MD makes {bought}."
     most_ps = worth.high_ps if worth.bound == "" else None if worth.bound == "at least" else worth.worth_ps
@@ -90,7 +92,3 @@ def _gain_words(worth: Worth, gain: float | None, costs: Costs) -> str:
     return (
         f"no gain is shown (at least {gain:.2g}): in the {format_wall(spent_s)} that took{training}, MD makes {bought}."
     )
-
-
-def _short(time_ps: float) -> str:
-    return format_time_ps(float(f"{time_ps:.2g}"))

@@ -56,13 +56,15 @@ def _row(result: dict[str, Any]) -> str:
         return f'<tr><th scope="row">{name}</th>{reason}</tr>'
     link = f'<a href="{quote(result["name"])}/report.html">{name}</a>'
     gain = "" if result["gain"] is None else f"{result['gain']:.2g}"
-    cells = (result["way"], format_time_ps(_two(result["rolled_ps"])), format_time_ps(_two(result["held_out_ps"])),
-             result["worth"] or "not told", gain, result["verdict"], format_wall(result["wall_s"]))  # fmt: skip
+    cells = (
+        result["way"],
+        format_time_ps(result["rolled_ps"], 2),
+        format_time_ps(result["held_out_ps"], 2),
+        result["worth"] or "not told",
+        gain,
+        result["verdict"],
+        format_wall(result["wall_s"]),
+    )
     labelled = zip(_HEADS[1:], cells, strict=True)
-    return f'<tr><th scope="row">{link}</th>' + "".join(
-        f'<td data-label="{head}">{escape(cell)}</td>' for head, cell in labelled
-    ) + "</tr>"  # fmt: skip
-
-
-def _two(value: float) -> float:
-    return float(f"{value:.2g}")
+    columns = "".join(f'<td data-label="{head}">{escape(cell)}</td>' for head, cell in labelled)
+    return f'<tr><th scope="row">{link}</th>{columns}</tr>'
