@@ -30,8 +30,6 @@ from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, hottest_k
 from systems.errors import InputError, SimulationError
 from systems.scene import FloatArray
 
-# What `platform` says for it; to OpenMM it is none.
-PLATFORM = "lanes"
 _SOURCE = Path(__file__).with_name("lanes.cpp")
 _FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-fPIC", "-shared")
 _COULOMB = 138.93545764438198

@@ -16,9 +16,9 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
-from md_reference.run.lanes import PLATFORM, Lanes, n_lanes
+from md_reference.run.lanes import Lanes, n_lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform
+from md_reference.run.platforms import LANES, PlatformChoice, choose_platform, measured_platform
 from md_reference.run.timing import as_records
 from systems.scene import FloatArray, Scene
 from systems.selection import part_of
@@ -87,7 +87,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
     side_by_side = min(replicas, cores)
-    in_lanes = config.platform == PLATFORM
+    in_lanes = config.platform == LANES
     if in_lanes:
         choice = lanes_choice()
     elif measure_s > 0:
@@ -139,7 +139,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
 
 
 def lanes_choice() -> PlatformChoice:
-    return PlatformChoice(PLATFORM, 1, f"{n_lanes()} replicas at once on a core")
+    return PlatformChoice(LANES, 1, f"{n_lanes()} replicas at once on a core")
 
 
 def _time_lanes_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> float:
@@ -197,7 +197,7 @@ def _wall_s(config: MDConfig, replicas: int, step_s: float | None) -> float | No
     """Return the seconds of all replicas, as many at once as there are cores, equilibration included."""
     if step_s is None:
         return None
-    at_once = n_lanes() if config.platform == PLATFORM else 1
+    at_once = n_lanes() if config.platform == LANES else 1
     rounds = math.ceil(math.ceil(replicas / at_once) / available_cores()) * min(replicas, at_once)
     return rounds * (config.time_ps + config.equilibrate_ps) / config.timestep_ps * step_s
 

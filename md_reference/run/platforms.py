@@ -13,9 +13,11 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.machine import platforms
 from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
-from systems.errors import UnknownNameError, nearest
+from systems.errors import InputError, UnknownNameError, nearest
 from systems.scene import Scene
 
+# What `platform` says for replicas in vector lanes (`run.lanes`); to OpenMM it is none.
+LANES = "lanes"
 # Up to so many atoms a thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
 # OpenMM 8.6.1 on peptides of 22 to 108 atoms: level with native OBC2 at 47 atoms on free cores (102 against 115
 # µs a step at 42, 205 against 167 at 62) and near 62 on busy ones, in vacuum at about 105 (9 against 47 µs at 22).
@@ -47,9 +49,12 @@ def choose_platform(n_atoms: int, requested: str = "auto", *, born: bool = True)
     """Return the platform for `n_atoms` by size alone, with a generalised Born term or without; a request is checked.
 
     One thread in any case: below some hundreds of atoms a second thread slows a step down, and replicas, which run side
-    by side, use the other cores. Raises UnknownNameError (with the nearest name) for a platform that is not here.
+    by side, use the other cores. Raises UnknownNameError (with the nearest name) for a platform that is not here,
+    InputError for lanes, in which OpenMM does not run.
     """
-    available = list(platforms())
+    available = [*platforms(), LANES]
+    if requested == LANES:
+        raise InputError("platform lanes is for replicas of `reference` and `run`; take another platform here.")
     if requested != "auto":
         if requested not in available:
             raise UnknownNameError(

@@ -13,10 +13,10 @@ from typing import Any
 
 from md_reference.forces.forcefield import resolve
 from md_reference.run.config import MDConfig, check_run
-from md_reference.run.lanes import PLATFORM, n_lanes
+from md_reference.run.lanes import n_lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import lanes_choice, line_of_run
-from md_reference.run.platforms import measured_platform
+from md_reference.run.platforms import LANES, measured_platform
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.run.simulate_lanes import simulate_batch
 from systems.errors import SimulationError, SurromdError
@@ -58,14 +58,14 @@ def simulate_replicas(
         check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     jobs = [[k] for k in range(len(outs))]
-    if config.platform == PLATFORM:
+    if config.platform == LANES:
         size = n_lanes()
         jobs = [list(range(k, min(k + size, len(outs)))) for k in range(0, len(outs), size)]
     width = workers or min(len(jobs), available_cores())
     # What goes on keeps its platform.
     fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
     choice = None
-    if fresh and config.platform == PLATFORM:
+    if fresh and config.platform == LANES:
         if announce is not None:
             announce(line_of_run(scene, config, lanes_choice(), replicas=len(outs)))
     elif fresh:
@@ -134,7 +134,7 @@ def _run(
     scene: Scene, configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], progress: ProgressFn | None
 ) -> None:
     """Run one replica, or on platform lanes a batch of them; `how`: what else `simulate` takes."""
-    if configs[0].platform == PLATFORM:
+    if configs[0].platform == LANES:
         simulate_batch(scene, configs[0], outs, resume=how["resume"], overwrite=how["overwrite"], progress=progress)
     else:
         simulate(scene, configs[0], outs[0], progress=progress, **how)

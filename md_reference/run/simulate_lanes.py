@@ -21,7 +21,8 @@ from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import integrator_name
-from md_reference.run.lanes import PLATFORM, Lanes, n_lanes
+from md_reference.run.lanes import Lanes, n_lanes
+from md_reference.run.platforms import LANES
 from md_reference.run.run_summary import summarise
 from md_reference.run.simulate import ProgressFn, stand_of, tell_preparing
 from systems.errors import InputError, SimulationError
@@ -152,7 +153,7 @@ class _Batch:
         self.save()
 
     def save(self) -> None:
-        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": PLATFORM}
+        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": LANES}
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
         self.file.write(self.header, self.lanes.checkpoint())
 
@@ -235,7 +236,7 @@ class _Batch:
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "completed": False,
             **settings_of(self.config),
-            "platform": PLATFORM,
+            "platform": LANES,
             "threads": 1,
             "platform_reason": "replicas in the lanes of one core, energies and forces checked against OpenMM's",
         }
