@@ -1,6 +1,6 @@
-"""How rare phi > 0 is in each capped amino acid: `python -m surrogate.bench.recipes.peptide_energies FOLDER`.
+"""How likely each phi is in each capped amino acid: `python -m surrogate.bench.recipes.peptide_energies FOLDER`.
 
-Short runs leave that state and hardly ever enter it, so they do not tell. Umbrella sampling does: sixteen copies of the
+Short runs leave phi > 0 and hardly ever enter it, so they do not tell how rare it is. Umbrella sampling does: sixteen copies of the
 molecule at once (`md_reference.run.lanes`), each held at another phi, neighbours exchanging their places (Sugita, Kitao
 and Okamoto, J. Chem. Phys. 113, 6042 (2000)) so that psi and side chains turn where phi lets them, put together by WHAM
 (Kumar et al., J. Comput. Chem. 13, 1011 (1992)). Two runs of each, whose difference is kept; what is in FOLDER is not
@@ -26,6 +26,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.lanes import Lanes
 from surrogate.bench.recipes.peptide_list import RESIDUES
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
+from surrogate.models.peptides.phi_signs import POSITIVE_PHI_DEG
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide
@@ -42,12 +43,12 @@ _PULLED_PS, _SETTLED_PS, _SAVE_PS = 100.0, 200.0, 0.4
 _BINS = 72
 _SWEEPS = 20_000
 _CONVERGED_KT = 1e-6
+_SEEDS = (1, 2)
 
 
-def free_energy_of_positive_phi(scene: Scene, *, time_ps: float, seed: int) -> float:
-    """Return the free energy of phi > 0 over phi < 0 of the first residue that has a phi, in kT at 300 K; `time_ps` is
-    that of each copy. Raises SimulationError. Not for glycine, which has no higher barrier (and, by its mirror image,
-    0)."""
+def population_of_phi(scene: Scene, *, time_ps: float, seed: int) -> FloatArray:
+    """Return the population `(72,)` of phi of the first residue that has one, in bins from -π, at 300 K; `time_ps` is
+    that of each copy. Raises SimulationError. Not for glycine, which has no higher barrier."""
     quad = backbone_torsions(scene)["phi"][0]
     system = build_system(scene, ForceFieldSpec("ff14SB", "obc2"))
     run = Lanes(
@@ -75,9 +76,7 @@ def free_energy_of_positive_phi(scene: Scene, *, time_ps: float, seed: int) -> f
             angles[held, k] = phi
         held = exchanged(held, phi, centres, _STIFFNESS_KJ_MOL / kt, k % 2, rng)
         run.set_bias(0, centres[held], _STIFFNESS_KJ_MOL)
-    surface = wham(angles, centres, _STIFFNESS_KJ_MOL / kt)
-    positive = np.arange(_BINS) >= _BINS // 2
-    return float(np.log(surface[~positive].sum() / surface[positive].sum()))
+    return wham(angles, centres, _STIFFNESS_KJ_MOL / kt)
 
 
 def exchanged(
@@ -120,14 +119,20 @@ def wham(angles: FloatArray, centres: FloatArray, stiffness_kt: float) -> FloatA
     return np.asarray(population / population.sum())
 
 
+def free_energy_kt(population: FloatArray, low_deg: float = 0.0, high_deg: float = 180.0) -> float:
+    """Return the free energy in kT of phi between two angles over phi elsewhere, of a population `(72,)`."""
+    middles = (np.arange(_BINS) + 0.5) * 360.0 / _BINS - 180.0
+    inside = (middles > low_deg) & (middles < high_deg)
+    return float(np.log(population[~inside].sum() / population[inside].sum()))
+
+
 def known_energies(folder: Path) -> dict[str, float]:
-    """Return the free energies of phi > 0, kT, of the records in a folder, by residue type; glycine's is 0."""
-    found = {"GLY": 0.0}
-    for path in sorted(folder.glob("ACE-*-NME-free-energy.json")):
+    """Return the free energies in kT of phi in POSITIVE_PHI_DEG, of the records in a folder, by residue type."""
+    found = {}
+    for path in sorted(folder.glob("ACE-*-NME-phi.json")):
         record = json.loads(path.read_text())
-        found[record["sequence"].split("-")[1]] = float(
-            np.mean([v for k, v in record.items() if k[-2:] in (" 1", " 2")])
-        )
+        runs = [np.array(record[f"umbrella {seed}"]) for seed in _SEEDS]
+        found[record["sequence"].split("-")[1]] = float(np.mean([free_energy_kt(x, *POSITIVE_PHI_DEG) for x in runs]))
     return found
 
 
@@ -140,16 +145,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     a.folder.mkdir(parents=True, exist_ok=True)
     for residue in a.residues:
         sequence = f"ACE-{residue}-NME"
-        path = a.folder / f"{sequence}-free-energy.json"
+        path = a.folder / f"{sequence}-phi.json"
         if not path.exists():
             scene = build_peptide(sequence)
-            found = {
-                f"umbrella {seed}": free_energy_of_positive_phi(scene, time_ps=a.time_ps, seed=seed) for seed in (1, 2)
-            }
+            found = {seed: population_of_phi(scene, time_ps=a.time_ps, seed=seed) for seed in _SEEDS}
+            record = {f"umbrella {seed}": [float(f"{p:.4g}") for p in x] for seed, x in found.items()}
             part = path.with_suffix(".part")
-            part.write_text(json.dumps({"sequence": sequence, "umbrella_ps": a.time_ps, **found}, indent=1))
+            part.write_text(json.dumps({"sequence": sequence, "umbrella_ps": a.time_ps, **record}))
             os.replace(part, path)
-        sys.stdout.write(f"{path.read_text()}\n")
+        record = json.loads(path.read_text())
+        energies = [free_energy_kt(np.array(record[f"umbrella {seed}"])) for seed in _SEEDS]
+        sys.stdout.write(f"{sequence}: phi > 0 lies {energies[0]:.2f} and {energies[1]:.2f} kT above phi < 0\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.bench.recipes.peptide_energies import exchanged, known_energies, wham
+from surrogate.bench.recipes.peptide_energies import exchanged, free_energy_kt, known_energies, wham
 
 CENTRES = np.linspace(np.radians(82.0), np.radians(-185.0), 16)
 STIFF = 40.0
@@ -62,6 +62,16 @@ def test_exchanges_keep_the_distribution_of_each_window() -> None:
 
 
 def test_records_are_read_by_residue(tmp_path: Path) -> None:
-    record = {"sequence": "ACE-VAL-NME", "umbrella_ps": 10.0, "umbrella 1": 4.0, "umbrella 2": 5.0, "md": 9.0}
-    (tmp_path / "ACE-VAL-NME-free-energy.json").write_text(json.dumps(record))
-    assert known_energies(tmp_path) == {"GLY": 0.0, "VAL": 4.5}
+    """Of bins 5 degrees wide, 26 lie between 0 and 130 degrees; what lies beyond belongs to the strands."""
+    flat = np.ones(72)
+    beyond = flat.copy()
+    beyond[62:] = 100.0
+    for name, population in (("VAL", flat), ("LEU", beyond)):
+        record = {"sequence": f"ACE-{name}-NME", "umbrella_ps": 10.0, "umbrella 1": list(population)}
+        record["umbrella 2"] = record["umbrella 1"]
+        (tmp_path / f"ACE-{name}-NME-phi.json").write_text(json.dumps(record))
+    found = known_energies(tmp_path)
+    assert found["VAL"] == pytest.approx(np.log(46 / 26))
+    assert found["LEU"] == pytest.approx(np.log(1036 / 26))
+    assert free_energy_kt(flat) == pytest.approx(0.0)
+    assert free_energy_kt(beyond) == pytest.approx(np.log(36 / 1026))
