@@ -63,6 +63,16 @@ def beyond(scene: Scene, start: int, end: int) -> list[int]:
     return sorted(nx.node_connected_component(graph, end))
 
 
+def with_phi_turned(scene: Scene) -> np.ndarray:
+    """Every phi turned by half a circle: strands become left-handed."""
+    from systems.chemistry.graph import backbone_torsions
+
+    positions = scene.positions_nm
+    for _, start, end, _ in backbone_torsions(scene)["phi"].tolist():
+        positions = rotated(positions, beyond(scene, start, end), (start, end), np.pi)
+    return positions
+
+
 def stretched(scene: Scene, by_nm: float) -> np.ndarray:
     """The first bond that ends in one atom alone, longer by `by_nm`."""
     i, j = next((i, j) for i, j in scene.bonds.tolist() if beyond(scene, i, j) == [j])

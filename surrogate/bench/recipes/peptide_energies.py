@@ -1,10 +1,10 @@
 """How likely each phi is in each capped amino acid: `python -m surrogate.bench.recipes.peptide_energies FOLDER`.
 
-Short runs leave phi > 0 and hardly ever enter it, so they do not tell how rare it is. Umbrella sampling does: sixteen copies of the
-molecule at once (`md_reference.run.lanes`), each held at another phi, neighbours exchanging their places (Sugita, Kitao
-and Okamoto, J. Chem. Phys. 113, 6042 (2000)) so that psi and side chains turn where phi lets them, put together by WHAM
-(Kumar et al., J. Comput. Chem. 13, 1011 (1992)). Two runs of each, whose difference is kept; what is in FOLDER is not
-done again.
+Short runs leave phi > 0 and hardly ever enter it, so they do not tell how rare it is. Umbrella sampling does: sixteen
+copies of the molecule at once (`md_reference.run.lanes`), each held at another phi, neighbours exchanging their places
+(Sugita, Kitao and Okamoto, J. Chem. Phys. 113, 6042 (2000)) so that psi and side chains turn where phi lets them, put
+together by WHAM (Kumar et al., J. Comput. Chem. 13, 1011 (1992)). Two runs of each, whose difference is kept; what is
+in FOLDER is not done again.
 """
 
 from __future__ import annotations

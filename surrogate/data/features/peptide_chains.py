@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from surrogate.models.peptides.chains import (
     ChainScale,
     internal_coordinates,
 )
+from surrogate.models.peptides.phi_signs import UNSIGNED
 from systems.chemistry.graph import backbone_torsions, bonded_graph, ring_bonds
 from systems.errors import InputError
 from systems.scene import Scene
@@ -137,7 +138,17 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
     layout = settled(chain_layout(scene), config.scale)
     fitted = fitted_atoms(scene)
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
-    return ChainFeatures(ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted)
+    quads = [q for q in backbone_torsions(scene)["phi"].tolist() if layout.types[residue_of(scene, q)] not in UNSIGNED]
+    return ChainFeatures(
+        ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
+        torch.tensor([residue_of(scene, q) for q in quads], dtype=torch.long),
+        torch.tensor(quads, dtype=torch.long).reshape(-1, 4),
+    )  # fmt: skip
+
+
+def residue_of(scene: Scene, phi: Sequence[int]) -> int:
+    """Return the residue that the torsion phi of these four atoms belongs to."""
+    return int(scene.residue_of_atom[phi[2]])
 
 
 def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -> ChainScale:

@@ -13,12 +13,14 @@ Each number belongs to one residue and has a place (slot) in that residue's toke
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+
+from surrogate.models.peptides.phi_signs import is_positive
 
 # A number told in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
@@ -146,15 +148,27 @@ class ChainCode(nn.Module):
 @dataclass(frozen=True, eq=False)
 class ChainFeatures:
     """What a model of peptides is told of one: its `code`, the types of its residues and their neighbours as numbers
-    `places` (n_residues, 3), and the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`."""
+    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, and of the
+    residues `signed` (n,) the four atoms of phi, `phi_quads` (n, 4)."""
 
     code: ChainCode
     places: Tensor
     template_nm: npt.NDArray[np.float64]
     fitted: npt.NDArray[np.int64]
+    signed: Tensor
+    phi_quads: Tensor
 
     def to(self, device: torch.device) -> ChainFeatures:
-        return ChainFeatures(copy.deepcopy(self.code).to(device), self.places.to(device), self.template_nm, self.fitted)
+        tensors = {name: getattr(self, name).to(device) for name in ("places", "signed", "phi_quads")}
+        return replace(self, code=copy.deepcopy(self.code).to(device), **tensors)
+
+    def positive_phi(self, frames_nm: Tensor) -> Tensor:
+        """Return of frames `(..., n_atoms, 3)` which residues have phi on the left-handed side: `(..., n_residues)`."""
+        quads = self.phi_quads
+        phi = dihedral(*(frames_nm[..., quads[:, k], :].float() for k in range(4)))
+        found = phi.new_zeros(*phi.shape[:-1], len(self.places), dtype=torch.bool)
+        found[..., self.signed] = is_positive(phi)
+        return found
 
 
 def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, primary: Tensor) -> Tensor:

@@ -20,8 +20,10 @@ from torch.nn import functional as F
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.further_noise import REDRAWS, SIDES, generators
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import ChainScale
+from surrogate.models.peptides.phi_signs import PhiCrossings, draw_sides, sides_of, times_apart
 from surrogate.models.settings import build
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -36,6 +38,8 @@ _FAR = 6
 _LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
+# Chunks that disobey the sides of phi that were drawn for them are drawn again so often.
+MAX_REDRAWS = 4
 
 
 @dataclass(frozen=True)
@@ -113,13 +117,14 @@ class TypedLinear(nn.Module):
 
 class Told(NamedTuple):
     """What the evaluations of a chunk have in common: `types` (r,), `of_type` (r, width), `given` (b, 1, r, width) the
-    embedded frame, `of_times` (b, t, 1, width), `rope` of the frames, and of each layer the `biases` between residues.
+    embedded frame, `of_frames` (b, t, r, width) the frames' times and the sides of phi, `rope` of the frames, and of
+    each layer the `biases` between residues.
     """
 
     types: Tensor
     of_type: Tensor
     given: Tensor
-    of_times: Tensor
+    of_frames: Tensor
     rope: tuple[Tensor, Tensor]
     biases: list[Tensor]
 
@@ -152,6 +157,7 @@ class PeptideFlow(nn.Module):
         self.of_known = TypedLinear(n_slots, c.width, n_types)
         self.of_type = nn.ModuleList(nn.Embedding(n_types, c.width) for _ in range(3))
         self.of_given = nn.Parameter(torch.randn(c.width) * 0.02)
+        self.of_side = nn.Parameter(torch.zeros(c.width))
         n_waves = 16
         self.register_buffer("waves", math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
         self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
@@ -164,17 +170,14 @@ class PeptideFlow(nn.Module):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
 
-    def forward(
-        self, o: Tensor, tau: Tensor, known: Tensor, times_ps: Tensor, places: Tensor, told: Told | None = None
-    ) -> Tensor:
-        """`o` (b, t, r, slots), `tau` (b,), or (1,) of all, `known` (b, r, slots), `times_ps` (b, t), `places` (r, 3)
-        -> like `o`. `told` is what the method of that name returned, so that a chunk's evaluations compute it once."""
-        told = self.told(known, times_ps, places) if told is None else told
+    def forward(self, o: Tensor, tau: Tensor, told: Told) -> Tensor:
+        """`o` (b, t, r, slots), `tau` (b,), or (1,) of all, `told` what the method of that name returns -> like `o`."""
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
         return skip * o + out * self._network(o * scale_in, tau, told)
 
-    def told(self, known: Tensor, times_ps: Tensor, places: Tensor) -> Told:
-        """Return what all evaluations of a chunk have in common; shapes as for `forward`."""
+    def told(self, known: Tensor, times_ps: Tensor, places: Tensor, sides: Tensor) -> Told:
+        """Return what all evaluations of a chunk have in common, of the given frame `known` (b, r, slots), `times_ps`
+        (b, t), `places` (r, 3), and the `sides` (b, t, r) that phi is on: 1, -1, or 0 where it has none."""
         types = places[:, 0]
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
         angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
@@ -184,13 +187,13 @@ class PeptideFlow(nn.Module):
             types,
             of_type,
             self.of_known(known[:, None], types) + self.of_given,
-            self._of_times(times_ps)[:, :, None],
+            self._of_times(times_ps)[:, :, None] + sides[..., None].to(self.of_side.dtype) * self.of_side,
             (angles.cos(), angles.sin()),
             [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
         )
 
     def _network(self, o: Tensor, tau: Tensor, told: Told) -> Tensor:
-        h = torch.cat([told.given, self.of_noisy(o, told.types) + told.of_times], dim=1) + told.of_type
+        h = torch.cat([told.given, self.of_noisy(o, told.types) + told.of_frames], dim=1) + told.of_type
         time = F.silu(self.embed_tau(tau))
         modulation = self.modulation(time).unflatten(-1, (6, -1))
         h = h.transpose(1, 2)
@@ -229,6 +232,7 @@ class PeptideSlide(Surrogate):
         self.config = config
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
+        self.crossings = PhiCrossings(n_slots, n_types)
         self.lag_ps = config.shortest_ps
         self.register_buffer("token_mean", torch.zeros(n_types, n_slots))
         self.register_buffer("token_scale", torch.ones(n_types, n_slots))
@@ -316,10 +320,37 @@ class PeptideSlide(Surrogate):
         drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
 
-        told = self.flow.told(known, times, chain.places)
+        positive = self._draw_sides(last_frames_nm[:, -1], known, times, chain, noise)
 
-        def predict(o: Tensor, tau: Tensor) -> Tensor:
-            return torch.where(filled, self.flow(o, tau, known, times, chain.places, told), 0.0)
+        def solve(rows: Tensor, drawn: Tensor) -> Tensor:
+            told = self.flow.told(known[rows], times[rows], chain.places, sides_of(positive[rows], chain.signed))
 
-        y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
-        return Chunk(self.frames_of(self.from_innovations(y, known, times, types), chain))
+            def predict(o: Tensor, tau: Tensor) -> Tensor:
+                return torch.where(filled, self.flow(o, tau, told), 0.0)
+
+            y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
+            return self.frames_of(self.from_innovations(y, known[rows], times[rows], types), chain)
+
+        rows = torch.arange(len(known), device=known.device)
+        frames = solve(rows, drawn)
+        for attempt in range(MAX_REDRAWS):
+            rows = rows[(chain.positive_phi(frames[rows]) != positive[rows]).any(-1).any(-1)]
+            if not len(rows):
+                break
+            again = drawn.new_zeros(len(rows), *drawn.shape[1:])
+            shape = (*drawn.shape[1:2], int(filled.sum()))
+            seeds = generators(noise[rows], REDRAWS, attempt)
+            again[..., filled] = torch.stack([torch.randn(shape, generator=g) for g in seeds]).to(again)
+            frames[rows] = solve(rows, again)
+        return Chunk(frames)
+
+    def _draw_sides(
+        self, last_nm: Tensor, known: Tensor, times_ps: Tensor, chain: ChainFeatures, noise: Tensor
+    ) -> Tensor:
+        """Return on which side of its barrier each residue's phi is to be in each new frame: `(b, t, r)`."""
+        logits = self.crossings(known, chain.places, times_ps, times_apart(times_ps, self.config.forgotten_ps))
+        shape = (times_ps.shape[1], len(chain.signed))
+        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators(noise, SIDES)])
+        every = logits.new_ones(*logits.shape[:3])
+        every[..., chain.signed] = uniform.to(logits)
+        return draw_sides(logits, chain.positive_phi(last_nm), every)

@@ -15,8 +15,6 @@ from surrogate.data.equilibrium import equilibrium_weights
 from surrogate.data.frames import TrainingFrames
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions
 from systems.errors import InputError
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
@@ -25,6 +23,9 @@ _EVEN_SHARE = 0.5
 _WHOLE_SHARE = 0.5
 # Share of windows whose later frames are drawn from equilibrium, at a time when the given one is forgotten.
 _FORGOTTEN_SHARE = 0.1
+# Share of windows that are made to hold a crossing of phi's barrier.
+_CROSSING_SHARE = 0.15
+_LIKELIEST = 0.9
 _MARKOV_LAG_PS = 50.0
 _BLOCK = 20_000
 _TRIES = 20
@@ -64,27 +65,33 @@ class PeptideSubject:
 
         Residues are taken to be independent; those whose free energy is not given play no part.
         """
-        scene = self.frames.scene
         states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
-        for quad in backbone_torsions(scene)["phi"]:
-            name = scene.residue_names[scene.residue_of_atom[quad[2]]]
+        for residue in self.chain.signed.tolist():
+            name = self.frames.scene.residue_names[residue]
             if name in positive_phi_kt:
-                phi = np.concatenate(
-                    [torsion(self.frames.positions_nm(kept[k : k + _BLOCK]).astype(np.float64), quad[None])[:, 0]
-                     for k in range(0, len(kept), _BLOCK)]
-                )  # fmt: skip
-                states = states + len(shares) * (phi > 0)
+                states = states + len(shares) * self._positive[kept, residue]
                 odds = float(np.exp(-positive_phi_kt[name]))
                 shares = np.concatenate([shares, shares * odds])
         return states, shares
+
+    @cached_property
+    def _positive(self) -> npt.NDArray[np.bool_]:
+        """Which residues of each frame have phi on the left-handed side: `(n_frames, n_residues)`."""
+        blocks = (
+            self._frames(k, min(k + _BLOCK, self.frames.n_frames)) for k in range(0, self.frames.n_frames, _BLOCK)
+        )
+        return torch.cat([self.chain.positive_phi(block).cpu() for block in blocks]).numpy()
+
+    def _frames(self, low: int, high: int) -> Tensor:
+        return torch.from_numpy(self.frames.positions_nm(np.arange(low, high))).to(self.chain.places.device)
 
     def _torsions(self, low: int, high: int) -> npt.NDArray[np.float64]:
         """Return cosines and sines `(n, 2 n_torsions)` of frames."""
         at = self.chain.code.turning_at
         found = []
         for start in range(low, high, _BLOCK):
-            frames = self.frames.positions_nm(np.arange(start, min(start + _BLOCK, high)))
-            found.append(self.chain.code.encode(torch.from_numpy(frames)).flatten(-2)[:, torch.cat([at, at + 1])])
+            tokens = self.chain.code.encode(self._frames(start, min(start + _BLOCK, high)))
+            found.append(tokens.flatten(-2)[:, torch.cat([at, at + 1])].cpu())
         return torch.cat(found).double().numpy()
 
     def windows(
@@ -195,17 +202,73 @@ class PeptideSubject:
         assert self.weights is not None
         return np.cumsum(self.weights)
 
-    def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw windows as training sees them: half of the batches of whole chunks, the others of fewer frames."""
+    def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw windows as training sees them: half of the batches of whole chunks, the others of fewer frames.
+
+        Returns frames and times as `windows` does, and which windows `(n,)` are as likely as there. The others hold a
+        crossing of phi's barrier: a flow that is told of it may see as many as it needs.
+        """
         later = config.chunk_frames
         if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
             later = int(torch.randint(1, later + 1, (1,), generator=generator))
-        return self.windows(n, config, generator, later=later)
+        idx, times = self.windows(n, config, generator, later=later)
+        return self._with_crossings(idx, times, config, generator)
 
-    def numbers(self, model: PeptideSlide, idx: Tensor) -> Tensor:
-        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames."""
+    def _with_crossings(
+        self, idx: Tensor, times: Tensor, config: PeptideConfig, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Put windows over crossings in the place of some, their spacing kept; half are read backwards if any are.
+
+        Read forwards, crossings need no weights. Backwards, the frame that the run came from must be as likely as
+        equilibrium has it among those on its own side.
+        """
+        plain = torch.ones(len(idx), dtype=torch.bool)
+        crossings, relative = self._crossings
+        if not len(crossings):
+            return idx, times, plain
+        asked = (torch.rand(len(idx), generator=generator) < _CROSSING_SHARE) & (times[:, 0] < config.forgotten_ps)
+        backwards = torch.rand(len(idx), generator=generator) < (0.0 if self.weights is None else 0.5)
+        ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=False))
+        for row in torch.nonzero(asked)[:, 0].tolist():
+            ahead = (times[row] / self.frames.lag_ps).round().long()
+            span = int(ahead[-1])
+            draws = torch.rand(3, _TRIES, generator=generator, dtype=torch.float64).numpy()
+            first = crossings[(draws[0] * len(crossings)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
+            which = np.searchsorted(ranges[:, 0], first, side="right") - 1
+            fits = (
+                (first >= ranges[which.clip(min=0), 0]) & (first + span < ranges[which.clip(min=0), 1]) & (which >= 0)
+            )
+            if bool(backwards[row]):
+                fits &= draws[2] < relative[first.clip(min=0)]
+            if fits.any():
+                start = int(first[fits][0])
+                steps = torch.cat([ahead.new_zeros(1), ahead])
+                idx[row] = start + (span - steps if bool(backwards[row]) else steps)
+                plain[row] = False
+        return idx, times, plain
+
+    @cached_property
+    def _crossings(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return the frames after which some phi changes sides, and how likely each frame `(n_frames,)` is to be kept
+        so that those of one side are as in equilibrium, the likeliest (but for a few) always."""
+        positive = self._positive
+        pattern = (positive << np.arange(positive.shape[1])).sum(axis=1)
+        ranges = self.frames.split.ranges(self.frames.starts, validation=False)
+        found = [low + np.flatnonzero(np.diff(pattern[low:high])) for low, high in ranges]
+        relative = np.ones(len(pattern))
+        if self.weights is not None:
+            for one in np.unique(pattern):
+                inside = pattern == one
+                kept = self.weights[inside & (self.weights > 0)]
+                if len(kept):
+                    relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
+        return np.concatenate(found), relative
+
+    def seen(self, model: PeptideSlide, idx: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames, and which of their residues have
+        phi on the left-handed side, `(*idx.shape, n_residues)`."""
         frames = torch.from_numpy(self.frames.positions_nm(idx.numpy())).to(model.token_mean.device)
-        return model.normalised(frames, self.chain)
+        return model.normalised(frames, self.chain), self.chain.positive_phi(frames)
 
 
 def _distinct(ahead: Tensor, longest: int) -> Tensor:

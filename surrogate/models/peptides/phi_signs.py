@@ -77,6 +77,13 @@ class PhiCrossings(nn.Module):
         return self.of_times(torch.cat([waves, logs], dim=-1)), logs[..., 1]
 
 
+def sides_of(positive: Tensor, signed: Tensor) -> Tensor:
+    """Return 1 and -1 for the sides `positive` (b, t, r) of the residues `signed` (n,), and 0 for others."""
+    sides = torch.zeros_like(positive, dtype=torch.float32)
+    sides[..., signed] = 2.0 * positive[..., signed].float() - 1.0
+    return sides
+
+
 def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
     """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
     before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)

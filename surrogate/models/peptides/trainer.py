@@ -21,6 +21,7 @@ from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
+from surrogate.models.peptides.phi_signs import crossing_loss, sides_of, times_apart
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
@@ -95,8 +96,8 @@ def train_peptides(
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
-        idx, times = subject.batch(training.batch, config, generator)
-        return peptide_loss(model, subject.chain, subject.numbers(model, idx), times.to(device), generator)
+        idx, times, plain = subject.batch(training.batch, config, generator)
+        return peptide_loss(model, subject.chain, *subject.seen(model, idx), times.to(device), generator, plain=plain)
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
@@ -105,7 +106,7 @@ def train_peptides(
             generator = torch.Generator().manual_seed(_HELD_SEED)
             with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
                 _, terms = peptide_loss(
-                    model, subject.chain, subject.numbers(model, idx), times.to(device), generator, noisy=False
+                    model, subject.chain, *subject.seen(model, idx), times.to(device), generator, noisy=False
                 )
             for key, value in terms.items():
                 found.setdefault(f"{name}_{key}", []).append(float(value))
@@ -125,7 +126,7 @@ def train_peptides(
         for path in (state, log):
             path.unlink(missing_ok=True)
     place = StagePlace(state, log, device, resume)
-    spent = run_stage(model.flow, stage, loss_fn, validate, place, progress=progress, on_save=write)
+    spent = run_stage(model, stage, loss_fn, validate, place, progress=progress, on_save=write)
     if is_first_process():
         write(spent)
         state.unlink(missing_ok=True)
@@ -185,7 +186,7 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
             except InputError:
                 continue
             first = torch.from_numpy(rng.choice(starts, size=min(_MEASURED_PAIRS // len(subjects) + 100, len(starts))))
-            both = subject.numbers(model, torch.stack([first, first + lag])).double()
+            both = subject.seen(model, torch.stack([first, first + lag]))[0].double()
             for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
@@ -208,13 +209,15 @@ def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
 
 
 def peptide_loss(
-    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, times_ps: Tensor, generator: torch.Generator, *,
-    noisy: bool = True,
+    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, positive: Tensor, times_ps: Tensor,
+    generator: torch.Generator, *, noisy: bool = True, plain: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-    """Flow matching on the innovations of windows: `numbers` (b, 1 + t, r, slots), the first frame given.
+    """Flow matching on the innovations of windows, and the log-likelihood of crossings: `numbers` (b, 1 + t, r, slots)
+    and the sides of phi `positive` (b, 1 + t, r), the first frame given.
 
-    The error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the given
-    frame is disturbed as in training. Returns the loss and its parts, of torsions' numbers and of stiff ones.
+    The flow's error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the
+    given frame is disturbed as in training. `plain` (b,): windows that crossings are counted in; all where not given.
+    Returns the loss and its parts: of torsions' numbers, of stiff ones, of crossings.
     """
     c, filled = model.config, chain.code.filled
     known, later = numbers[:, 0], numbers[:, 1:]
@@ -225,7 +228,8 @@ def peptide_loss(
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
-    found = model.flow(alpha * target + sigma * noise, tau, known, times_ps, chain.places)
+    told = model.flow.told(known, times_ps, chain.places, sides_of(positive[:, 1:], chain.signed))
+    found = model.flow(alpha * target + sigma * noise, tau, told)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
     error = (found - target).square() * weight
     turning = torch.zeros_like(filled).flatten()
@@ -233,5 +237,10 @@ def peptide_loss(
     turning = turning.reshape(filled.shape)
     of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
     share = c.turning_weight * turning.sum() / (c.turning_weight * turning.sum() + (filled & ~turning).sum())
-    loss = share * of_turning + (1 - share) * of_stiff
-    return loss, {"flow": loss.detach(), "turning": of_turning.detach(), "stiff": of_stiff.detach()}
+    of_flow = share * of_turning + (1 - share) * of_stiff
+    counted = torch.zeros(len(numbers), numbers.shape[2], device=numbers.device)
+    counted[:, chain.signed] = 1.0 if plain is None else plain[:, None].to(counted)
+    logits = model.crossings(known, chain.places, times_ps, times_apart(times_ps, c.forgotten_ps))
+    of_crossings = crossing_loss(logits, positive, counted)
+    parts = {"flow": of_flow, "turning": of_turning, "stiff": of_stiff, "crossings": of_crossings}
+    return of_flow + of_crossings, {name: part.detach() for name, part in parts.items()}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_scenes import with_phi_turned
 
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
@@ -17,8 +18,6 @@ from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import PeptideTraining, normalise, train_peptides, with_scale
 from surrogate.sampling.runner import RolloutConfig, rollout
-from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
 
@@ -117,9 +116,9 @@ def test_batches_are_of_every_length_that_a_chunk_has(frames: TrainingFrames, co
 def test_positive_phi_weighs_what_metadynamics_says() -> None:
     """Two runs at either sign of phi of both residues: each of the four patterns weighs what its residues' odds say."""
     scene = build_peptide("ACE-ALA-VAL-NME")
-    mirrored = scene.positions_nm * np.array([1.0, 1.0, -1.0])
+    turned = with_phi_turned(scene)
     rng = np.random.default_rng(0)
-    x = np.stack([scene.positions_nm, mirrored])[np.arange(8) % 2][:, None] + 0.002 * rng.normal(
+    x = np.stack([scene.positions_nm, turned])[np.arange(8) % 2][:, None] + 0.002 * rng.normal(
         size=(8, 100, scene.n_atoms, 3)
     )
     posed = canonicalise(x.reshape(-1, scene.n_atoms, 3), scene)
@@ -129,8 +128,7 @@ def test_positive_phi_weighs_what_metadynamics_says() -> None:
     assert weights is not None
     of_run = weights.reshape(8, 100)
     assert (of_run[:, 80:] == 0).all(), "held out"
-    positive = int(torsion(scene.positions_nm[None], backbone_torsions(scene)["phi"])[0, 0] <= 0)
-    ratio = of_run[positive::2].sum() / of_run[1 - positive :: 2].sum()
+    ratio = of_run[1::2].sum() / of_run[::2].sum()
     assert np.log(ratio) == pytest.approx(-3.0, abs=1e-6)
 
 
@@ -142,8 +140,37 @@ def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: P
     filled = chain.code.filled[1]
     found = model.correlation_at(torch.tensor([[1.0, 5.0, 40.0]]), types)[0, :, 0, filled].mean(-1)
     np.testing.assert_allclose(found, [0.9, 0.9**5, 0.9**40], atol=0.08)
-    numbers = PeptideSubject(frames, chain).numbers(model, torch.arange(0, 160))
+    numbers, _ = PeptideSubject(frames, chain).seen(model, torch.arange(0, 160))
     assert float(numbers[:, 1, filled].std()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_batches_show_crossings_of_phi_apart_from_what_is_likely() -> None:
+    """Runs that stand on one side of phi and, from frame 50 on, on the other: half of the windows made to hold the
+    crossing are read backwards, and then only from runs whose frames equilibrium has."""
+    scene = build_peptide("ACE-ALA-NME")
+    rng = np.random.default_rng(0)
+    side = (np.arange(8) % 2)[:, None] ^ (np.arange(100) >= 50)
+    x = np.stack([scene.positions_nm, with_phi_turned(scene)])[side]
+    x = x + 0.002 * rng.normal(size=x.shape)
+    posed = canonicalise(x.reshape(-1, scene.n_atoms, 3), scene)
+    frames = TrainingFrames(scene, quantise(posed), np.arange(9) * 100, 1.0, True, CONDITIONS, (), split=Split(0.2))
+    config = with_scale(SMALL, [frames])
+    weights = np.repeat([1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0], 100)
+    subject = PeptideSubject(frames, chain_features(scene, config), weights)
+    idx, times, plain = subject.batch(4000, config, torch.Generator().manual_seed(0))
+    crossing = ~plain & (times[:, 0] < config.forgotten_ps)
+    assert (idx[crossing] // 100 == idx[crossing, :1] // 100).all() and (idx[crossing] % 100 < 80).all()
+    assert (((idx[crossing] % 100) < 50).any(1) & ((idx[crossing] % 100) >= 50).any(1)).all()
+    assert ((idx[crossing, 1:] - idx[crossing, :1]).abs().float() == times[crossing]).all()
+    assert 0.1 < float(crossing.float().mean()) < 0.16
+    backwards = idx[crossing, -1] < idx[crossing, 0]
+    assert 0.3 < float(backwards.float().mean()) < 0.6
+    runs = idx[crossing, 0] // 100
+    assert set(runs[~backwards].tolist()) == set(range(8))
+    assert set(runs[backwards].tolist()) == {0, 1, 4, 5, 6, 7}
+    # Of what stays on its side no window is made.
+    still = replace(frames, coordinates=np.repeat(frames.coordinates[:1], 800, axis=0))
+    assert PeptideSubject(still, subject.chain, weights).batch(50, config, torch.Generator())[2].all()
 
 
 def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frames: TrainingFrames) -> None:
