@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_scenes import with_phi_turned
 
+from small_scenes import with_phi_turned
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split

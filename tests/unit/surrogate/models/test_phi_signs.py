@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from small_scenes import with_phi_turned
 
+from small_scenes import with_phi_turned
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.phi_signs import (
