@@ -90,13 +90,14 @@ def simulate(
         claimed_outputs([out], may_exist=resume or overwrite),
     ):
         if resume and out.exists() and not chk.exists():
-            return _already_complete(out, config)
+            already_complete(out, config)
+            return out
         kept = last_supported(chk, [out]) if resume and chk.exists() else None
         run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
         run.asked_to_stop = asked_to_stop
         run.progress = progress
         run.prepare(choice)
-        with run.engine_at_start() as engine, run.writer(engine) as writer:
+        with run.engine_at_start() as engine, run.writer() as writer:
             run.produce(engine, writer)
         chk.unlink(missing_ok=True)
     return out
@@ -178,10 +179,11 @@ class _Run:
             self.save(engine)
         return engine
 
-    def writer(self, engine: Engine) -> TrajectoryWriter:
+    def writer(self) -> TrajectoryWriter:
         """Return the writer of the trajectory, which holds the frames that are done."""
         columns = self.config.columns
-        return writer_at(self.out, self.scene, self._record(engine), self.header, resumed=self.resumed, columns=columns)
+        record = record_of(self.scene, self.config, self.choice)
+        return writer_at(self.out, self.scene, record, self.header, resumed=self.resumed, columns=columns)
 
     def _equilibrated(self) -> Engine:
         """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
@@ -335,34 +337,38 @@ class _Run:
             "ns_per_day": simulated_ps * 1e-3 / self.wall_s * 86400.0,
         }
 
-    def _record(self, engine: Engine) -> dict[str, Any]:
-        import openmm
 
-        return {
-            "kind": "reference",
-            "integrator": integrator_name(self.config.ensemble, self.scene),
-            "program": {"openmm": openmm.__version__},
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "completed": False,
-            **settings_of(self.config),
-            "platform": engine.platform_name,
-            "threads": engine.threads,
-            "platform_reason": self.choice.reason,
-        }
+def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[str, Any]:
+    """Return what the file of a run says of it before there are frames."""
+    import openmm
+
+    return {
+        "kind": "reference",
+        "integrator": integrator_name(config.ensemble, scene),
+        "program": {"openmm": openmm.__version__},
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "completed": False,
+        **settings_of(config),
+        "platform": choice.name,
+        "threads": choice.threads,
+        "platform_reason": choice.reason,
+    }
 
 
 def _advice(config: MDConfig) -> str:
     return f"Try a shorter `timestep_ps` (now {config.timestep_ps * 1000:g} fs)."
 
 
-def _already_complete(out: Path, config: MDConfig) -> Path:
+def already_complete(out: Path, config: MDConfig) -> None:
+    """A file without its checkpoint must hold all frames of this run. Raises InputError."""
+    if not out.exists():
+        raise InputError(f"{out} is not there, nor is the checkpoint of its run; start again with `overwrite`.")
     with open_trajectory(out) as reader:
         record, n_frames = reader.record, reader.n_frames
     # The record names the platform that ran, which "auto" leaves open.
     check_same_run(record, config, out, ignoring=("platform",))
-    if record.get("completed") and n_frames == config.n_frames:
-        return out
-    raise InputError(
-        f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
-        "`overwrite`, or keep it under another name."
-    )
+    if not record.get("completed") or n_frames != config.n_frames:
+        raise InputError(
+            f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "
+            "`overwrite`, or keep it under another name."
+        )

@@ -11,20 +11,19 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine
-from md_reference.run.integrators import integrator_name
 from md_reference.run.lanes import Lanes, n_lanes
-from md_reference.run.platforms import LANES
+from md_reference.run.platforms import LANES, PlatformChoice
 from md_reference.run.run_summary import summarise
-from md_reference.run.simulate import ProgressFn, stand_of, tell_preparing
+from md_reference.run.simulate import ProgressFn, already_complete, record_of, stand_of, tell_preparing
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -38,11 +37,11 @@ from systems.trajectory.checkpoint import (
     new_header,
     writer_at,
 )
-from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps
 
 # Frames are computed for about so long, then written and checkpointed.
 _BLOCK_S = 2.0
+_CHOICE = PlatformChoice(LANES, 1, "replicas in the lanes of one core, energies and forces checked against OpenMM's")
 
 
 def simulate_batch(
@@ -53,8 +52,13 @@ def simulate_batch(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
+    starts_nm: npt.NDArray[np.floating] | None = None,
+    notes: Sequence[dict[str, Any]] = (),
 ) -> None:
     """Run a replica for each of `outs`, at most `n_lanes()`; all have `config.seed` and their number in the batch.
+
+    They start from the scene, its energy minimised, or from `starts_nm` (n, n_atoms, 3) as they stand; `notes` are
+    added to their records.
 
     Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
     Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
@@ -69,38 +73,20 @@ def simulate_batch(
     state_path = checkpoint_path(outs[0])
     with deferred_interrupt() as asked_to_stop, claimed_outputs(list(outs), may_exist=resume or overwrite):
         if resume and not state_path.exists() and any(out.exists() for out in outs):
-            _refuse_unfinished(outs, config)
+            for out in outs:
+                already_complete(out, config)
             return
         kept = last_supported(state_path, list(outs)) if resume and state_path.exists() else None
         batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
-        batch.start(asked_to_stop, progress)
+        batch.start(starts_nm, asked_to_stop, progress)
+        record = record_of(scene, config, _CHOICE)
         with ExitStack() as stack:
-            record = batch.record()
-            writers = [
-                stack.enter_context(
-                    writer_at(
-                        out, scene, {**record, "lane": k, "of_lanes": len(outs)}, batch.header, k, resumed=batch.resumed
-                    )
-                )
-                for k, out in enumerate(outs)
-            ]
+            writers = []
+            for k, out in enumerate(outs):
+                own = {**record, "lane": k, "of_lanes": len(outs), **(notes[k] if notes else {})}
+                writers.append(stack.enter_context(writer_at(out, scene, own, batch.header, k, resumed=batch.resumed)))
             batch.produce(writers, asked_to_stop, progress)
         state_path.unlink(missing_ok=True)
-
-
-def _refuse_unfinished(outs: Sequence[Path], config: MDConfig) -> None:
-    """Without a checkpoint all files must be complete. Raises InputError."""
-    for out in outs:
-        if not out.exists():
-            raise InputError(f"{out} is not there, and no checkpoint of its batch is; start again with `overwrite`.")
-        with open_trajectory(out) as reader:
-            record, n_frames = reader.record, reader.n_frames
-        check_same_run(record, config, out)
-        if not record.get("completed") or n_frames != config.n_frames:
-            raise InputError(
-                f"{out} holds {n_frames} of {config.n_frames} frames but the checkpoint of its batch is gone; start "
-                "again with `overwrite`, or keep it under another name."
-            )
 
 
 class _Batch:
@@ -131,17 +117,22 @@ class _Batch:
     def wall_s(self) -> float:
         return self.stand.wall_s + time.monotonic() - self.began
 
-    def start(self, asked_to_stop: Callable[[], bool], progress: ProgressFn | None) -> None:
-        """Go to where the batch was left, or minimise and equilibrate. Raises SimulationError, KeyboardInterrupt."""
+    def start(
+        self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
+        progress: ProgressFn | None,
+    ) -> None:  # fmt: skip
+        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError, KeyboardInterrupt."""
         if self.resumed:
             self.lanes.restore(self.blob)
             return
         tell_preparing(progress, 0.0)
-        with Engine(self.scene, replace(self.config, platform="Reference"), system=self.system) as engine:
-            engine.minimise()
-            start = engine.positions()
-        self.lanes.check(self.system, start)
-        self.lanes.set_positions(np.repeat(start[None], self.lanes.n_lanes, axis=0))
+        if starts_nm is None:
+            with Engine(self.scene, replace(self.config, platform="Reference"), system=self.system) as engine:
+                engine.minimise()
+                starts_nm = engine.positions()[None]
+        self.lanes.check(self.system, starts_nm[0])
+        # Lanes left over repeat the last start; they cost nothing and are not kept.
+        self.lanes.set_positions(starts_nm[np.minimum(np.arange(self.lanes.n_lanes), len(starts_nm) - 1)])
         self.lanes.thermalise()
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
         piece = max(1, min(1000, n_steps))
@@ -224,19 +215,4 @@ class _Batch:
             "wall_s": wall_s,
             "energy_evaluations": self.done * self.config.steps_per_frame,
             "ns_per_day": simulated_ps * 1e-3 / wall_s * 86400.0,
-        }
-
-    def record(self) -> dict[str, Any]:
-        import openmm
-
-        return {
-            "kind": "reference",
-            "integrator": integrator_name(self.config.ensemble, self.scene),
-            "program": {"openmm": openmm.__version__},
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "completed": False,
-            **settings_of(self.config),
-            "platform": LANES,
-            "threads": 1,
-            "platform_reason": "replicas in the lanes of one core, energies and forces checked against OpenMM's",
         }

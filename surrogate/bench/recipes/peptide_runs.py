@@ -4,8 +4,7 @@ What the weights `peptides` learn from (`FOLDER/train`) and are tested on (`FOLD
 with `run_000.h5`, ...: ff14SB, OBC2, 300 K, 4 fs, frames 1 ps apart, sixteen runs at once (`md_reference.run.lanes`,
 checked against OpenMM for each molecule). Runs for training start from structures chosen from metadynamics
 (`seeds.npz`), 20 ps after each start discarded; those for testing from the built structure, 1 ns discarded. What is
-there is left alone, so that the same command goes on after an interruption; a batch of sixteen that was under way is
-begun again. One process a core, at low priority.
+there is left alone, so that the same command goes on after an interruption. One process a core, at low priority.
 """
 
 from __future__ import annotations
@@ -19,35 +18,30 @@ import sys
 import time
 import zlib
 from collections.abc import Sequence
-from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import openmm
 
-from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import MDConfig, settings_of
+from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
-from md_reference.run.integrators import integrator_name
-from md_reference.run.lanes import Lanes
+from md_reference.run.lanes import n_lanes
 from md_reference.run.machine import available_cores
+from md_reference.run.platforms import LANES
+from md_reference.run.simulate_lanes import simulate_batch
 from surrogate.bench.recipes.peptide_list import Peptide, held_out_peptides, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
 from systems.parent_watch import end_with_parent
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.codec import open_trajectory
 from systems.trajectory.topology_file import topology_path
 from systems.units import parse_wall_s
 
 DISCARD_PS, TEST_DISCARD_PS = 20.0, 1000.0
 _SPEC = ForceFieldSpec("ff14SB", "obc2")
-# Frames of a batch are written so often.
-_BLOCK_PS = 100
 # Metadynamics needs OpenMM; of tiny molecules its Reference platform is the fastest.
 _PLATFORM = "Reference"
 
@@ -106,70 +100,16 @@ def simulate(
 ) -> int:
     """Simulate from the first of the `wanted` starts, as many as go at once; return how many.
 
-    Their files are written when all frames are there. Raises SimulationError.
+    Their files get their names when all frames are there. Raises SimulationError.
     """
-    system = build_system(scene, _SPEC)
+    wanted = list(wanted[: n_lanes()])
     config = MDConfig(
-        time_ps=peptide.time_ps, equilibrate_ps=discard_ps, seed=_seed_of(peptide, wanted[0]), force=_SPEC
-    )
-    lanes = Lanes(
-        system,
-        temperature_k=config.temperature_k,
-        friction_per_ps=config.friction_per_ps,
-        timestep_ps=config.timestep_ps,
-        seed=config.seed,
-    )
-    wanted = list(wanted[: lanes.n_lanes])
-    # Lanes left over repeat the last start; they cost nothing and are not kept.
-    starts = [*wanted, *[wanted[-1]] * (lanes.n_lanes - len(wanted))]
-    began = time.monotonic()
-    lanes.check(system, seeds.positions_nm[wanted[0]])
-    lanes.set_positions(seeds.positions_nm[starts])
-    lanes.thermalise()
-    for _ in range(round(discard_ps / config.save_every_ps)):
-        lanes.step(config.steps_per_frame)
+        time_ps=peptide.time_ps, equilibrate_ps=discard_ps, seed=_seed_of(peptide, wanted[0]), force=_SPEC,
+        platform=LANES,
+    )  # fmt: skip
     parts = [folder / f".{run_path(folder, k).stem}.part.h5" for k in wanted]
-    record: dict[str, Any] = {
-        "kind": "reference",
-        "integrator": integrator_name(config.ensemble, scene),
-        "program": {"openmm": openmm.__version__},
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "completed": True,
-        **settings_of(config),
-        "platform": "lanes",
-        "threads": 1,
-        "platform_reason": f"{lanes.n_lanes} copies at once, forces checked against OpenMM's",
-    }
-    with ExitStack() as stack:
-        writers = [
-            stack.enter_context(
-                open_writer(
-                    part,
-                    scene,
-                    {**record, "start": {"group": seeds.groups[k], "index": k, "discarded_ps": discard_ps}},
-                    overwrite=True,
-                )
-            )
-            for k, part in zip(wanted, parts, strict=True)
-        ]
-        for first in range(0, config.n_frames, _BLOCK_PS):
-            states = []
-            for _ in range(min(_BLOCK_PS, config.n_frames - first)):
-                lanes.step(config.steps_per_frame)
-                states.append((lanes.positions_nm.astype(np.float32), lanes.energies(), lanes.temperatures_k()))
-            positions, energies, temperatures = (np.stack(values, axis=1) for values in zip(*states, strict=True))
-            times = (first + 1 + np.arange(len(states))) * config.save_every_ps
-            for k, writer in enumerate(writers):
-                scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
-                writer.append(positions[k], times, scalars=scalars)
-        wall_s = (time.monotonic() - began) / lanes.n_lanes
-        cost = {
-            "wall_s": wall_s,
-            "energy_evaluations": config.n_frames * config.steps_per_frame,
-            "ns_per_day": config.time_ps * 1e-3 / wall_s * 86400.0,
-        }
-        for writer in writers:
-            writer.update_record({"cost": cost})
+    notes = [{"start": {"group": seeds.groups[k], "index": k, "discarded_ps": discard_ps}} for k in wanted]
+    simulate_batch(scene, config, parts, resume=True, starts_nm=seeds.positions_nm[wanted], notes=notes)
     for k, part in zip(wanted, parts, strict=True):
         os.replace(topology_path(part), topology_path(run_path(folder, k)))
         os.replace(part, run_path(folder, k))
