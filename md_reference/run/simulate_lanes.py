@@ -121,7 +121,10 @@ class _Batch:
         self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
         progress: ProgressFn | None,
     ) -> None:  # fmt: skip
-        """Go to where the batch was left, or to the starts, and equilibrate. Raises SimulationError, KeyboardInterrupt."""
+        """Go to where the batch was left, or to the starts, and equilibrate.
+
+        Raises SimulationError, KeyboardInterrupt.
+        """
         if self.resumed:
             self.lanes.restore(self.blob)
             return
