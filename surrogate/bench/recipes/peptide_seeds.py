@@ -29,7 +29,7 @@ Quad = tuple[int, int, int, int]
 
 _HOT_K = 500.0
 _WIDTH_RAD = 0.30
-_HEIGHT_KJ_MOL = 1.2
+_HEIGHT_KJ_MOL = 2.4
 _BIAS_FACTOR = 8.0
 _DEPOSIT_STEPS = 250
 _TIMESTEP_PS = 0.004
@@ -148,7 +148,7 @@ def choose_seeds(scene: Scene, n: int, *, seed: int, platform: str) -> Seeds:
     Raises SimulationError when OpenMM fails.
     """
     residues = residue_torsions(scene)
-    time_ps = 1000.0 + 800.0 * len(residues)
+    time_ps = 500.0 + 400.0 * len(residues)
     frames, free = metadynamics(
         scene, time_ps=time_ps, temperature_k=_HOT_K, bias_factor=_BIAS_FACTOR, seed=seed, platform=platform
     )
