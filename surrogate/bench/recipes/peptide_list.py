@@ -54,13 +54,13 @@ def training_peptides() -> tuple[Peptide, ...]:
     for _ in range(_PAIR_ROUNDS):
         drawn = _matching(rng, taken)
         taken.update(drawn)
-        pairs += [Peptide(pair, True, 32, 1600.0) for pair in drawn]
+        pairs += [Peptide(pair, True, 16, 1600.0) for pair in drawn]
     chains = [
-        Peptide(residues, True, 32, 1600.0)
+        Peptide(residues, True, 16, 1600.0)
         for residues in _chains(rng, {*TEST_CHAINS, *TEST_FREE_CHAINS}, lengths=(3, 4), n=_CHAINS)
     ]
     free = [
-        Peptide(residues, False, 32, 1600.0) for residues in _chains(rng, set(TEST_PAIRS), lengths=(2,), n=_FREE_PAIRS)
+        Peptide(residues, False, 16, 1600.0) for residues in _chains(rng, set(TEST_PAIRS), lengths=(2,), n=_FREE_PAIRS)
     ]
     return (*monomers, *pairs, *(peptide for both in zip(chains, free, strict=True) for peptide in both))
 
