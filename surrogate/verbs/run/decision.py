@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from surrogate.verbs.run.rates import REPLICAS, Rates
+from surrogate.verbs.run.stage_clock import Pace
 from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
 
@@ -19,7 +21,7 @@ WAYS: dict[Way, str] = {
     "trained": "weights trained on MD made here, checked by other MD",
 }
 # Shares of what is left when the report is paid for; MD that is held out comes last, and takes what others leave. MD
-# that judges itself is split by replicas, or by stages if it has one core.
+# that judges itself is split by replicas, or by stages if there is one replica.
 _BY_STAGES: tuple[tuple[Stage, float], ...] = (("md", 0.5), ("held-out md", 0.5))
 _SHARES: dict[Way, tuple[tuple[Stage, float], ...]] = {
     "md": (("md", 1.0),),
@@ -42,12 +44,15 @@ MOST_BURSTS, _LEAST_BURSTS = 300, 60
 _RELAXING_STEPS = 150
 # Of their share, what bursts are planned to take: their estimate is the least sure.
 _BURSTS_AIM = 0.7
-# The judge: processor seconds at all, and of an atom in a frame.
-_JUDGE_S, _JUDGE_ATOM_S = 4.0, 3e-6
-_JUDGE_SHARE = 0.1
+# The judge: processor seconds at all, and of an atom in a frame; what it is meant to take of a budget, and may.
+_JUDGE_S, _JUDGE_ATOM_S = 5.5, 3e-6
+_JUDGE_SHARE, _MOST_FOR_REPORT = 0.1, 0.5
+# After so long it is known from a stage of MD how busy the machine is.
+_PACE_TOLD_S = 5.0
+_LEAST_STAGE_S = 2.0
 _MOST_FRAMES, _LEAST_FRAMES = 400_000, 4_000
 _MOST_STRETCH_FORESEEN = 2.0
-_MD_STAGES: tuple[Stage, ...] = ("training md", "md", "held-out md")
+MD_STAGES: tuple[Stage, ...] = ("training md", "md", "held-out md")
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -85,10 +90,8 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
     Raises InputError for a budget in which nothing can be judged.
     """
     chosen, why = _choose(rates, budget_s, way)
-    shares = dict(_BY_STAGES if chosen == "md" and rates.cores == 1 else _SHARES[chosen])
-    n_md = sum(name in _MD_STAGES for name in shares)
-    # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
-    least_s = max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * min(rates.stretch, _MOST_STRETCH_FORESEEN))
+    shares = _shares(rates, chosen)
+    least_s = least_budget_s(rates, chosen)
     if budget_s < least_s:
         raise InputError(
             f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and judge anything on this machine, as "
@@ -103,13 +106,48 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
     return replace(_divided(rates, chosen, why, shares, budget_s, frames), save_every_ps=every_ps)
 
 
+def _shares(rates: Rates, way: Way) -> dict[Stage, float]:
+    return dict(_BY_STAGES if way == "md" and rates.replicas == 1 else _SHARES[way])
+
+
+def least_budget_s(rates: Rates, way: Way) -> float:
+    """Return the wall seconds that the stages of a way need to come to anything."""
+    n_md = sum(name in MD_STAGES for name in _shares(rates, way))
+    # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
+    return max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * min(rates.stretch, _MOST_STRETCH_FORESEEN))
+
+
+def report_s(rates: Rates, frames: float, stretch: float) -> float:
+    """Return the wall seconds that judging so many frames takes; `stretch`: as of `Rates`, by now."""
+    return (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * stretch
+
+
+def seconds_of_first(
+    pending: Sequence[PlannedStage], rates: Rates, save_every_ps: float, left_s: float, frames: int, pace: Pace
+) -> float:
+    """Return the wall seconds that the first stage may take, when `left_s` of the budget are left at its beginning.
+
+    The others keep what was planned for them. If MD is the last before the report, its `pace` says how busy the machine
+    is by now, and so what a report will take of the frames that there are: `frames` before, and its own.
+    """
+    first, *later = pending
+    others_s = sum(stage.seconds for stage in later)
+    is_last = [stage.name for stage in later] == ["report"]
+    if is_last and first.name in MD_STAGES and pace.wall_s >= _PACE_TOLD_S:
+        stretch = max(1.0, rates.cores * pace.wall_s / max(pace.processor_s, 1e-3))
+        ps_of_core_s = rates.md_ps_per_s * rates.stretch / rates.cores
+        frames += round(pace.processor_s * ps_of_core_s / save_every_ps)
+        others_s = min(report_s(rates, frames, stretch), _MOST_FOR_REPORT * left_s)
+    return max(left_s - others_s, _LEAST_STAGE_S)
+
+
 def _divided(
     rates: Rates, way: Way, why: tuple[str, ...], shares: dict[Stage, float], budget_s: float, frames: int
 ) -> Decision:
     """Return the decision for a way: the budget divided by its `shares`, when so many frames are read at the end."""
     shares = dict(shares)
-    report_s = min(0.5 * budget_s, (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * rates.stretch)
-    left_s = budget_s - report_s
+    judge_s = min(_MOST_FOR_REPORT * budget_s, report_s(rates, frames, rates.stretch))
+    left_s = budget_s - judge_s
     n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
     if "bursts" in shares:
         burst_s = (burst_ps / rates.timestep_ps + _RELAXING_STEPS) * rates.step_s * rates.stretch
@@ -123,11 +161,11 @@ def _divided(
     scale = (1.0 - shares.get("bursts", 0.0)) / sum(share for name, share in shares.items() if name != "bursts")
     stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
               for name, share in shares.items()]  # fmt: skip
-    found = Decision(way, why, (*stages, PlannedStage("report", report_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
-    expected_ps = {name: md_ps(rates, found, name) for name in shares if name in _MD_STAGES}
+    found = Decision(way, why, (*stages, PlannedStage("report", judge_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
+    expected_ps = {name: md_ps(rates, found, name) for name in shares if name in MD_STAGES}
     return replace(
         found,
-        equilibrate_ps=_EQUILIBRATION_SHARE * min(expected_ps.values()) / rates.cores,
+        equilibrate_ps=_EQUILIBRATION_SHARE * min(expected_ps.values()) / rates.replicas,
         expected_md_ps=sum(expected_ps.values()),
         expected_rollout_ps=found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0),
     )
@@ -141,9 +179,10 @@ def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:
 def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
     if way == "md":
         return "md", ("asked for",)
+    in_lanes = " in lanes" if rates.at_once > 1 else ""
     if rates.rolls is not None:
         ratio = rates.rolls.ps_per_s / rates.md_ps_per_s
-        speeds = f"{rates.rolls.weights} rolls {ratio:.2g} times as fast as MD runs here"
+        speeds = f"{rates.rolls.weights} rolls {ratio:.2g} times as fast as MD runs here{in_lanes}"
         if ratio > 1.0 or way == "surrogate":
             return "rollout", (speeds, rates.coverage)
         return "md", (f"{speeds}: no surrogate pays", rates.coverage)
@@ -157,7 +196,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
     if way == "surrogate":
         return "trained", ("asked for; MD is cheap, and what it is trained on would answer by itself", none)
     day = format_time_ps(rates.md_ps_per_s * 86_400, 2)
-    return "md", (f"MD is cheap ({day} a day) and nothing covers the scene: no surrogate would pay", none)
+    return "md", (f"MD is cheap ({day} a day{in_lanes}) and nothing covers the scene: no surrogate would pay", none)
 
 
 def _frames(rates: Rates, budget_s: float) -> int:
@@ -179,13 +218,17 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
         return f"{format_time_ps(ps_per_s * 86_400, 3)} a day"
 
     busy = f", of which other work takes {1.0 - 1.0 / rates.stretch:.0%}" if rates.stretch > 1.1 else ""
+    cores = "one core" if rates.cores == 1 else f"{rates.cores} cores"
     lines = [
         ("MD", rates.md.rsplit("; about", 1)[0]),
-        ("MD here", f"{per_day(rates.md_ps_per_s)} on {rates.cores} cores{busy}"),
+        ("by OpenMM", f"{per_day(rates.openmm_ps_per_s)} on {cores}{busy}, a replica on each"),
     ]
+    if rates.at_once > 1:
+        lines.append(("in lanes", f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"))
+    elif rates.without_lanes:
+        lines.append(("in lanes", rates.without_lanes))
     if rates.rolls is not None:
-        rolled = f"{per_day(rates.rolls.ps_per_s)} by {rates.rolls.weights} in {REPLICAS} replicas"
-        lines.append(("rollout here", rolled))
+        lines.append(("by rollout", f"{per_day(rates.rolls.ps_per_s)}, {REPLICAS} replicas of {rates.rolls.weights}"))
     lines.append(("way", WAYS[decision.way]))
     lines += [("because", reason) for reason in decision.why]
     lines += [(stage.name, f"{format_wall(stage.seconds)}{_to_come(stage.name, decision, rates)}")
@@ -196,7 +239,7 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
 
 def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
     """Return what a stage is expected to come to."""
-    if name in _MD_STAGES:
+    if name in MD_STAGES:
         return f", about {format_time_ps(md_ps(rates, decision, name), 2)}"
     if name == "rollout" and decision.expected_rollout_ps:
         return f", about {format_time_ps(decision.expected_rollout_ps, 2)}"

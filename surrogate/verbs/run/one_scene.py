@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -15,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.reference import settle_run
-from surrogate.verbs.run.decision import Decision, decide
+from surrogate.verbs.run.decision import (
+    MD_STAGES,
+    Decision,
+    PlannedStage,
+    Stage,
+    decide,
+    least_budget_s,
+    seconds_of_first,
+)
 from surrogate.verbs.run.rates import measure
 from surrogate.verbs.run.run_record import (
     RUN_NAME,
@@ -25,11 +34,12 @@ from surrogate.verbs.run.run_record import (
     settings_of_run,
     write_run,
 )
-from surrogate.verbs.run.stage_clock import Clock
+from surrogate.verbs.run.stage_clock import Clock, Pace
 from surrogate.verbs.run.stages import STAGES, Site, md_options
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.errors import InputError, SurromdError
+from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.claim import Claim
 
 if TYPE_CHECKING:
@@ -62,7 +72,7 @@ def run_scene(
         with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
             kept = _Kept(folder, before)
             clock = Clock(options.budget_s, before.spent_s if before else 0.0, kept.beat, advance)
-            settled = clock.work("preparing", options.budget_s, lambda: _settled(scene, options)).result
+            settled = clock.work("preparing", lambda _: options.budget_s, lambda: _settled(scene, options)).result
             if settled is None:
                 raise InputError("the budget is spent before the scene is prepared; give more `budget_s`.")
             molecule, config = settled
@@ -132,8 +142,8 @@ class _Run:
 
     def to_the_end(self) -> RunRecord:
         """Do the stages that have not ended and return the record."""
-        while (name := self._next()) is not None:
-            self._do(name)
+        while pending := self._pending:
+            self._do(pending[0].name)
         return self.record
 
     @property
@@ -141,19 +151,26 @@ class _Run:
         assert self.record.decision is not None
         return self.record.decision
 
-    def _next(self) -> str | None:
-        return next((stage.name for stage in self.decision.stages if self.record.ended(stage.name) is None), None)
+    @property
+    def _pending(self) -> list[PlannedStage]:
+        return [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]
 
-    def _do(self, name: str) -> None:
-        pending = [stage for stage in self.decision.stages if self.record.ended(stage.name) is None]
-        later_s = sum(stage.seconds for stage in pending[1:])
-        # The report is made however long it takes: without it all else was in vain.
-        seconds = max(self.clock.budget_s - self.clock.spent_s - later_s, 2.0) if name != "report" else 86_400.0
-        self.say(f"{name}: for {seconds:.0f} s" if name != "report" else name)
+    def _do(self, name: Stage) -> None:
         stage, record = STAGES[name], self.record
+        frames = self._frames(name) if name in MD_STAGES else 0
+        left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
+
+        def may_take(pace: Pace) -> float:
+            # The report is made however long it takes: without it all else was in vain.
+            if name == "report":
+                return math.inf
+            assert record.rates is not None
+            return seconds_of_first(self._pending, record.rates, every_ps, left_s, frames, pace)
+
+        self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         try:
-            ended = self.clock.work(name, seconds, lambda: stage.work(self.site, record))
+            ended = self.clock.work(name, may_take, lambda: stage.work(self.site, record))
         except SurromdError as error:
             if not stage.may_fail:
                 raise
@@ -166,6 +183,11 @@ class _Run:
             self._failed(name, "nothing came of it in its time")
             return
         self._ended(found, StageEntry(name, "done" if ended.result is not None else "out of time", 0.0))
+
+    def _frames(self, name: Stage) -> int:
+        """Return how many frames there are to judge before a stage, its own among them where it goes on."""
+        record = STAGES[name].found(self.site, self.record) or self.record
+        return sum(frames_in(self.site.folder / file) for file in (*record.trajectory, *record.held_out))
 
     def _failed(self, name: str, reason: str) -> None:
         self.say(f"{name} failed: {reason}")
@@ -182,7 +204,7 @@ class _Run:
     def _by_md(self, why: str) -> None:
         """Spend what is left on MD."""
         assert self.record.rates is not None
-        left_s = max(self.clock.budget_s - self.clock.spent_s, 30.0)
+        left_s = max(self.clock.budget_s - self.clock.spent_s, least_budget_s(self.record.rates, "md"))
         decision = decide(self.record.rates, left_s, "md", save_every_ps=self.decision.save_every_ps)
         ended = {entry.name for entry in self.record.stages}
         stages = tuple(stage for stage in decision.stages if stage.name not in ended)
@@ -211,7 +233,7 @@ def _decide(record: RunRecord, scene: Scene, config: MDConfig, options: RunOptio
     def work() -> RunRecord:
         return _decided(record, scene, config, options, lambda: clock.spent_s)
 
-    found = clock.work("measuring", options.budget_s, work).result
+    found = clock.work("measuring", lambda _: options.budget_s, work).result
     if found is None:
         raise InputError("the budget is spent before the scene is measured; give more `budget_s`.")
     return found

@@ -5,13 +5,13 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import OutOfDomainError
+from systems.errors import OutOfDomainError, SimulationError
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -25,6 +25,8 @@ LONG_LAG_PS = 10.0
 _CHUNKS = 6
 _LONGEST_STRETCH = 10.0
 _SAME = ("force_field", "solvent", "temperature_k")
+# Beyond this, lanes are not tried: they relax the scene on OpenMM's Reference platform, which takes minutes there.
+_MOST_ATOMS_IN_LANES = 500
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,10 @@ class Rolls:
 @dataclass(frozen=True)
 class Rates:
     """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
-    other work shares them. `step_s`: processor seconds of a step of MD on one core, `md_ps_per_s`: of MD on all cores
-    in a second of wall time; `dear`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none
-    do; `coverage`: why these, or none.
+    other work shares them. `step_s`: processor seconds of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all
+    cores in a second of wall time, by the fastest way: on this `platform`, `at_once` replicas on each core; `md`: in
+    words; `dear`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none do; `coverage`:
+    why these, or none. `without_lanes`: why MD is not run in lanes, where it might have been.
     """
 
     n_atoms: int
@@ -54,6 +57,19 @@ class Rates:
     md_ps_per_s: float
     coverage: str
     rolls: Rolls | None = None
+    platform: str = "auto"
+    at_once: int = 1
+    without_lanes: str = ""
+
+    @property
+    def replicas(self) -> int:
+        """How many replicas of MD run at once."""
+        return self.cores * self.at_once
+
+    @property
+    def openmm_ps_per_s(self) -> float:
+        """What OpenMM simulates in a second of wall time, a replica on each core."""
+        return self.cores * self.timestep_ps / self.step_s / self.stretch
 
 
 def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int | None = None) -> Rates:
@@ -65,25 +81,57 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     from md_reference.forces.spec import QUANTUM
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
+    from md_reference.run.platforms import LANES
 
     cores = min(cores or available_cores(), available_cores())
     stretch = measured_stretch(cores)
-    plan = make_plan(scene, config, replicas=cores)
+    by_openmm = replace(config, platform="auto") if config.platform == LANES else config
+    plan = make_plan(scene, by_openmm, replicas=cores)
     assert plan.us_per_step is not None
-    step_s = plan.us_per_step * 1e-6
     weights, coverage = _covering(scene, config, named)
-    return Rates(
+    rates = Rates(
         n_atoms=scene.n_atoms,
         cores=cores,
         stretch=stretch,
         dear=config.force.force_field == QUANTUM,
         md=plan.line,
-        step_s=step_s,
+        step_s=plan.us_per_step * 1e-6,
         timestep_ps=config.timestep_ps,
-        md_ps_per_s=cores * config.timestep_ps / step_s / stretch,
+        md_ps_per_s=0.0,
         coverage=coverage,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch),
+        platform=by_openmm.platform,
     )
+    rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
+    return rates if rates.dear or config.platform not in ("auto", LANES) else _in_lanes(rates, scene, config)
+
+
+def _in_lanes(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
+    """Return the rates with MD in lanes where that is faster, else with the reason why it is not.
+
+    Raises SimulationError where lanes were asked for and cannot run the scene.
+    """
+    from md_reference.run.lanes import n_lanes
+    from md_reference.run.plan import make_plan
+    from md_reference.run.platforms import LANES
+
+    asked_for = config.platform == LANES
+    if not asked_for and config.ensemble != "nvt":
+        return replace(rates, without_lanes=f"not in {config.ensemble}: they run in a bath (nvt) alone")
+    if not asked_for and scene.n_atoms > _MOST_ATOMS_IN_LANES:
+        return replace(rates, without_lanes=f"not tried: more than {_MOST_ATOMS_IN_LANES} atoms")
+    try:
+        at_once = n_lanes()
+        plan = make_plan(scene, replace(config, platform=LANES), replicas=rates.cores * at_once)
+    except SimulationError as error:
+        if asked_for:
+            raise
+        return replace(rates, without_lanes=str(error).removesuffix("; take another platform."))
+    assert plan.us_per_step is not None
+    ps_per_s = rates.cores * config.timestep_ps / (plan.us_per_step * 1e-6) / rates.stretch
+    if ps_per_s <= rates.md_ps_per_s and not asked_for:
+        return replace(rates, without_lanes="no faster than OpenMM here")
+    return replace(rates, md=plan.line, md_ps_per_s=ps_per_s, platform=LANES, at_once=at_once)
 
 
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float) -> Rolls:

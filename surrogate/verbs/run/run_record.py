@@ -15,7 +15,7 @@ from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 
 RUN_NAME = "run.json"
-FORMAT = 1
+FORMAT = 2
 # What may change from one sitting to the next.
 _FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})
 

@@ -6,6 +6,8 @@ import contextvars
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from surrogate.progress import ProgressFn
@@ -15,6 +17,14 @@ from systems.units import format_wall
 T = TypeVar("T")
 _TICK_S = 0.2
 _SAVE_EVERY_S = 2.0
+
+
+@dataclass(frozen=True)
+class Pace:
+    """What a stage has taken so far: wall seconds, and processor seconds of this process and of those it started."""
+
+    wall_s: float
+    processor_s: float
 
 
 class Ended(Generic[T]):
@@ -39,13 +49,15 @@ class Clock:
     def spent_s(self) -> float:
         return self._before_s + time.monotonic() - self._began
 
-    def work(self, said: str, seconds: float, stage: Callable[[], T]) -> Ended[T]:
-        """Do a stage and return how it ended; after `seconds` it is asked to stop, as Ctrl-C asks.
+    def work(self, said: str, may_take: Callable[[Pace], float], stage: Callable[[], T]) -> Ended[T]:
+        """Do a stage and return how it ended; after the seconds that it `may_take` it is asked to stop, as Ctrl-C asks.
 
-        It runs in a thread of its own, and must end with KeyboardInterrupt when it is asked to (`deferred_interrupt`,
+        How many those are is asked every few seconds: its pace may tell what later stages will need. It runs in a
+        thread of its own, and must end with KeyboardInterrupt when it is asked to (`deferred_interrupt`,
         `stop_if_asked`). Ctrl-C stops it likewise: KeyboardInterrupt with the stage's own words. Raises what it raises.
         """
-        until = time.monotonic() + seconds
+        began, processor_s = time.monotonic(), _processor_s()
+        until = began + may_take(Pace(0.0, 0.0))
         results: list[T] = []
         errors: list[BaseException] = []
         with deferred_interrupt() as asked_to_stop:
@@ -66,6 +78,7 @@ class Clock:
                 if time.monotonic() - saved > _SAVE_EVERY_S:
                     saved = time.monotonic()
                     self._save(self.spent_s)
+                    until = began + may_take(Pace(saved - began, _processor_s() - processor_s))
             self._save(self.spent_s)
             if errors and isinstance(errors[0], KeyboardInterrupt):
                 if asked_to_stop():
@@ -82,3 +95,15 @@ class Clock:
             spent_s = min(self.spent_s, self.budget_s)
             note = f"{said}, {format_wall(round(spent_s))} of {format_wall(self.budget_s)}"
             self._advance(round(10 * spent_s), round(10 * self.budget_s), note)
+
+
+def _processor_s() -> float:
+    """Return the processor seconds that this process and those it started have used so far."""
+    import psutil
+
+    total = 0.0
+    own = psutil.Process()
+    for process in (own, *own.children(recursive=True)):
+        with suppress(psutil.Error):
+            total += sum(process.cpu_times()[:4])  # user and system, its own and of children that have ended
+    return total

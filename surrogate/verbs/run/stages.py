@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
     from systems.scene import Scene
 
-# A run may turn out faster than measured: the clock, not its length, ends it.
-_AMPLE = 3.0
+# A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
+_AMPLE = 2.0
 _LEAST_FRAMES = 20
 _OPTIMISING = 0.85
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
@@ -63,30 +63,26 @@ def _settled(record: RunRecord) -> tuple[Rates, Decision]:
 
 
 def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
-    """Return a stage of MD into `place`, replicas on all cores."""
+    """Return a stage of MD into `place`, by the fastest way, replicas on all cores."""
 
-    def outs(site: Site, record: RunRecord) -> list[Path]:
-        from systems.trajectory.claim import replica_paths
-
-        suffix = f".{site.options.format}" if name == "md" else ".h5"
-        return replica_paths(site.folder / f"{place}{suffix}", _settled(record)[0].cores)
+    def out(site: Site) -> Path:
+        return site.folder / f"{place}.{site.options.format if name == 'md' else 'h5'}"
 
     def work(site: Site, record: RunRecord) -> RunRecord:
         rates, decision = _settled(record)
         every_ps = decision.save_every_ps
-        expected_ps = md_ps(rates, decision, name) / rates.cores
-        first = outs(site, record)
-        out = site.folder / f"{place}{first[0].suffix}"
-        out.parent.mkdir(exist_ok=True)
+        expected_ps = md_ps(rates, decision, name) / rates.replicas
+        out(site).parent.mkdir(exist_ok=True)
         reference(
             site.scene,
-            out,
+            out(site),
             options=md_options(
                 site.options,
-                time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * expected_ps / every_ps)),
+                time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
                 save_every_ps=every_ps,
                 equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
-                replicas=rates.cores,
+                replicas=rates.replicas,
+                platform=rates.platform,
                 seed=site.options.seed + seed * _SEEDS_APART,
                 resume=True,
             ),
@@ -97,12 +93,15 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         return done
 
     def found(site: Site, record: RunRecord) -> RunRecord | None:
-        files = _with_frames(site.folder, outs(site, record))
+        from systems.trajectory.claim import replica_paths
+
+        replicas = _settled(record)[0].replicas
+        files = _with_frames(site.folder, replica_paths(out(site), replicas))
         if not files:
             return None
         if name == "held-out md":
             return replace(record, held_out=files)
-        if name == "md" and _settled(record)[0].cores > 1:
+        if name == "md" and replicas > 1:
             n_own = -(-len(files) // 2)
             return replace(record, trajectory=files[:n_own], held_out=files[n_own:])
         return replace(record, trajectory=files) if name == "md" else record
@@ -169,7 +168,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
         own if record.weights == WEIGHTS_NAME else record.weights,
         out,
         options=RolloutOptions(
-            time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * expected_ps / every_ps)),
+            time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
             save_every_ps=every_ps,
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,

@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from md_reference.run.machine import available_cores
-from surrogate.verbs.run.decision import Decision, decide, table
+from surrogate.verbs.run.decision import Decision, PlannedStage, decide, report_s, seconds_of_first, table
 from surrogate.verbs.run.rates import Rates, Rolls, measured_stretch
+from surrogate.verbs.run.stage_clock import Pace
 from systems.errors import InputError
 
 # Alanine dipeptide on two cores: 20 ns of MD in a minute, and weights that roll five times as fast.
@@ -44,6 +45,44 @@ def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
     assert named(alone) == ["md", "held-out md", "report"] and alone.seconds("md") == alone.seconds("held-out md")
     assert "S not seen" in found.why[1]
     assert decide(UNCOVERED, 600.0, "surrogate").way == "trained"
+
+
+def test_md_in_lanes_is_a_rival_of_the_surrogate() -> None:
+    lanes = replace(COVERED, platform="lanes", at_once=16, md_ps_per_s=3200.0)
+    found = decide(lanes, 600.0)
+    assert found.way == "md" and "0.5 times as fast as MD runs here in lanes: no surrogate pays" in found.why[0]
+    lines = dict(table(lanes, found, 600.0))
+    assert lines["by OpenMM"].startswith("27.6 us a day on 2 cores") and lines["in lanes"].startswith("276 us a day")
+    assert lines["by rollout"].startswith("138 us a day")
+    assert lanes.replicas == 32 and found.equilibrate_ps == pytest.approx(0.1 * found.expected_md_ps / 32)
+    one_core = decide(replace(lanes, cores=1), 600.0)
+    assert named(one_core) == ["md", "report"], "sixteen replicas of one core judge each other"
+    without = replace(COVERED, without_lanes="no C++ compiler")
+    assert decide(without, 600.0).way == "rollout"
+    assert dict(table(without, decide(without, 600.0), 600.0))["in lanes"] == "no C++ compiler"
+
+
+@pytest.mark.parametrize("busy", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("foreseen", [1.0, 3.0])
+def test_md_ends_when_the_report_of_what_there_is_fits_into_the_rest(busy: float, foreseen: float) -> None:
+    budget_s = 120.0
+    rates = replace(UNCOVERED, stretch=foreseen, md_ps_per_s=320.0 / foreseen)
+    found = decide(rates, budget_s)
+    wall_s, may_s = 0.0, 1.0
+    while wall_s < may_s:
+        wall_s += 0.5
+        pace = Pace(wall_s, 2 * wall_s / busy)
+        may_s = seconds_of_first(found.stages, rates, found.save_every_ps, budget_s, 0, pace)
+    frames = pace.processor_s * 160.0 / found.save_every_ps
+    assert wall_s + report_s(rates, frames, busy) == pytest.approx(budget_s, rel=0.05)
+
+
+def test_stages_before_the_last_leave_the_others_what_was_planned() -> None:
+    found = decide(COVERED, 600.0)
+    planned = sum(stage.seconds for stage in found.stages[1:])
+    assert seconds_of_first(found.stages, COVERED, 1.0, 600.0, 0, Pace(50.0, 10.0)) == pytest.approx(600.0 - planned)
+    late = [PlannedStage("held-out md", 100.0), PlannedStage("report", 30.0)]
+    assert seconds_of_first(late, COVERED, 1.0, 10.0, 0, Pace(0.0, 0.0)) == 2.0, "what is over the budget is short"
 
 
 def test_dear_truth_is_learned_where_there_is_time_to() -> None:

@@ -85,7 +85,7 @@ def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth
 
 
 def told(way: Way, found: Worth | None, costs: Costs = CHEAP, bursts: str = "") -> Outcome:
-    account = SimpleNamespace(total_ps=50_000.0)
+    account = SimpleNamespace(total_ps=50_000.0, n_segments=16)
     status, worths = ("close", (found,)) if found else ("undecided", ())
     judged = SimpleNamespace(account=account, worth=worths, worth_words="words" if found else "", status=status,
                              verdict="Close.", effective_samples=4.0)  # fmt: skip
@@ -121,5 +121,6 @@ def test_where_md_was_the_better_choice_it_is_said() -> None:
 def test_md_claims_no_gain_and_what_has_no_worth_says_so() -> None:
     found = told("md", worth())
     assert found.gain is None and "62 ns to use" in found.headline
+    assert found.headline.startswith("50 ns of MD in 16 replicas of 3.1 ns, and 12 ns of held-out MD")
     untold = told("rollout", None).headline
     assert "tell no worth" in untold and "a budget of about 5 min would tell" in untold

@@ -1,0 +1,97 @@
+"""Rates of MD: lanes where they run and are faster, OpenMM and one plain line where not."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run import lanes, plan
+from md_reference.run.config import MDConfig
+from md_reference.run.lanes import LanesUnavailableError
+from surrogate.verbs.run import rates as measuring
+from surrogate.verbs.run.rates import Rates, measure
+from systems.errors import SimulationError
+from systems.prepare.peptide import build_peptide
+
+SCENE = build_peptide("ACE-GLY-NME")
+CONFIG = MDConfig(time_ps=1.0, force=ForceFieldSpec("ff14SB", "obc2"))
+NO_COMPILER = "no C++ compiler (g++) was found, which platform lanes needs"
+
+
+@pytest.fixture(autouse=True)
+def timed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenMM takes 25 µs a step, sixteen replicas in lanes 32: 2 each."""
+
+    def planned(scene: Any, config: MDConfig, *, replicas: int) -> Any:
+        return SimpleNamespace(us_per_step=2.0 if config.platform == "lanes" else 25.0, line=config.platform)
+
+    monkeypatch.setattr(plan, "make_plan", planned)
+    monkeypatch.setattr(lanes, "n_lanes", lambda: 16)
+    monkeypatch.setattr(measuring, "measured_stretch", lambda cores: 2.0)
+    monkeypatch.setattr(measuring, "_covering", lambda *_: (None, "nothing covers it"))
+
+
+def found(config: MDConfig = CONFIG) -> Rates:
+    return measure(SCENE, config, None, cores=1)
+
+
+def test_lanes_are_taken_where_they_are_faster() -> None:
+    rates = found()
+    assert (rates.platform, rates.at_once, rates.replicas, rates.md) == ("lanes", 16, 16, "lanes")
+    assert rates.md_ps_per_s == pytest.approx(0.004 / 2e-6 / 2.0), "half of the core is others'"
+    assert rates.openmm_ps_per_s == pytest.approx(0.004 / 25e-6 / 2.0) and rates.without_lanes == ""
+
+
+def refuses(error: Exception) -> Callable[..., Any]:
+    def plan_of(scene: Any, config: MDConfig, *, replicas: int) -> Any:
+        if config.platform == "lanes":
+            raise error
+        return SimpleNamespace(us_per_step=25.0, line=config.platform)
+
+    return plan_of
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (LanesUnavailableError(f"{NO_COMPILER}; take another platform."), NO_COMPILER),
+        (LanesUnavailableError("platform lanes knows no CMAPTorsionForce; take another platform."), "CMAPTorsionForce"),
+        (SimulationError("a copy of the molecule blew up"), "blew up"),
+    ],
+)
+def test_where_lanes_cannot_openmm_runs_and_one_line_says_why(
+    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan, "make_plan", refuses(error))
+    rates = found()
+    assert (rates.platform, rates.replicas) == ("auto", 1) and rates.md_ps_per_s == rates.openmm_ps_per_s
+    assert rates.without_lanes.endswith(said) or said in rates.without_lanes
+    assert "another platform" not in rates.without_lanes
+    with pytest.raises(type(error)):
+        found(replace(CONFIG, platform="lanes"))
+
+
+def test_what_is_no_rival_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "make_plan", refuses(AssertionError("lanes were tried")))
+    assert "bath" in found(replace(CONFIG, ensemble="nve")).without_lanes
+    asked = found(replace(CONFIG, platform="CPU"))
+    assert (asked.platform, asked.without_lanes) == ("CPU", "")
+    assert found(replace(CONFIG, force=ForceFieldSpec("gfn2-xtb", "vacuum"))).dear
+
+
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
+def test_without_a_compiler_the_line_is_plain(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:  # fmt: skip
+    monkeypatch.undo()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(lanes, "_program", lanes._program.__wrapped__)
+    monkeypatch.setattr(measuring, "_covering", lambda *_: (None, "nothing covers it"))
+    assert found().without_lanes == NO_COMPILER
