@@ -1,0 +1,131 @@
+"""Runs that are killed or stopped at the seams of their stages go on with `resume` and end as if nothing had been."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from surrogate import api
+from surrogate.verbs.run import one_scene, stages
+from surrogate.verbs.run.decision import decide
+from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
+from surrogate.verbs.run.run_record import Outcome, RunRecord, read_run
+from surrogate.verbs.run.stages import Site, StageOf
+from systems.trajectory.checkpoint import frames_in
+from systems.trajectory.codec import open_trajectory
+
+# As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock, and bursts are too dear.
+RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("alanine-dipeptide", 1.0, 0.25))
+BUDGET_S = 400.0
+OPENMM, LANES = RATES, replace(RATES, platform="lanes", at_once=16, md_ps_per_s=0.8)
+needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
+WAYS = [
+    pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
+    pytest.param(("md", LANES, ["md", "report"]), id="lanes", marks=needs_compiler),
+    pytest.param(("surrogate", OPENMM, ["rollout", "held-out md", "report"]), id="rollout"),
+]
+Way = tuple[str, Rates, list[str]]
+
+
+class Killed(BaseException):
+    """Nobody catches it: what is on disk is what a kill leaves."""
+
+
+def run(folder: Path, asked: str, *, resume: bool = False) -> dict[str, Any]:
+    return api.run("alanine-dipeptide", folder, budget_s=BUDGET_S, way=asked, resume=resume, quiet=True)
+
+
+def frames(folder: Path) -> dict[str, Any]:
+    found = {}
+    for path in sorted(folder.glob("*/*.h5")):
+        with open_trajectory(path) as reader:
+            found[path.name] = np.asarray(reader.read())
+    return found
+
+
+def disturbed(stage: StageOf, *, before: Callable[[], None] = lambda: None, after: Callable[[], None] = lambda: None,
+              ) -> StageOf:  # fmt: skip
+    def work(site: Site, record: Any) -> Any:
+        before()
+        found = stage.work(site, record)
+        after()
+        return found
+
+    return replace(stage, work=work)
+
+
+def kill() -> None:
+    raise Killed
+
+
+def interrupt() -> None:
+    """Ctrl-C, heard by the stage at its next look."""
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def ended(found: dict[str, Any]) -> list[tuple[str, str]]:
+    return [(stage["name"], stage["status"]) for stage in found["stages"]]
+
+
+def judged_at_once(site: Site, record: RunRecord) -> RunRecord:
+    """A report that only counts; the judge takes seconds, and is tested elsewhere."""
+    held_ps, rolled_ps = (
+        float(sum(frames_in(site.folder / file) for file in files)) for files in (record.held_out, record.trajectory)
+    )
+    (site.folder / stages.REPORT_NAME).write_text("judged")
+    return replace(record, outcome=Outcome("head", "close", "verdict", held_ps, rolled_ps))
+
+
+@pytest.fixture(params=WAYS)
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Way:
+    """A way to run, its rates, and its stages."""
+    asked, rates, names = request.param
+    monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
+    # However long it took to get there: lengths of runs are those of the whole budget.
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    return asked, rates, names
+
+
+def test_kills_before_and_after_each_stage_change_nothing(
+    way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, rates, names = way
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    expected = run(whole, asked)
+    assert ended(expected) == [(name, "done") for name in names]
+    for k, name in enumerate(names):
+        for moment in ({"before": kill}, {"after": kill}):
+            with monkeypatch.context() as patch:
+                patch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], **moment))
+                with pytest.raises(Killed):
+                    run(killed, asked, resume=True)
+            assert [entry.name for entry in read_run(killed).stages] == names[:k], "what had ended, and no more"
+    found = run(killed, asked, resume=True)
+    assert ended(found) == ended(expected) and found["outcome"] == expected["outcome"]
+    kept, undisturbed = frames(killed), frames(whole)
+    assert len(kept) == {"md": rates.replicas, "surrogate": REPLICAS}[asked] + (rates is OPENMM)
+    assert kept.keys() == undisturbed.keys()
+    for name, positions in undisturbed.items():
+        assert np.array_equal(kept[name], positions), name
+
+
+def test_ctrl_c_in_each_stage_keeps_everything(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, _, names = way
+    expected = run(tmp_path / "whole", asked)
+    for k, name in enumerate(names):
+        with monkeypatch.context() as patch:
+            patch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], before=interrupt))
+            with pytest.raises(KeyboardInterrupt, match=r"keeps what was done; the same again with `resume=True`"):
+                run(tmp_path / "run", asked, resume=True)
+        assert [entry.name for entry in read_run(tmp_path / "run").stages] == names[:k]
+    found = run(tmp_path / "run", asked, resume=True)
+    assert ended(found) == ended(expected) and found["outcome"] == expected["outcome"]
