@@ -37,8 +37,8 @@ def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", no
     gain = _least_gain(worth, costs) if way != "md" else None
     held = f"{format_time_ps(held_ps, 2)} of held-out MD"
     if way == "md":
-        n = judged.account.n_segments
-        each = f" in {n} replicas of {format_time_ps(rolled_ps / n, 2)}" if n > 1 else ""
+        replicas = judged.account.n_segments
+        each = f" in {replicas} replicas of {format_time_ps(rolled_ps / replicas, 2)}" if replicas > 1 else ""
         head = f"{format_time_ps(rolled_ps, 2)} of MD{each}, and {held} that judges it"
         head += f": worth {worth.in_words()} of MD by its {worth.measure}." if worth else f": {judged.status}."
         head += f" With the held-out half there are {format_time_ps(rolled_ps + held_ps, 2)} to use."
