@@ -44,7 +44,7 @@ def test_only_what_ci_does_itself_is_left_out(repository: Path) -> None:
     shell = blocks((repository / "README.md").read_text(encoding="utf-8"), "sh")
     left = [line for block in shell for line in ELSEWHERE.sub("", block).splitlines() if line and line[0] != "#"]
     assert [line.split()[:2] for line in left] == [
-        ["surromd", verb] for verb in ("demo", "reference", "rollout", "compare")
+        ["surromd", verb] for verb in ("demo", "run", "reference", "rollout", "compare")
     ]
 
 
@@ -59,7 +59,7 @@ def programs() -> list[list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", programs(), ids=["demo", "the three jobs", "python"])
+@pytest.mark.parametrize("program", programs(), ids=["demo", "your own molecule", "the three jobs", "python"])
 def test_its_code_runs(tmp_path: Path, program: list[str]) -> None:
     search = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     done = subprocess.run(program, cwd=tmp_path, env={**os.environ, "PATH": search}, capture_output=True, text=True)
