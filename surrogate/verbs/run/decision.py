@@ -45,7 +45,7 @@ _RELAXING_STEPS = 150
 # Of their share, what bursts are planned to take: their estimate is the least sure.
 _BURSTS_AIM = 0.7
 # The judge: processor seconds at all, and of an atom in a frame; what it is meant to take of a budget, and may.
-_JUDGE_S, _JUDGE_ATOM_S = 5.5, 3e-6
+_JUDGE_S, _JUDGE_ATOM_S = 7.0, 3e-6
 _JUDGE_SHARE, _MOST_FOR_REPORT = 0.1, 0.5
 # After so long it is known from a stage of MD how busy the machine is.
 _PACE_TOLD_S = 5.0
@@ -118,8 +118,8 @@ def least_budget_s(rates: Rates, way: Way) -> float:
 
 
 def report_s(rates: Rates, frames: float, stretch: float) -> float:
-    """Return the wall seconds that judging so many frames takes; `stretch`: as of `Rates`, by now."""
-    return (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * stretch
+    """Return the wall seconds that judging so many frames takes, on one core; `stretch`: as of `Rates`, by now."""
+    return (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * max(1.0, stretch * rates.alone)
 
 
 def seconds_of_first(
@@ -134,7 +134,7 @@ def seconds_of_first(
     others_s = sum(stage.seconds for stage in later)
     is_last = [stage.name for stage in later] == ["report"]
     if is_last and first.name in MD_STAGES and pace.wall_s >= _PACE_TOLD_S:
-        stretch = max(1.0, rates.cores * pace.wall_s / max(pace.processor_s, 1e-3))
+        stretch = rates.cores * pace.wall_s / max(pace.processor_s, 1e-3)
         ps_of_core_s = rates.md_ps_per_s * rates.stretch / rates.cores
         frames += round(pace.processor_s * ps_of_core_s / save_every_ps)
         others_s = min(report_s(rates, frames, stretch), _MOST_FOR_REPORT * left_s)

@@ -72,7 +72,7 @@ def run_scene(
         with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
             kept = _Kept(folder, before)
             clock = Clock(options.budget_s, before.spent_s if before else 0.0, kept.beat, advance)
-            settled = clock.work("preparing", lambda _: options.budget_s, lambda: _settled(scene, options)).result
+            settled = clock.work("preparing", lambda _: options.budget_s, lambda: _settled(scene, options))
             if settled is None:
                 raise InputError("the budget is spent before the scene is prepared; give more `budget_s`.")
             molecule, config = settled
@@ -170,7 +170,7 @@ class _Run:
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         try:
-            ended = self.clock.work(name, may_take, lambda: stage.work(self.site, record))
+            done = self.clock.work(name, may_take, lambda: stage.work(self.site, record))
         except SurromdError as error:
             if not stage.may_fail:
                 raise
@@ -178,11 +178,11 @@ class _Run:
             return
         finally:
             self.kept.stage = ""
-        found = stage.found(self.site, record) if ended.result is None else ended.result
+        found = stage.found(self.site, record) if done is None else done
         if found is None:
             self._failed(name, "nothing came of it in its time")
             return
-        self._ended(found, StageEntry(name, "done" if ended.result is not None else "out of time", 0.0))
+        self._ended(found, StageEntry(name, "out of time" if done is None else "done", 0.0))
 
     def _frames(self, name: Stage) -> int:
         """Return how many frames there are to judge before a stage, its own among them where it goes on."""
@@ -206,10 +206,20 @@ class _Run:
         assert self.record.rates is not None
         left_s = max(self.clock.budget_s - self.clock.spent_s, least_budget_s(self.record.rates, "md"))
         decision = decide(self.record.rates, left_s, "md", save_every_ps=self.decision.save_every_ps)
+        decision = _beside_training(self.record, replace(decision, why=(why,)))
         ended = {entry.name for entry in self.record.stages}
         stages = tuple(stage for stage in decision.stages if stage.name not in ended)
-        self.keep(replace(self.record, decision=replace(decision, why=(why,), stages=stages)))
+        decision = replace(decision, stages=stages)
+        self.keep(replace(self.record, decision=decision, trajectory=self.record.training))
         self.say(f"{why}: MD for the rest of the budget")
+
+
+def _beside_training(record: RunRecord, decision: Decision) -> Decision:
+    """Return the decision for MD where MD was made to train on: that is the trajectory, and what is made judges it."""
+    if not record.training:
+        return decision
+    judging = PlannedStage("held-out md", decision.seconds("md") + decision.seconds("held-out md"))
+    return replace(decision, stages=(judging, PlannedStage("report", decision.seconds("report"))))
 
 
 def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
@@ -223,6 +233,7 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     if longer.way != record.decision.way:  # a surrogate that failed
         return record
     decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)
+    decision = _beside_training(record, decision) if way == "md" else decision
     ended = tuple(entry for entry in record.stages if entry.status == "done" and entry.name != "report")
     return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
 
@@ -233,7 +244,7 @@ def _decide(record: RunRecord, scene: Scene, config: MDConfig, options: RunOptio
     def work() -> RunRecord:
         return _decided(record, scene, config, options, lambda: clock.spent_s)
 
-    found = clock.work("measuring", lambda _: options.budget_s, work).result
+    found = clock.work("measuring", lambda _: options.budget_s, work)
     if found is None:
         raise InputError("the budget is spent before the scene is measured; give more `budget_s`.")
     return found

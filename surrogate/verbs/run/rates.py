@@ -23,7 +23,7 @@ REPLICAS = 8
 # Weights for several lags step so far, or as near to it as they can.
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
-_LONGEST_STRETCH = 10.0
+_LONGEST_STRETCH = 30.0
 _SAME = ("force_field", "solvent", "temperature_k")
 # Beyond this, lanes are not tried: they relax the scene on OpenMM's Reference platform, which takes minutes there.
 _MOST_ATOMS_IN_LANES = 500
@@ -41,10 +41,11 @@ class Rolls:
 @dataclass(frozen=True)
 class Rates:
     """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
-    other work shares them. `step_s`: processor seconds of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all
-    cores in a second of wall time, by the fastest way: on this `platform`, `at_once` replicas on each core; `md`: in
-    words; `dear`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none do; `coverage`:
-    why these, or none. `without_lanes`: why MD is not run in lanes, where it might have been.
+    other work shares them; `alone`: what part of that a thread sees which runs by itself. `step_s`: processor seconds
+    of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
+    on this `platform`, `at_once` replicas on each core; `md`: in words; `dear`: it is quantum mechanics. `rolls`: of
+    weights that cover the scene, None where none do; `coverage`: why these, or none. `without_lanes`: why MD is not run
+    in lanes, where it might have been.
     """
 
     n_atoms: int
@@ -60,6 +61,7 @@ class Rates:
     platform: str = "auto"
     at_once: int = 1
     without_lanes: str = ""
+    alone: float = 1.0
 
     @property
     def replicas(self) -> int:
@@ -101,6 +103,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         coverage=coverage,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch),
         platform=by_openmm.platform,
+        alone=1.0 if cores == 1 else min(1.0, measured_stretch(1) / stretch),
     )
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
     return rates if rates.dear or config.platform not in ("auto", LANES) else _in_lanes(rates, scene, config)
@@ -193,9 +196,9 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
     return weights, why
 
 
-def measured_stretch(cores: int, seconds: float = 0.5) -> float:
+def measured_stretch(cores: int, seconds: float = 1.0) -> float:
     """Return the wall seconds of a second of processor time when so many threads compute at once; at least 1, and at
-    most ten, beyond which so short a look tells no more."""
+    most thirty, beyond which so short a look tells no more."""
     block = bytes(2**20)
     used_s = [0.0] * cores
     began = time.perf_counter()

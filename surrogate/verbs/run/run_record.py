@@ -52,8 +52,8 @@ class Outcome:
 @dataclass(frozen=True)
 class RunRecord:
     """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget, `spent_in` each
-    stage; `trajectory`, `held_out`: files, relative to the folder; `weights`: a file there, or the name of shipped
-    ones."""
+    stage; `trajectory`, `held_out`, `training`: files, relative to the folder; `weights`: a file there, or the name of
+    shipped ones."""
 
     scene: str
     molecule: str
@@ -69,6 +69,7 @@ class RunRecord:
     stages: tuple[StageEntry, ...] = ()
     trajectory: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
+    training: tuple[str, ...] = ()
     weights: str = ""
     outcome: Outcome | None = None
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from surrogate.progress import ProgressFn
 from systems.interrupts import deferred_interrupt, stop_when
@@ -27,13 +27,6 @@ class Pace:
     processor_s: float
 
 
-class Ended(Generic[T]):
-    """How a stage ended: with its `result`, or, where that is None, because its time was up."""
-
-    def __init__(self, result: T | None) -> None:
-        self.result = result
-
-
 class Clock:
     """Counts the wall time of a run, of earlier sittings too (`spent_s`). `save` is told every few seconds what is
     spent, so that a run that is killed does not start its budget over; `advance` shows it."""
@@ -49,11 +42,11 @@ class Clock:
     def spent_s(self) -> float:
         return self._before_s + time.monotonic() - self._began
 
-    def work(self, said: str, may_take: Callable[[Pace], float], stage: Callable[[], T]) -> Ended[T]:
-        """Do a stage and return how it ended; after the seconds that it `may_take` it is asked to stop, as Ctrl-C asks.
+    def work(self, said: str, may_take: Callable[[Pace], float], stage: Callable[[], T]) -> T | None:
+        """Do a stage and return its result; None where it was asked to stop, as Ctrl-C asks, when its time was up.
 
-        How many those are is asked every few seconds: its pace may tell what later stages will need. It runs in a
-        thread of its own, and must end with KeyboardInterrupt when it is asked to (`deferred_interrupt`,
+        `may_take` is asked every few seconds, for the pace of a stage may tell what later ones will need. A stage runs
+        in a thread of its own, and must end with KeyboardInterrupt when it is asked to (`deferred_interrupt`,
         `stop_if_asked`). Ctrl-C stops it likewise: KeyboardInterrupt with the stage's own words. Raises what it raises.
         """
         began, processor_s = time.monotonic(), _processor_s()
@@ -83,12 +76,12 @@ class Clock:
             if errors and isinstance(errors[0], KeyboardInterrupt):
                 if asked_to_stop():
                     raise KeyboardInterrupt(*errors[0].args) from None
-                return Ended(None)
+                return None
             if errors:
                 raise errors[0]
             if asked_to_stop():
                 raise KeyboardInterrupt
-        return Ended(results[0])
+        return results[0]
 
     def _show(self, said: str) -> None:
         if self._advance is not None:

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
 _AMPLE = 2.0
 _LEAST_FRAMES = 20
-_OPTIMISING = 0.85
+# Of a training's time what may go into steps, and processor seconds before the first: frames are read, programs loaded.
+_OPTIMISING, _BEFORE_STEPS_S = 0.95, 8.0
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
 WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
@@ -101,10 +102,10 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
             return None
         if name == "held-out md":
             return replace(record, held_out=files)
-        if name == "md" and replicas > 1:
-            n_own = -(-len(files) // 2)
-            return replace(record, trajectory=files[:n_own], held_out=files[n_own:])
-        return replace(record, trajectory=files) if name == "md" else record
+        if name == "training md":
+            return replace(record, training=files)
+        n_own = -(-len(files) // 2) if replicas > 1 else 1
+        return replace(record, trajectory=files[:n_own], held_out=files[n_own:])
 
     return StageOf(work, found)
 
@@ -123,17 +124,17 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
-    _, decision = _settled(record)
-    dear = decision.way == "potential"
+    rates, decision = _settled(record)
+    dear, seconds = decision.way == "potential", decision.seconds("train")
     options = TrainOptions(
         level=site.options.level if dear else None,
-        # A potential's budget covers all it does; others read frames before, and are tried out after.
-        budget_s=(1.0 if dear else _OPTIMISING) * decision.seconds("train"),
+        # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
+        budget_s=seconds if dear else max(_OPTIMISING * seconds - _BEFORE_STEPS_S * rates.stretch, 0.3 * seconds),
         seed=site.options.seed,
         resume=True,
         quiet=True,
     )
-    train(site.scene if dear else sorted((site.folder / "reference").glob("training*.h5")), out, options=options)
+    train(site.scene if dear else [site.folder / file for file in record.training], out, options=options)
     return _trained(site, record) or record
 
 

@@ -28,9 +28,9 @@ def clock(kept: list[float] | None = None, spent_s: float = 0.0) -> Clock:
 
 def test_a_stage_is_stopped_when_its_time_is_up() -> None:
     began = time.monotonic()
-    assert clock().work("md", lambda _: 0.3, until_asked).result is None
+    assert clock().work("md", lambda _: 0.3, until_asked) is None
     assert time.monotonic() - began >= 0.3
-    assert clock().work("md", lambda _: 60.0, lambda: "done").result == "done", "control"
+    assert clock().work("md", lambda _: 60.0, lambda: "done") == "done", "control"
 
 
 def test_time_of_earlier_sittings_counts() -> None:
@@ -76,4 +76,4 @@ def test_work_that_only_looks_now_and_then_is_stopped_too() -> None:
             stop_if_asked()
             time.sleep(0.01)
 
-    assert clock().work("bursts", lambda _: 0.2, loop).result is None
+    assert clock().work("bursts", lambda _: 0.2, loop) is None

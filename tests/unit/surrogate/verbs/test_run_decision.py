@@ -64,9 +64,12 @@ def test_md_in_lanes_is_a_rival_of_the_surrogate() -> None:
 
 @pytest.mark.parametrize("busy", [1.0, 2.0, 4.0])
 @pytest.mark.parametrize("foreseen", [1.0, 3.0])
-def test_md_ends_when_the_report_of_what_there_is_fits_into_the_rest(busy: float, foreseen: float) -> None:
+@pytest.mark.parametrize("alone", [1.0, 0.5])
+def test_md_ends_when_the_report_of_what_there_is_fits_into_the_rest(
+    busy: float, foreseen: float, alone: float
+) -> None:
     budget_s = 120.0
-    rates = replace(UNCOVERED, stretch=foreseen, md_ps_per_s=320.0 / foreseen)
+    rates = replace(UNCOVERED, stretch=foreseen, md_ps_per_s=320.0 / foreseen, alone=alone)
     found = decide(rates, budget_s)
     wall_s, may_s = 0.0, 1.0
     while wall_s < may_s:
@@ -125,7 +128,7 @@ def test_other_work_on_the_machine_leaves_fewer_bursts() -> None:
 
 
 def test_work_beside_us_stretches_time() -> None:
-    assert 1.0 <= measured_stretch(1, 0.05) <= 10.0
+    assert 1.0 <= measured_stretch(1, 0.05) <= 30.0
     assert measured_stretch(4 * available_cores(), 0.2) > 2.0, "four threads on each core"
 
 

@@ -68,6 +68,20 @@ def test_where_a_surrogate_fails_md_takes_the_rest(
     assert found["outcome"]["notes"] and "no frame through" in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
+def test_md_that_was_made_to_train_on_is_not_made_in_vain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("training diverged")
+
+    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="nothing"))
+    monkeypatch.setitem(stages.STAGES, "train", replace(stages.STAGES["train"], work=fail))
+    found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
+    ended = [(stage["name"], stage["status"]) for stage in found["stages"]]
+    assert ended == [("training md", "done"), ("train", "failed"), ("held-out md", "done"), ("report", "done")]
+    assert found["trajectory"] == found["training"] == ["reference/training_r0.h5", "reference/training_r1.h5"]
+    assert found["held_out"] == ["reference/held_out_r0.h5", "reference/held_out_r1.h5"]
+    assert "training diverged" in found["outcome"]["notes"][0]
+
+
 def test_molecules_are_a_list_a_folder_or_a_campaign(tmp_path: Path) -> None:
     (tmp_path / "m.smi").write_text("# drugs\nCCO ethanol\nCC(=O)O\n\n")
     found = molecules_in(tmp_path / "m.smi")
