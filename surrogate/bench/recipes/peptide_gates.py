@@ -42,6 +42,7 @@ from surrogate.bench.recipes.peptide_list import training_peptides
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
+from systems.units import parse_wall_s
 
 if TYPE_CHECKING:
     from surrogate.bench.recipes.peptide_scores import Scores
@@ -118,7 +119,7 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
     }
 
 
-def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
+def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, budget_s: float | None = None) -> None:
     """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
 
     Free energies of phi > 0 are those in the folder of `out`. Raises InputError when fewer pairs have runs.
@@ -137,7 +138,9 @@ def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int) -> None:
     if len(doubles) < n_pairs:
         raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
     sets = [collect_frames(files) for files in singles + doubles]
-    training = PeptideTraining(steps=steps, time_reversal=True, positive_phi_kt=known_energies(out.parent))
+    training = PeptideTraining(
+        steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent)
+    )
     train_peptides(sets, out, PeptideConfig(), training, resume=True)
 
 
@@ -273,7 +276,8 @@ def pairs_gate(a: argparse.Namespace) -> None:
     rows = []
     for n_pairs in a.pairs:
         out = a.folder / f"pairs-{n_pairs}.safetensors"
-        train_on_pairs(a.train, out, n_pairs, steps=a.steps)
+        budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
+        train_on_pairs(a.train, out, n_pairs, steps=a.steps if a.budget is None else None, budget_s=budget_s)
         weights = load_weights(out)
         for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
             runs = sorted(molecule.rglob("*.h5"))
@@ -381,6 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for gate in (code, pairs):
         gate.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
         gate.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
+    pairs.add_argument("--budget", help="wall time of a training, in place of steps")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")
