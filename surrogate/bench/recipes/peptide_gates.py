@@ -61,6 +61,7 @@ _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
 # Rollouts by which rare states are counted.
 _REPLICAS, _REPLICA_PS, _REPLICA_LAG_PS = 64, 200_000.0, 50.0
 _MARKOV_LAG_PS = 50.0
+_VALIDATE_S = 300.0
 
 
 def train(
@@ -139,8 +140,9 @@ def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, bu
         raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
     sets = [collect_frames(files) for files in singles + doubles]
     training = PeptideTraining(
-        steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent)
-    )
+        steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
+        validate_every_s=_VALIDATE_S,
+    )  # fmt: skip
     train_peptides(sets, out, PeptideConfig(), training, resume=True)
 
 

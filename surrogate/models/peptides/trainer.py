@@ -29,7 +29,8 @@ from systems.errors import InputError
 
 _MEASURED_FRAMES = 4000
 _MEASURED_PAIRS = 4000
-_HELD_WINDOWS = 128
+# Of one molecule; of many fewer of each, so that validation stays a small share of a training.
+_HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL = 128, 16, 1024
 # Flow times and noise of validation are the same each time.
 _HELD_SEED = 0
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
@@ -88,8 +89,9 @@ def train_peptides(
         "flow", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
         bf16=training.bf16, validate_every_s=training.validate_every_s,
     )  # fmt: skip
+    n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
     held = [
-        (name, subject, *subject.windows(_HELD_WINDOWS, config, torch.Generator().manual_seed(_HELD_SEED),
+        (name, subject, *subject.windows(n_held, config, torch.Generator().manual_seed(_HELD_SEED),
                                          validation=name == "validation"))
         for name, some in (("validation", subjects), ("unseen", held_out)) for subject in some
     ]  # fmt: skip
