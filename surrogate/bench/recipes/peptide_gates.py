@@ -6,10 +6,10 @@ joint phi/psi distance, beside MD from the same starts; and Chapman and Kolmogor
 one of 100 ps, beside two halves of MD. `--plain` trains without innovations, the ablation.
 
 `seeds`: another model of the same peptide, trained on short runs from many starts (`--runs`, a folder of
-`peptide_runs`), and the one of `lag` roll as long and as often as `--test` did: joint phi/psi distances, and the free
-energy of phi > 0 of many more and longer rollouts, how often they enter and leave that state, beside what the short
-runs and a Markov model of them say. How likely phi > 0 is, the records of `peptide_energies` or `free-energy` in FOLDER
-tell the training: short runs leave that state and never enter it.
+`peptide_runs`), and other `--weights` (that of `lag`) roll as long and as often as `--test` did: joint phi/psi
+distances, and the free energy of phi > 0 of many more and longer rollouts, how often they enter and leave that state,
+beside what the short runs and a Markov model of them say. How likely phi > 0 is, the records of `peptide_energies` or
+`free-energy` in FOLDER tell the training: short runs leave that state and never enter it.
 
 `code`: how far frames of the molecules below `--test`, coded by residues as in training and rebuilt, lie from
 themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numbers is that of the monomers in `--train`.
@@ -39,29 +39,30 @@ import numpy.typing as npt
 from surrogate.bench.lag_errors import Row, evenly_started, hold_against, joint_distance, table, torsions
 from surrogate.bench.recipes.peptide_energies import known_energies
 from surrogate.bench.recipes.peptide_list import training_peptides
+from surrogate.bench.recipes.peptide_pairs import pairs_gate
+from surrogate.bench.recipes.peptide_rollouts import (
+    FRAMES_PS,
+    REPLICA_LAG_PS,
+    REPLICA_PS,
+    REPLICAS,
+    frame_weights,
+    free_energy,
+    rolled,
+    thinned,
+)
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from systems.chemistry.validity import Geometry
-from systems.errors import InputError
-from systems.units import parse_wall_s
 
 if TYPE_CHECKING:
-    from surrogate.bench.recipes.peptide_scores import Scores
     from surrogate.data.frames import TrainingFrames
     from surrogate.data.weights import Weights
-    from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
 LAGS_PS = (1, 3, 10, 30, 100, 300, 1000)
 STEPS = 7300
 STARTS = 5000
-# Frames of rollouts and of MD are compared so far apart.
-FRAMES_PS = 10.0
 _KELVIN, _BIAS_FACTOR = 300.0, 8.0
 _SHORT_PS, _STEPS_OF_SHORT = 10.0, 10
-# Rollouts by which rare states are counted.
-_REPLICAS, _REPLICA_PS, _REPLICA_LAG_PS = 64, 200_000.0, 50.0
-_MARKOV_LAG_PS = 50.0
-_VALIDATE_S = 300.0
 
 
 def train(
@@ -120,95 +121,6 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
     }
 
 
-def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, budget_s: float | None = None) -> None:
-    """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
-
-    Free energies of phi > 0 are those in the folder of `out`. Raises InputError when fewer pairs have runs.
-    """
-    from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.trainer import is_trained
-    from surrogate.models.peptides.model import PeptideConfig
-    from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
-
-    if is_trained(out):
-        return
-    known = [p for p in training_peptides() if p.capped and len(p.residues) <= 2]
-    found = [(p, sorted((runs / p.name).glob("run_*.h5"))) for p in known]
-    singles = [files for p, files in found if files and len(p.residues) == 1]
-    doubles = [files for p, files in found if files and len(p.residues) == 2][:n_pairs]
-    if len(doubles) < n_pairs:
-        raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
-    sets = [collect_frames(files) for files in singles + doubles]
-    training = PeptideTraining(
-        steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
-        validate_every_s=_VALIDATE_S,
-    )  # fmt: skip
-    train_peptides(sets, out, PeptideConfig(), training, resume=True)
-
-
-def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
-    """Return the distances of one test molecule: MD's own, the model's, and those of the library of `monomers`.
-
-    The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
-    """
-    from surrogate.bench.recipes.peptide_scores import angles, floor, library, score, turns_of
-
-    scene, truth, time_ps = _thinned(runs)
-    turns = turns_of(scene)
-    rolled = _rolled(weights, scene, [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))], time_ps, FRAMES_PS)
-    truth, rolled = [angles(turns, x) for x in truth], [angles(turns, x) for x in rolled]
-    names = [name for name in scene.residue_names if name not in ("ACE", "NME")]
-    alone = [_thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
-    own = [turns_of(of) for of, _, _ in alone]
-    values = [[angles(t, run) for run in x] for t, (_, x, _) in zip(own, alone, strict=True)]
-    likely = [_weights(x) for x in values]
-    rng = np.random.default_rng(0)
-    drawn = [
-        library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
-    ]  # fmt: skip
-    return [floor(turns, truth), score(turns, truth, rolled, "model"), score(turns, truth, drawn, "library")]
-
-
-def _weights(runs: Sequence[FloatArray]) -> FloatArray:
-    """Return how likely each frame of seeded runs, torsions `(n_frames, n)` FRAMES_PS apart, is in equilibrium."""
-    from surrogate.data.equilibrium import equilibrium_weights
-
-    found = equilibrium_weights(
-        [np.concatenate([np.cos(x), np.sin(x)], axis=1) for x in runs], round(_MARKOV_LAG_PS / FRAMES_PS)
-    )
-    n = sum(len(x) for x in runs)
-    return np.full(n, 1.0 / n) if found is None else found / found.sum()
-
-
-def _rolled(
-    weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float
-) -> list[FloatArray]:  # fmt: skip
-    """Return the frames of unguarded rollouts; those that are there are read."""
-    from surrogate.sampling.runner import RolloutConfig, rollout
-
-    if not all(out.exists() for out in outs):
-        outs[0].parent.mkdir(parents=True, exist_ok=True)
-        rollout(
-            scene, weights, outs, RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=1, guard="off"), overwrite=True
-        )
-    return [_thinned([out], lag_ps)[1][0] for out in outs]
-
-
-def _thinned(paths: Sequence[Path], apart_ps: float = FRAMES_PS) -> tuple[Scene, list[FloatArray], float]:
-    """Return the scene, the frames `apart_ps` apart of each file, and the time that the first one spans."""
-    from systems.trajectory.codec import open_trajectory
-
-    frames = []
-    for path in paths:
-        with open_trajectory(path) as reader:
-            every = max(1, round(apart_ps / float(reader.time_ps[1] - reader.time_ps[0])))
-            frames.append(reader.read(every - 1, None, every).astype(np.float64))
-            scene = reader.scene
-    if scene is None:
-        raise InputError(f"{paths[-1]} does not say what molecule it is of.")
-    return scene, frames, len(frames[0]) * apart_ps
-
-
 def lag_gate(a: argparse.Namespace) -> None:
     """Train on one peptide, measure each lag and Chapman and Kolmogorov's test, print and keep the table."""
     from surrogate.data.frames import collect_frames
@@ -229,67 +141,37 @@ def lag_gate(a: argparse.Namespace) -> None:
 
 
 def seeds_gate(a: argparse.Namespace) -> None:
-    """Train on seeded runs, roll both models, print and keep distances and free energies."""
+    """Train on seeded runs, roll this model and the others, print and keep distances and free energies."""
     from surrogate.bench.recipes.peptide_scores import crossings
     from surrogate.data.weights import load_weights
 
-    runs = sorted(a.runs.glob("run_*.h5"))
-    train(
-        runs, a.folder / "seeds.safetensors", steps=a.steps, innovation=True, positive_phi_kt=known_energies(a.folder)
-    )  # fmt: skip
-    scene, truth, time_ps = _thinned(a.test)
+    models = {path.stem: path for path in a.weights}
+    runs = [] if a.runs is None else sorted(a.runs.glob("run_*.h5"))
+    if runs:
+        models["seeds"] = a.folder / "seeds.safetensors"
+        train(runs, models["seeds"], steps=a.steps, innovation=True, positive_phi_kt=known_energies(a.folder))
+    scene, truth, time_ps = thinned(a.test)
     angles = [torsions(scene, x) for x in truth]
     md = crossings([x[:, 0] for x in angles], FRAMES_PS)
-    record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)], **md}}
-    for name in ("lag", "seeds"):
-        weights, folder = load_weights(a.folder / f"{name}.safetensors"), a.folder / f"{name}-rollouts"
-        same = _rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(truth))], time_ps, FRAMES_PS)
+    record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)],
+                                     **free_energy([float((x[:, 0] > 0).mean()) for x in angles]), **md}}  # fmt: skip
+    for name, path in models.items():
+        weights, folder = load_weights(path), a.folder / f"{name}-rollouts"
+        same = rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(truth))], time_ps)
         found = [joint_distance(torsions(scene, x), y) for x in same for y in angles]
-        many = [folder / f"long_{k:02d}.h5" for k in range(_REPLICAS)]
-        long = _rolled(weights, scene, many, _REPLICA_PS, _REPLICA_LAG_PS)
-        phi = [torsions(scene, x)[:, 0] for x in long]
-        record[name] = {"distance": found, **_free_energy([float((x > 0).mean()) for x in phi]),
-                        **crossings(phi, _REPLICA_LAG_PS)}  # fmt: skip
-    _, short, _ = _thinned(runs)
-    both = [torsions(scene, x) for x in short]
-    share = float(_weights(both)[np.concatenate(both)[:, 0] > 0].sum())
-    record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None,
-                              **crossings([x[:, 0] for x in both], FRAMES_PS)}  # fmt: skip
+        many = [folder / f"long_{k:02d}.h5" for k in range(REPLICAS)]
+        phi = [torsions(scene, x)[:, 0] for x in rolled(weights, scene, many, REPLICA_PS, REPLICA_LAG_PS)]
+        record[name] = {"distance": found, **free_energy([float((x > 0).mean()) for x in phi]),
+                        **crossings(phi, REPLICA_LAG_PS)}  # fmt: skip
+    if runs:
+        _, short, _ = thinned(runs)
+        both = [torsions(scene, x) for x in short]
+        share = float(frame_weights(both)[np.concatenate(both)[:, 0] > 0].sum())
+        record["Markov model"] = {"free_energy_kt": float(np.log((1 - share) / share)) if share > 0 else None,
+                                  **crossings([x[:, 0] for x in both], FRAMES_PS)}  # fmt: skip
     (a.folder / "seeds.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(json.dumps({k: {x: np.round(y, 3).tolist() for x, y in v.items() if y is not None}
                                  for k, v in record.items()}, indent=1) + "\n")  # fmt: skip
-
-
-def _free_energy(shares: Sequence[float]) -> dict[str, float | None]:
-    """Return the free energy in kT of a state that runs spend `shares` of their time in, and its standard error; None
-    where it was never seen, or nothing else."""
-    p = float(np.mean(shares))
-    if not 0 < p < 1:
-        return {"free_energy_kt": None, "error_kt": None}
-    # of ln((1 - p) / p), by the scatter of p over runs
-    error = float(np.std(shares, ddof=1) / len(shares) ** 0.5 / (p * (1 - p)))
-    return {"free_energy_kt": float(np.log((1 - p) / p)), "error_kt": error}
-
-
-def pairs_gate(a: argparse.Namespace) -> None:
-    """Train on each number of pairs, roll every test molecule, print and keep the table."""
-    from surrogate.data.weights import load_weights
-
-    rows = []
-    for n_pairs in a.pairs:
-        out = a.folder / f"pairs-{n_pairs}.safetensors"
-        budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
-        train_on_pairs(a.train, out, n_pairs, steps=a.steps if a.budget is None else None, budget_s=budget_s)
-        weights = load_weights(out)
-        for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
-            runs = sorted(molecule.rglob("*.h5"))
-            if len(runs) < 2:
-                continue
-            for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name):
-                rows.append({"pairs": n_pairs, "molecule": molecule.name, **asdict(scores)})
-            sys.stderr.write(f"{n_pairs} pairs: {molecule.name} measured\n")
-    (a.folder / "pairs.json").write_text(json.dumps(rows, indent=1))
-    sys.stdout.write(pairs_table(rows) + "\n")
 
 
 def code_gate(a: argparse.Namespace) -> None:
@@ -306,7 +188,7 @@ def code_gate(a: argparse.Namespace) -> None:
     for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
         runs = sorted(molecule.rglob("*.h5"))
         if runs:
-            scene, frames, _ = _thinned(runs[:1])
+            scene, frames, _ = thinned(runs[:1])
             record[molecule.name] = rebuilt(scene, frames[0], config)
     (a.folder / "code.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(json.dumps(record, indent=1) + "\n")
@@ -335,7 +217,7 @@ def free_energy_gate(a: argparse.Namespace) -> None:
             phi = torsions(scene, reader.read(stride=10).astype(np.float64))[:, 0]
             shares.append(float((phi > 0).mean()))
     if shares:
-        record["md"] = _free_energy(shares)
+        record["md"] = free_energy(shares)
     (a.folder / f"{a.sequence}-free-energy.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(json.dumps(record, indent=1) + "\n")
 
@@ -351,23 +233,6 @@ def positive_phi_kt(free_kj_mol: FloatArray, temperature_k: float = _KELVIN) -> 
     return float(-np.log(positive / (float(weights.sum()) - positive)))
 
 
-def pairs_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the rows as Markdown, distances as multiples of MD's own."""
-    lines = [
-        "| pairs | molecule | source | torsions | over floor | joint maps | over floor |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    least: dict[str, Any] = {}
-    for row in rows:
-        least = row if row["source"] == "MD" else least
-        lines.append(
-            f"| {row['pairs']} | {row['molecule']} | {row['source']} "
-            f"| {row['single']:.3f} ± {row['single_error']:.3f} | {row['single'] / least['single']:.2f} "
-            f"| {row['joint']:.3f} ± {row['joint_error']:.3f} | {row['joint'] / least['joint']:.2f} |"
-        )
-    return "\n".join(lines)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -381,7 +246,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     lag.add_argument("--train", type=Path, nargs="+", required=True, help="references of one peptide")
     for gate in (lag, seeds):
         gate.add_argument("--test", type=Path, nargs="+", required=True, help="references that training does not see")
-    seeds.add_argument("--runs", type=Path, required=True, help="folder of short runs of the same peptide")
+    seeds.add_argument("--runs", type=Path, help="folder of short runs of the same peptide; without, none is trained")
+    seeds.add_argument("--weights", type=Path, nargs="*", default=(), help="other models to roll beside it")
     lag.add_argument("--starts", type=int, default=STARTS, help="frames that each lag is started from")
     lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
     for gate in (code, pairs):

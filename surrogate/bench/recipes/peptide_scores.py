@@ -45,13 +45,15 @@ class Turn:
 @dataclass(frozen=True)
 class Scores:
     """Distances of one source to MD of a peptide, with the standard error over its runs: mean over single torsions, and
-    over joint maps of psi and the next residue's phi (NaN for a monomer)."""
+    over joint maps of psi and the next residue's phi (NaN for a monomer). `valid`: the share of its frames without
+    broken bonds, angles or clashes (NaN of what has no frames)."""
 
     source: str
     single: float
     single_error: float
     joint: float
     joint_error: float
+    valid: float = float("nan")
 
 
 def turns_of(scene: Scene) -> list[Turn]:

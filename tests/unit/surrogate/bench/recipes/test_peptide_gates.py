@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.bench.recipes import peptide_gates
+from surrogate.bench.recipes.peptide_rollouts import free_energy
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_writer
@@ -60,13 +61,15 @@ def test_the_lag_gate_trains_measures_and_keeps_its_table(
 def test_the_seeds_gate_sets_both_models_beside_md(
     reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, value in (("_REPLICAS", 2), ("_REPLICA_PS", 500.0)):
+    for name, value in (("REPLICAS", 2), ("REPLICA_PS", 500.0)):
         monkeypatch.setattr(peptide_gates, name, value)
     peptide_gates.train([reference], tmp_path / "lag.safetensors", steps=2, innovation=True)
     runs = tmp_path / "ALA"
     runs.mkdir()
     (runs / "run_000.h5").symlink_to(reference)
-    arguments = ["seeds", str(tmp_path), "--runs", str(runs), "--test", str(reference), str(reference), "--steps", "2"]
+    lag = tmp_path / "lag.safetensors"
+    arguments = ["seeds", str(tmp_path), "--runs", str(runs), "--weights", str(lag)]
+    arguments += ["--test", str(reference), str(reference), "--steps", "2"]
     peptide_gates.main(arguments)
     record = json.loads((tmp_path / "seeds.json").read_text())
     assert record["MD"]["distance"] == [0.0], "the same run twice"
@@ -76,10 +79,10 @@ def test_the_seeds_gate_sets_both_models_beside_md(
 
 
 def test_a_free_energy_is_that_of_the_mean_share() -> None:
-    found = peptide_gates._free_energy([0.1, 0.2, 0.3])
+    found = free_energy([0.1, 0.2, 0.3])
     assert found["free_energy_kt"] == pytest.approx(np.log(4))
     assert found["error_kt"] == pytest.approx(0.1 / 3**0.5 / 0.16)
-    assert peptide_gates._free_energy([0.0, 0.0]) == {"free_energy_kt": None, "error_kt": None}
+    assert free_energy([0.0, 0.0]) == {"free_energy_kt": None, "error_kt": None}
 
 
 def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_library(
@@ -108,6 +111,7 @@ def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_l
     assert [r["source"] for r in rows] == ["MD", "model", "library"]
     least, model, library = (r["single"] for r in rows)
     assert 0 < least < min(model, library) and max(model, library) < 0.83
+    assert rows[0]["valid"] == 1.0 and 0.0 <= rows[1]["valid"] <= 1.0 and np.isnan(rows[2]["valid"])
     assert "| 1 | unseen | MD |" in capsys.readouterr().out
 
 

@@ -1,0 +1,124 @@
+"""What training on pairs teaches of pairs that were never seen: the gate `pairs` of `peptide_gates`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surrogate.bench.recipes.peptide_energies import known_energies
+from surrogate.bench.recipes.peptide_list import training_peptides
+from surrogate.bench.recipes.peptide_rollouts import FRAMES_PS, frame_weights, rolled, thinned
+from systems.chemistry.validity import INVALID, Geometry, check_frames
+from systems.errors import InputError
+from systems.units import parse_wall_s
+
+if TYPE_CHECKING:
+    from surrogate.bench.recipes.peptide_scores import Scores
+    from surrogate.data.weights import Weights
+
+_VALIDATE_S = 300.0
+
+
+def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, budget_s: float | None = None) -> None:
+    """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
+
+    Free energies of phi > 0 are those in the folder of `out`. Raises InputError when fewer pairs have runs.
+    """
+    from surrogate.data.frames import collect_frames
+    from surrogate.models.lam_slide.trainer import is_trained
+    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
+
+    if is_trained(out):
+        return
+    known = [p for p in training_peptides() if p.capped and len(p.residues) <= 2]
+    found = [(p, sorted((runs / p.name).glob("run_*.h5"))) for p in known]
+    singles = [files for p, files in found if files and len(p.residues) == 1]
+    doubles = [files for p, files in found if files and len(p.residues) == 2][:n_pairs]
+    if len(doubles) < n_pairs:
+        raise InputError(f"{runs} holds runs of {len(doubles)} pairs, {n_pairs} are asked for; simulate more first.")
+    sets = [collect_frames(files) for files in singles + doubles]
+    training = PeptideTraining(
+        steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
+        validate_every_s=_VALIDATE_S,
+    )  # fmt: skip
+    train_peptides(sets, out, PeptideConfig(), training, resume=True)
+
+
+def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
+    """Return the distances of one test molecule: MD's own, the model's, and those of the library of `monomers`.
+
+    The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
+    """
+    from surrogate.bench.recipes.peptide_scores import angles, floor, library, score, turns_of
+    from surrogate.sampling.domain import fit_weights
+
+    scene, truth, time_ps = thinned(runs)
+    turns = turns_of(scene)
+    model = rolled(weights, scene, [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))], time_ps)
+    fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS)
+    geometry = Geometry.from_dict(fitted.domain.geometry)
+    valid = [
+        float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some])) for some in (truth, model)
+    ]
+    truth, model = ([angles(turns, x) for x in some] for some in (truth, model))
+    names = [name for name in scene.residue_names if name not in ("ACE", "NME")]
+    alone = [thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
+    own = [turns_of(of) for of, _, _ in alone]
+    values = [[angles(t, run) for run in x] for t, (_, x, _) in zip(own, alone, strict=True)]
+    likely = [frame_weights(x) for x in values]
+    rng = np.random.default_rng(0)
+    drawn = [
+        library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
+    ]  # fmt: skip
+    return [
+        replace(floor(turns, truth), valid=valid[0]),
+        replace(score(turns, truth, model, "model"), valid=valid[1]),
+        score(turns, truth, drawn, "library"),
+    ]
+
+
+def pairs_gate(a: argparse.Namespace) -> None:
+    """Train on each number of pairs, roll every test molecule, print and keep the table."""
+    from surrogate.data.weights import load_weights
+
+    rows = []
+    for n_pairs in a.pairs:
+        out = a.folder / f"pairs-{n_pairs}.safetensors"
+        budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
+        train_on_pairs(a.train, out, n_pairs, steps=a.steps if a.budget is None else None, budget_s=budget_s)
+        weights = load_weights(out)
+        for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
+            runs = sorted(path for path in molecule.rglob("*.h5") if not path.name.startswith("."))
+            if len(runs) < 2:
+                continue
+            for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name):
+                rows.append({"pairs": n_pairs, "molecule": molecule.name, **asdict(scores)})
+            sys.stderr.write(f"{n_pairs} pairs: {molecule.name} measured\n")
+    (a.folder / "pairs.json").write_text(json.dumps(rows, indent=1))
+    sys.stdout.write(pairs_table(rows) + "\n")
+
+
+def pairs_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the rows as Markdown, distances as multiples of MD's own."""
+    lines = [
+        "| pairs | molecule | source | torsions | over floor | joint maps | over floor | valid, % |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    least: dict[str, Any] = {}
+    for row in rows:
+        least = row if row["source"] == "MD" else least
+        lines.append(
+            f"| {row['pairs']} | {row['molecule']} | {row['source']} "
+            f"| {row['single']:.3f} ± {row['single_error']:.3f} | {row['single'] / least['single']:.2f} "
+            f"| {row['joint']:.3f} ± {row['joint_error']:.3f} | {row['joint'] / least['joint']:.2f} "
+            f"| {100 * row['valid']:.2f} |"
+        )
+    return "\n".join(lines)
