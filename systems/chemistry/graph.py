@@ -82,7 +82,8 @@ def backbone_torsions(scene: Scene) -> dict[str, IntArray]:
     """Return the peptide torsions `phi`, `psi`, `omega`, each `(k, 4)`, ordered along the chain.
 
     Found from the graph: C(=O)-N-CA-C(=O) and N-CA-C(=O)-N, with omega (X, C, N, Y) about every C(=O)-N bond between
-    carbons X and Y (caps included). Names and residues play no part; scenes without peptides give empty arrays.
+    carbons X and Y (caps included). CA has no multiple bond in a ring: caffeine and picolinamide are no peptides. Names
+    and residues play no part; scenes without peptides give empty arrays.
     """
     graph = element_graph(scene.elements, scene.bonds)
     symbol = scene.elements
@@ -93,12 +94,15 @@ def backbone_torsions(scene: Scene) -> dict[str, IntArray]:
     def is_carbonyl(i: int) -> bool:
         return symbol[i] == "C" and graph.degree(i) == 3 and any(graph.degree(o) == 1 for o in near(i, "O"))
 
+    ring = {frozenset(pair) for pair in ring_bonds(scene).tolist()}
+    orders = zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True)
+    aromatic = {i for pair, order in orders if order > 1.0 and frozenset(pair) in ring for i in pair}
     carbonyls = [i for i in range(scene.n_atoms) if is_carbonyl(i)]
     amides = {c: [n for n in near(c, "N") if near(n, "C") != [c]] for c in carbonyls}
     units: list[tuple[int, int, int]] = []  # (N, CA, C) of each residue
     for c in carbonyls:
         for alpha in near(c, "C"):
-            if alpha not in carbonyls:
+            if alpha not in carbonyls and alpha not in aromatic:
                 units.extend((n, alpha, c) for n in near(alpha, "N"))
     joined = {n: c for c, nitrogens in amides.items() for n in nitrogens}
     units = [u for u in _along_chain(units, joined) if u[0] in joined or amides[u[2]]]

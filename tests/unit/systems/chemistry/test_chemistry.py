@@ -245,6 +245,17 @@ def test_molecules_without_peptides_have_no_backbone(from_smiles: MAKE) -> None:
         assert all(len(rows) == 0 for rows in backbone_torsions(from_smiles(smiles)).values())
 
 
+def test_flat_rings_are_no_residues(from_smiles: MAKE) -> None:
+    n_psi = {
+        "Cn1cnc2c1c(=O)n(C)c(=O)n2C": 0,
+        "NC(=O)c1ccccn1": 0,
+        "O=C1CNC(=O)CN1": 2,  # a ring of two glycines
+        "CC(=O)NC(=C)C(=O)NC": 1,  # dehydroalanine
+    }
+    for smiles, n in n_psi.items():
+        assert len(backbone_torsions(from_smiles(smiles))["psi"]) == n, smiles
+
+
 def test_exclusions_are_the_short_paths() -> None:
     graph = bonded_graph(ALA2)
     lengths = dict(nx.all_pairs_shortest_path_length(graph))
