@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
     from systems.scene import Scene
 
+T = TypeVar("T")
 LOG_NAME = "log.txt"
 # Without these there is nothing to judge; a run that lost them to a fault of the surrogate goes on by MD.
 _OF_SURROGATE = ("train", "rollout")
@@ -54,9 +55,9 @@ _GOES_ON = "the same again with `resume=True` goes on"
 
 def plan_scene(scene: str | Path | Scene, options: RunOptions) -> RunRecord:
     """Return what a run of a scene would be: rates, measured now, and the decision. Nothing is written."""
-    molecule, config = _settled(scene, options)
+    molecule, config = _prepared(scene, options)
     record = _new_record(scene, molecule, options)
-    return _decided(record, molecule, config, options, lambda: 0.0)
+    return _decide(record, molecule, config, options, lambda: 0.0)
 
 
 def run_scene(
@@ -72,10 +73,7 @@ def run_scene(
         with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
             kept = _Kept(folder, before)
             clock = Clock(options.budget_s, before.spent_s if before else 0.0, kept.beat, advance)
-            settled = clock.work("preparing", lambda _: options.budget_s, lambda: _settled(scene, options))
-            if settled is None:
-                raise InputError("the budget is spent before the scene is prepared; give more `budget_s`.")
-            molecule, config = settled
+            molecule, config = _before_stages(clock, "preparing", lambda: _prepared(scene, options))
             if before is None:
                 record = _new_record(scene, molecule, options)
             else:
@@ -83,7 +81,10 @@ def run_scene(
                 record = _taken_up(before, options)
             kept.keep(record, clock.spent_s)
             if record.decision is None:
-                record = _decide(record, molecule, config, options, clock)
+                new = record
+                record = _before_stages(
+                    clock, "measuring", lambda: _decide(new, molecule, config, options, lambda: clock.spent_s)
+                )
             tell_decision(record)
             kept.keep(record, clock.spent_s)
             return _Run(Site(folder, molecule, config, options), kept, clock).to_the_end()
@@ -238,19 +239,15 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
 
 
-def _decide(record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, clock: Clock) -> RunRecord:
-    """Measure and decide, on the clock."""
-
-    def work() -> RunRecord:
-        return _decided(record, scene, config, options, lambda: clock.spent_s)
-
-    found = clock.work("measuring", lambda _: options.budget_s, work)
+def _before_stages(clock: Clock, doing: str, work: Callable[[], T]) -> T:
+    """Return what comes of work that is done before there are stages. Raises InputError where the budget ends first."""
+    found = clock.work(doing, lambda _: clock.budget_s, work)
     if found is None:
-        raise InputError("the budget is spent before the scene is measured; give more `budget_s`.")
+        raise InputError(f"the budget is spent while {doing}; give more `budget_s`.")
     return found
 
 
-def _decided(
+def _decide(
     record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, spent_s: Callable[[], float]
 ) -> RunRecord:
     """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known."""
@@ -260,7 +257,7 @@ def _decided(
     return replace(record, rates=rates, decision=decision, weights=weights)
 
 
-def _settled(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MDConfig]:
+def _prepared(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MDConfig]:
     """Return the scene and the settings of its MD."""
     molecule = prepare_scene(scene, options, quiet=options.quiet)
     return settle_run(molecule, md_options(options), {"time_ps": 0.0}, quiet=options.quiet)[:2]

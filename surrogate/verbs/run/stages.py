@@ -58,7 +58,7 @@ class StageOf:
     may_fail: bool = False
 
 
-def _settled(record: RunRecord) -> tuple[Rates, Decision]:
+def _rates_and_decision(record: RunRecord) -> tuple[Rates, Decision]:
     assert record.rates is not None and record.decision is not None
     return record.rates, record.decision
 
@@ -70,7 +70,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         return site.folder / f"{place}.{site.options.format if name == 'md' else 'h5'}"
 
     def work(site: Site, record: RunRecord) -> RunRecord:
-        rates, decision = _settled(record)
+        rates, decision = _rates_and_decision(record)
         every_ps = decision.save_every_ps
         expected_ps = md_ps(rates, decision, name) / rates.replicas
         out(site).parent.mkdir(exist_ok=True)
@@ -96,7 +96,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     def found(site: Site, record: RunRecord) -> RunRecord | None:
         from systems.trajectory.claim import replica_paths
 
-        replicas = _settled(record)[0].replicas
+        replicas = _rates_and_decision(record)[0].replicas
         files = _with_frames(site.folder, replica_paths(out(site), replicas))
         if not files:
             return None
@@ -124,7 +124,7 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
-    rates, decision = _settled(record)
+    rates, decision = _rates_and_decision(record)
     dear, seconds = decision.way == "potential", decision.seconds("train")
     options = TrainOptions(
         level=site.options.level if dear else None,
@@ -145,7 +145,7 @@ def _trained(site: Site, record: RunRecord) -> RunRecord | None:
     out = site.folder / WEIGHTS_NAME
     if not out.exists():
         return None
-    rates, _ = _settled(record)
+    rates, _ = _rates_and_decision(record)
     rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
 
@@ -157,7 +157,7 @@ def _rolled_paths(site: Site) -> list[Path]:
 
 
 def _roll(site: Site, record: RunRecord) -> RunRecord:
-    rates, decision = _settled(record)
+    rates, decision = _rates_and_decision(record)
     assert rates.rolls is not None
     every_ps = rates.rolls.lag_ps * math.ceil(decision.save_every_ps / rates.rolls.lag_ps - 1e-6)
     expected_ps = decision.seconds("rollout") * rates.rolls.ps_per_s / REPLICAS
@@ -187,7 +187,7 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 def _burst(site: Site, record: RunRecord) -> RunRecord:
-    _, decision = _settled(record)
+    _, decision = _rates_and_decision(record)
     options = BurstOptions(n_bursts=decision.n_bursts, burst_ps=decision.burst_ps, seed=site.options.seed, quiet=True)
     check = bursts([site.folder / file for file in record.trajectory], options=options)
     text = json.dumps(check.to_dict(), indent=1, default=str)
@@ -198,7 +198,7 @@ def _burst(site: Site, record: RunRecord) -> RunRecord:
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.judge.report.report import Foreword, write_report
 
-    rates, decision = _settled(record)
+    rates, decision = _rates_and_decision(record)
     if not record.held_out or not record.trajectory:
         lacking = "the trajectory" if record.held_out else "MD to judge it by"
         raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
