@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
 _AMPLE = 2.0
 _LEAST_FRAMES = 20
-# Of a training's time what may go into steps, and processor seconds before the first: frames are read, programs loaded.
-_OPTIMISING, _BEFORE_STEPS_S = 0.95, 8.0
+# Of a training's time what may go into steps, and processor seconds that do not: frames are read, encoded, programs
+# loaded.
+_OPTIMISING, _BESIDE_STEPS_S = 0.95, 20.0
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
 WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
@@ -129,7 +130,7 @@ def _train(site: Site, record: RunRecord) -> RunRecord:
     options = TrainOptions(
         level=site.options.level if dear else None,
         # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
-        budget_s=seconds if dear else max(_OPTIMISING * seconds - _BEFORE_STEPS_S * rates.stretch, 0.3 * seconds),
+        budget_s=seconds if dear else max(_OPTIMISING * seconds - _BESIDE_STEPS_S * rates.stretch, 0.3 * seconds),
         seed=site.options.seed,
         resume=True,
         quiet=True,
