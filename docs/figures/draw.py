@@ -22,7 +22,7 @@ HERE = Path(__file__).resolve().parent
 TABLE = HERE.parent / "results" / "tables" / "effective_samples.json"
 CAUSES = TABLE.with_name("n_body_causes.json")
 KT_KJ_PER_MOL = 2.494
-# of the best polynomial on the 200 held-out trajectories of the study (docs/studies/surrogates/n_body_causes.py)
+# of the best polynomial on the 200 held-out trajectories of the study (docs/studies/n_body/n_body_causes.py)
 POLYNOMIAL_ADE = 0.503
 
 
@@ -61,15 +61,19 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
 
 
 def draw_n_body(table: dict[str, Any], out: Path) -> None:
-    """Draw the error of samples on held-out charged particles against steps, of lines that differ in one thing."""
-    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    colours = plt.get_cmap("tab20")
-    for k, (name, curve) in enumerate(table["curves"].items()):
-        steps, ades = np.array([point[:2] for point in curve]).T
-        axes.plot(steps, ades, "--" if name.startswith("set") else "-", marker=".", lw=1, color=colours(k), label=name)
-    axes.axhline(POLYNOMIAL_ADE, color="black", lw=0.8, ls=":", label="the polynomial alone")
-    axes.set(xlabel="steps of 64 windows", ylabel="ADE of samples", ylim=(0, 0.9))
-    axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    """Draw the error of samples on held-out charged particles against steps, of lines that differ in one thing: above
+    those of large batches, below those of small ones."""
+    figure, both = plt.subplots(2, 1, figsize=(7.6, 6.8), sharex=True, sharey=True, layout="constrained")
+    colours, few = plt.get_cmap("tab20"), "16 windows, "
+    for axes, start, batch in zip(both, ("", few), (64, 16), strict=True):
+        curves = {name: c for name, c in table["curves"].items() if name.startswith(few) == bool(start)}
+        for k, (name, curve) in enumerate(curves.items()):
+            steps, ades = np.array([point[:2] for point in curve]).T
+            style = "-" if "particles: " in name else "--"
+            axes.plot(steps, ades, style, marker=".", lw=1, color=colours(k), label=name.removeprefix(start))
+        axes.axhline(POLYNOMIAL_ADE, color="black", lw=0.8, ls=":", label="the polynomial alone")
+        axes.set(xlabel=f"steps of {batch} windows", ylabel="ADE of samples", ylim=(0, 0.9))
+        axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(out, metadata={"Date": None})
     plt.close(figure)
 

@@ -241,7 +241,7 @@ def sampled(
     for _ in range(n_samples):
         noise = torch.randn((len(known), *model.noise_shape(n)), generator=generator).to(known.device)
         latents = solve(predict, noise, settings.solver_steps, "linear")
-        samples.append(model.decode(latents[:, N_GIVEN:], n).double().cpu().numpy())
+        samples.append(model.decode(latents[:, known.shape[1] :], n).double().cpu().numpy())
     return np.stack(samples)
 
 

@@ -19,7 +19,8 @@ from surrogate.bench.reproduce.forecast_methods import (
     n_parameters,
     sampled,
 )
-from surrogate.bench.reproduce.md17_views import Array, BodyFrame, LinearForecast, MoleculeView
+from surrogate.bench.reproduce.md17_views import ELEMENTS, Array, AtomView, BodyFrame, LinearForecast, MoleculeView
+from surrogate.bench.reproduce.n_body_views import motion_sizes
 from surrogate.data.molecule_windows import MoleculeWindows
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from surrogate.models.lam_slide.model import LamSlide
 
-_ELEMENTS = (1, 6, 7, 8)
 _HELD = 32
 _BLOCK = 250
 
@@ -77,7 +77,7 @@ def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[Mol
 
     training = settings.training("egnn")
     model = EgnnJump(
-        EgnnJumpConfig(n_types=len(_ELEMENTS), n_new=N_NEW, lag_ps=molecules[0].lag_ps, from_velocity=False)
+        EgnnJumpConfig(n_types=len(ELEMENTS), n_new=N_NEW, lag_ps=molecules[0].lag_ps, from_velocity=False)
     )
 
     def jump(m: MoleculeWindows, given: Array, truth: Array) -> Jump:
@@ -86,7 +86,7 @@ def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[Mol
         # Lengths in units of a bond's: 0.1 nm.
         x, v = 10.0 * (last - centre), 10.0 * (last - given[:, -2]) / m.lag_ps
         ahead = 10.0 * (truth - (centre if truth.ndim == 3 else centre[:, None]))
-        types = torch.tensor([_ELEMENTS.index(e) for e in m.elements.tolist()]).expand(len(given), -1)
+        types = torch.tensor([ELEMENTS.index(e) for e in m.elements.tolist()]).expand(len(given), -1)
         kinds = torch.from_numpy(m.kinds).expand(len(given), -1, -1)
         state = [torch.from_numpy(a).float() for a in (x, v, ahead)]
         return Jump(state[0], state[1], types, kinds, state[2])
@@ -167,6 +167,54 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
     )
 
 
+def lam_slide_particles(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[MoleculeWindows]:
+    """LaM-SLidE with atoms as their own latents, all that one will do in one token; one model for all molecules, told
+    of elements and bonds, in the body frame."""
+    import torch
+
+    from surrogate.models.particles.flow_trainer import ParticleWindows, sample_ahead, train_particle_flow
+    from surrogate.models.particles.particle_flow import ParticleFlow, ParticleFlowConfig
+
+    training = settings.training("lam-slide-particles")
+    held = _held(molecules)
+    # Lengths in units of a bond's: 0.1 nm.
+    motions = [motion_sizes(BodyFrame.of(m, w).enter(w)[:, :N_GIVEN]) for m, w in held]
+    sizes_nm = (0.1, *(sum(size) / len(size) for size in list(zip(*motions, strict=True))[1:]))
+    views = {
+        m.name: AtomView(
+            MoleculeView.of(m, canonical=True, linear=LinearForecast.fit(m) if settings.extrapolate else None), sizes_nm
+        )
+        for m in molecules
+    }
+
+    def draw(batch: int, generator: torch.Generator) -> ParticleWindows:
+        m = molecules[int(torch.randint(len(molecules), (1,), generator=generator))]
+        return views[m.name].to_model(_drawn(m, batch, generator, any_start=settings.any_start))
+
+    seen = [views[m.name].to_model(windows) for m, windows in held]
+    config = ParticleFlowConfig(
+        seen[0].given.features.shape[-1],
+        n_types=len(ELEMENTS),
+        n_pair_kinds=3,
+        n_new=N_NEW,
+        pair_messages=settings.pair_messages,
+    )
+    model = ParticleFlow(config)
+    seconds = train_particle_flow(model, draw, seen, training)
+    model.eval()
+
+    def forecast(m: MoleculeWindows, given: Array, n_samples: int) -> Array:
+        view, generator = views[m.name], torch.Generator().manual_seed(settings.seed)
+        known = view.known(given).to(torch.device(settings.device))
+        samples = [sample_ahead(model, known, settings.solver_steps, generator) for _ in range(n_samples)]
+        return np.stack([view.from_model(given, x.double().cpu().numpy()) for x in samples])
+
+    more = beyond({"atoms are latents": True, "body frame": True, "corrects the linear forecast": settings.extrapolate,
+                   "any start": settings.any_start, "messages along pairs": settings.pair_messages})  # fmt: skip
+    note = f"ten frames, elements, bonds, {settings.solver_steps} Euler steps{more}"
+    return Fitted(forecast, note, seconds, n_parameters(model))
+
+
 def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
     """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
     from surrogate.models.lam_slide.config import AutoencoderConfig
@@ -202,4 +250,5 @@ METHODS: Mapping[str, Callable[[Sequence[MoleculeWindows], Settings], Fitted[Mol
     "linear": linear,
     "egnn": egnn,
     "lam-slide": lam_slide,
+    "lam-slide-particles": lam_slide_particles,
 }

@@ -1,17 +1,24 @@
-"""Views of windows for forecasters of molecules: the body frame, the best linear forecast, and LaM-SLidE's input."""
+"""Views of windows for forecasters of molecules: the body frame, the best linear forecast, and LaM-SLidE's inputs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW
+from surrogate.bench.reproduce.n_body_views import motion_features
 from surrogate.data.molecule_windows import MoleculeWindows
 from systems.chemistry.geometry import superposition
 
+if TYPE_CHECKING:
+    from surrogate.models.particles.flow_trainer import ParticleWindows
+    from surrogate.models.particles.particle_flow import Given
+
 Array = npt.NDArray[np.float64]
+ELEMENTS = (1, 6, 7, 8)
 # Ridge penalties that are tried, as shares of the mean variance of a given coordinate.
 _PENALTIES = (1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 _BLOCK = 2000
@@ -148,3 +155,36 @@ class MoleculeView:
 
     def _base(self, given: Array, frame: BodyFrame) -> Array | float:
         return 0.0 if self.linear is None else frame.enter(self.linear.forecast(self.molecule, given))
+
+
+@dataclass(frozen=True, eq=False)
+class AtomView:
+    """How LaM-SLidE sees what each atom does: frames to predict as `window` does, which is canonical; of the given ones
+    in the body frame what `motion_features` tells, in units of `sizes_nm` that all molecules share."""
+
+    window: MoleculeView
+    sizes_nm: tuple[float, float, float]
+
+    def known(self, given: Array) -> Given:
+        """Return what the network is told of windows with these given frames: motion, elements, bonds."""
+        import torch
+
+        from surrogate.models.particles.particle_flow import Given
+
+        m = self.window.molecule
+        features = motion_features(BodyFrame.of(m, given).enter(given), self.sizes_nm)
+        types = torch.tensor([ELEMENTS.index(e) for e in m.elements.tolist()]).expand(len(given), -1)
+        return Given(torch.from_numpy(features).float(), types, torch.from_numpy(m.kinds).expand(len(given), -1, -1))
+
+    def to_model(self, windows: Array) -> ParticleWindows:
+        """Windows `(n, n_given + n_new, n_atoms, 3)` nm as the network sees them."""
+        import torch
+
+        from surrogate.models.particles.flow_trainer import ParticleWindows
+
+        ahead = torch.from_numpy(self.window.to_model(windows)[:, N_GIVEN:].swapaxes(1, 2)).float()
+        return ParticleWindows(self.known(windows[:, :N_GIVEN]), ahead.contiguous())
+
+    def from_model(self, given: Array, seen: Array) -> Array:
+        """Given frames and predicted ones `(n, n_atoms, n_new, 3)` as the network sees them -> positions, nm."""
+        return self.window.from_model(given, seen.swapaxes(1, 2))

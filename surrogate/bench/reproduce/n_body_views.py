@@ -69,13 +69,11 @@ class ParticleView:
     @staticmethod
     def of(data: ParticleSet, weights: Array | None) -> ParticleView:
         """Measure the sizes on a set."""
-        last, step, bend = (float(np.sqrt((part**2).mean())) for part in _motion(data.positions_nm[:, :N_GIVEN]))
-        return ParticleView(WindowView.of(data, weights), (last, step, max(bend, 1e-3 * step)))
+        return ParticleView(WindowView.of(data, weights), motion_sizes(data.positions_nm[:, :N_GIVEN]))
 
     def given(self, given: Array) -> Array:
         """Given frames `(n, n_given, n_particles, 3)` nm -> features `(n, n_particles, n_features)`."""
-        parts = [part[:, ::-1] / size for part, size in zip(_motion(given), self.sizes_nm, strict=True)]
-        return np.concatenate(parts, axis=1).swapaxes(1, 2).reshape(len(given), given.shape[2], -1)
+        return motion_features(given, self.sizes_nm)
 
     def known(self, given: Array, data: ParticleSet) -> Given:
         """Return what the network is told of systems with these given frames."""
@@ -124,6 +122,19 @@ class ParticleView:
 
 def _centre(given: Array) -> Array:
     return given[:, -1:].mean(axis=2, keepdims=True)
+
+
+def motion_sizes(given: Array) -> tuple[float, float, float]:
+    """Return the sizes of what `motion_features` tells of these frames, nm."""
+    last, step, bend = (float(np.sqrt((part**2).mean())) for part in _motion(given))
+    return last, step, max(bend, 1e-3 * step)
+
+
+def motion_features(given: Array, sizes_nm: tuple[float, float, float]) -> Array:
+    """Given frames `(n, n_given, n_particles, 3)` nm -> what each particle does, `(n, n_particles, n_features)`
+    (`ParticleView`)."""
+    parts = [part[:, ::-1] / size for part, size in zip(_motion(given), sizes_nm, strict=True)]
+    return np.concatenate(parts, axis=1).swapaxes(1, 2).reshape(len(given), given.shape[2], -1)
 
 
 def _motion(given: Array) -> tuple[Array, Array, Array]:

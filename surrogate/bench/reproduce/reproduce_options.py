@@ -18,7 +18,7 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
 
     budget_s: float = option("Wall time of each method's training.", 600.0)
     methods: Sequence[str] | None = option(
-        "Only this; may be repeated. Baselines, egnn, lam-slide, and (n-body) lam-slide-particles, pair-forces.",
+        "Only this; may be repeated. Baselines, egnn, lam-slide, lam-slide-particles, and (n-body) pair-forces.",
         None,
         words=("method",),
     )
@@ -41,10 +41,13 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
     md17_ethanol: Path | None = option("md17: an .npz of MD17's own ethanol to forecast as well.", None)
     steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
     call_s: float | None = option(
-        "End this call at the first saved state after so long; `resume` goes on.", None, within=(0, None)
+        "End this call, with exit code 1, at the first saved state after so long; the same with `resume` goes on.",
+        None,
+        within=(0, None),
     )
     paper_size: bool = option(
-        "LaM-SLidE of the published sizes, n-body for the published epochs unless `steps` says otherwise.", False
+        "LaM-SLidE of the published sizes (n-body: and epochs, unless `steps` says otherwise): for a GPU, in calls.",
+        False,
     )
     solver_steps: int = option("LaM-SLidE's; 1 gives its mean forecast instead of samples.", 10, within=(1, None))
     workers: int | None = option("n-body: processes that simulate.", None, within=(1, None), unset="one a core")

@@ -18,8 +18,9 @@ from systems.errors import InputError
 
 # Widths about which a pair's inverse distances are softened, in the unit of the positions.
 _SOFT = 0.1
-# Numbers of a pair: difference of positions and of velocities, kinds, field of each kind, and distances.
-_N_PAIR_NUMBERS = 6 + N_PAIR_KINDS + 3 * N_PAIR_KINDS + 4
+# Numbers of a pair: difference of positions and of velocities, functions of the distance; and of each kind: whether it
+# is of it, and its field.
+_N_PAIR_NUMBERS, _N_KIND_NUMBERS = 10, 4
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class ParticleFlowConfig:
 
     n_features: int
     n_types: int = 3
+    n_pair_kinds: int = N_PAIR_KINDS
     n_new: int = 20
     frames_per_token: int = 20
     width: int = 128
@@ -115,7 +117,9 @@ class ParticleFlow(nn.Module):
         self.embed_pairs: nn.Sequential | None = None
         if c.pair_messages:
             self.embed_pairs = nn.Sequential(
-                nn.Linear(_N_PAIR_NUMBERS, pair_width), nn.SiLU(), nn.Linear(pair_width, pair_width)
+                nn.Linear(_N_PAIR_NUMBERS + _N_KIND_NUMBERS * c.n_pair_kinds, pair_width),
+                nn.SiLU(),
+                nn.Linear(pair_width, pair_width),
             )
         self.layers = nn.ModuleList(ParticleLayer(c, pair_width) for _ in range(c.n_layers))
         self.modulation = nn.Linear(c.width, 6 * c.width)
@@ -134,7 +138,9 @@ class ParticleFlow(nn.Module):
         # Given frames stay in float32: bf16 would round away the changes of velocity that tell forces.
         with torch.autocast(noisy.device.type, enabled=False):
             known = self.embed_given(given.features) + self.embed_type(given.types)
-            pairs = None if self.embed_pairs is None else self.embed_pairs(pair_numbers(given))
+            pairs = (
+                None if self.embed_pairs is None else self.embed_pairs(pair_numbers(given, self.config.n_pair_kinds))
+            )
         tokens = noisy.reshape(b, n, self.n_tokens, -1).transpose(1, 2)
         h = self.embed_noisy(tokens) + known[:, None] + self.embed_place
         time = F.silu(self.embed_time(tau))
@@ -146,13 +152,13 @@ class ParticleFlow(nn.Module):
         return self.final(h).float().transpose(1, 2).reshape(noisy.shape)
 
 
-def pair_numbers(given: Given) -> Tensor:
-    """Return what a pair's message is made of, `(b, n, n, _N_PAIR_NUMBERS)`: differences of last positions and steps,
+def pair_numbers(given: Given, n_kinds: int) -> Tensor:
+    """Return what a pair's message is made of, `(b, n, n, n_numbers)`: differences of last positions and steps,
     its kind, an inverse square field of each kind, and functions of the distance."""
     x, step = given.features[..., :3], given.features[..., 3:6]
     apart, passing = x[:, :, None] - x[:, None], step[:, :, None] - step[:, None]
     r = (apart.square().sum(-1, keepdim=True) + 1e-4).sqrt()
-    kind = F.one_hot(given.pairs, N_PAIR_KINDS).to(x.dtype)
+    kind = F.one_hot(given.pairs, n_kinds).to(x.dtype)
     toward = apart / r
     field = toward / (r.square() + 0.5 * _SOFT)
     fields = (kind[..., None] * field[..., None, :]).flatten(-2)

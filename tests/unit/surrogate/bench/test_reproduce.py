@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from surrogate.bench.reproduce.published import PUBLISHED
 from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
 from surrogate.models.lam_slide.losses import autoencoder_loss, random_rotations
+from surrogate.models.particles import trainer
 from surrogate.models.particles.flow_trainer import sample_ahead
 from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
 from surrogate.models.particles.particle_flow import Given, ParticleFlow, ParticleFlowConfig
@@ -368,6 +370,28 @@ def test_calls_that_end_early_go_on_to_the_same_numbers(method: str, tmp_path: P
             parts = replace(parts, resume=True)
     assert ended >= 2
     assert (found.ade, found.fde) == (expected.ade, expected.fde)
+
+
+def test_the_paper_size_runs_in_calls_until_its_epochs_are_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command for a GPU, with batches and epochs for a CPU; sizes are the published ones (tested above)."""
+    monkeypatch.setattr(trainer, "PAPER_SIZES", replace(trainer.PAPER_SIZES, batches=(4, 2)))
+    monkeypatch.setattr(trainer, "PAPER_STEPS", 4)
+    asked = ["reproduce", "n-body-charged", "--method", "lam-slide", "--paper-size", "--device", "cpu"]
+    asked += ["--call", "0.001s", "--solver-steps", "1", "-o", str(tmp_path), "--workers", "1"]
+    asked += ["--train", "4", "--validation", "2", "--test", "2"]
+    calls = [CliRunner().invoke(app, [*asked, *more]) for more in ([], *3 * [["--resume"]])]
+    assert [call.exit_code for call in calls[:2]] == [1, 1]
+    assert "the same command again with --resume" in calls[0].stderr
+    done = [call for call in calls if call.exit_code == 0]
+    assert done
+    assert "lam-slide" in done[0].stdout
+    with (tmp_path / "lam-slide.csv").open() as handle:
+        rows = list(csv.DictReader(handle))
+    assert {row["stage"]: int(row["step"]) for row in rows} == {"autoencoder": 2, "flow": 2}
+    record = json.loads((tmp_path / "n-body-charged.json").read_text())
+    assert record["rows"][0]["n_parameters"] > 5_000_000
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -17,7 +18,7 @@ from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, SWITCHES,
 from surrogate.bench.reproduce.md17 import MoleculeReproduction, reproduce_molecules, table_lines
 from surrogate.bench.reproduce.md17_data import read_md17_ethanol
 from surrogate.bench.reproduce.md17_methods import METHODS, lam_slide_model
-from surrogate.bench.reproduce.md17_views import BodyFrame, LinearForecast, MoleculeView
+from surrogate.bench.reproduce.md17_views import AtomView, BodyFrame, LinearForecast, MoleculeView
 from surrogate.bench.reproduce.published import PUBLISHED_MD17
 from surrogate.cli.main import app
 from surrogate.data.molecule_windows import MoleculeWindows, pair_kinds, split_windows
@@ -152,6 +153,31 @@ def test_windows_come_back_from_what_the_model_sees(canonical: bool, corrects: b
     assert same == canonical
 
 
+def test_atoms_come_back_from_their_view_and_know_no_pose_and_no_future() -> None:
+    m = vibrating(anharmonic=0.5)
+    bare = MoleculeView.of(m, canonical=True, linear=LinearForecast.fit(m))
+    view = AtomView(bare, (0.1, 0.01, 0.01))
+    windows = m.windows(m.starts["test"])
+    given = windows[:, :N_GIVEN]
+    seen = view.to_model(windows)
+    back = view.from_model(given, seen.ahead.double().numpy())
+    np.testing.assert_allclose(back, windows[:, N_GIVEN:], rtol=0, atol=1e-7)
+    # The last position stands first, in units of 0.1 nm about the centre of all atoms; types and pairs are the atoms'.
+    last = BodyFrame.of(m, given).enter(given)[:, -1]
+    last = 10.0 * (last - last.mean(axis=1, keepdims=True))
+    np.testing.assert_allclose(seen.given.features[..., :3].numpy(), last, rtol=0, atol=1e-5)
+    assert seen.given.types[0].tolist() == [1, 3, 0, 0]
+    assert seen.given.pairs[-1].tolist() == m.kinds.tolist()
+    rotation = Rotation.random(random_state=2).as_matrix()
+    turned = view.to_model(windows @ rotation.T + 2.0)
+    torch.testing.assert_close(turned.given.features, seen.given.features, rtol=0, atol=1e-4)
+    other = windows.copy()
+    other[:, N_GIVEN:] += 1.0
+    assert torch.equal(view.known(other[:, :N_GIVEN]).features, seen.given.features)
+    # Negative control: a mirrored molecule is another.
+    assert (view.known(given * [1.0, 1.0, -1.0]).features - seen.given.features).abs().max() > 0.1
+
+
 def test_normal_modes_follow_vibrations_and_keep_the_pose() -> None:
     m = vibrating(drift=0.0)
     given, truth = _split(m)
@@ -202,7 +228,7 @@ def test_the_whole_way_to_the_table(tmp_path: Path) -> None:
     assert saved["rows"][0]["ade"]["value"] == result.rows[0].ade.value
     # What is there is kept, a finished training resumed trains no more and forecasts the same.
     before = (tmp_path / "ethanol.h5").stat().st_mtime_ns
-    again = run(replace(settings, resume=True), "egnn", "lam-slide")
+    again = run(replace(settings, resume=True), "egnn", "lam-slide", "lam-slide-particles")
     assert (tmp_path / "ethanol.h5").stat().st_mtime_ns == before
     for row in again.rows:
         assert (row.ade, row.fde) == (by_name[row.method].ade, by_name[row.method].fde)
