@@ -104,6 +104,10 @@ CHANGES = (
     Change("particles: regression instead of a flow", particles={}, mean_only=True),
     Change("particles: 16 trajectories by heart", particles={}, n_train=16),
     Change("16 windows, particles: a token each", particles=_ALONE, batch=FEW),
+    Change("16 windows, particles: a token each, positions given", particles=_ALONE, motion=False,
+           batch=FEW, steps=500),
+    Change("16 windows, particles: a token each frame, positions given", particles=_ALONE | {"frames_per_token": 1},
+           motion=False, batch=FEW, steps=500),
     Change("16 windows, set: 2 latents in a token", batch=FEW),
     Change("16 windows, set: and auxiliary losses", flow={"position_weight": 0.25, "distance_weight": 0.25}, batch=FEW),
     Change("16 windows, set: and clean conditioning", flow={"clean_conditioning": True}, batch=FEW),
@@ -113,7 +117,7 @@ CHANGES = (
     Change("16 windows, exact code: a token for each particle of a frame", _EXACT, {"latents_per_token": 1},
            exact=True, batch=FEW, steps=500),
     Change("16 windows, set: 16 latents, a token each", {"n_latents": 16}, {"latents_per_token": 1},
-           batch=FEW, steps=250),
+           batch=FEW, steps=500),
 )  # fmt: skip
 
 
@@ -157,7 +161,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
         errors.update(mean_ade=mean[0], sample_ade=sample[0], sample_fde=sample[1])
         return errors
 
-    every_s = 60.0 if change.steps is None else 300.0  # where a step is dear, so are forecasts
+    every_s = 100.0 if change.steps is None else 600.0  # where a step is dear, so are forecasts
     stage = StageConfig(
         "flow", change.batch, 2e-3, None, steps, warmup_steps=50, ema_decay=0.99, validate_every_s=every_s
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -22,12 +21,11 @@ from surrogate.bench.reproduce.published import PUBLISHED
 from surrogate.cli.main import app
 from surrogate.data.particle_sets import ParticleSet, append_systems, check_disjoint, n_complete, read_set
 from surrogate.models.lam_slide.losses import autoencoder_loss, random_rotations
-from surrogate.models.particles import trainer
 from surrogate.models.particles.flow_trainer import sample_ahead
 from surrogate.models.particles.model import EgnnJump, EgnnJumpConfig, PairForces, PairForcesConfig
 from surrogate.models.particles.particle_flow import Given, ParticleFlow, ParticleFlowConfig
 from surrogate.models.particles.trainer import turned_windows
-from systems.errors import InputError, UnfinishedError, UnknownNameError
+from systems.errors import InputError, UnknownNameError
 
 COUNTS = {"train": 8, "validation": 3, "test": 4}
 
@@ -350,48 +348,6 @@ def test_the_whole_way_prints_our_rows_under_the_published(tmp_path: Path) -> No
     again = run(replace(settings, resume=True))
     for one, other in zip(result.rows, again.rows, strict=True):
         assert (one.method, one.ade, one.fde) == (other.method, other.ade, other.fde)
-
-
-@pytest.mark.parametrize("method", ["lam-slide", "lam-slide-particles"])
-def test_calls_that_end_early_go_on_to_the_same_numbers(method: str, tmp_path: Path) -> None:
-    sizes = {"train": 6, "validation": 2, "test": 3}
-    whole = Settings(tmp_path / "whole", budget_s=None, steps=4, solver_steps=2)
-    run = lambda s: reproduce("n-body-charged", s, methods=[method], sizes=sizes, workers=1)  # noqa: E731
-    expected = run(whole).rows[0]
-    parts = replace(whole, folder=tmp_path / "parts", call_s=1e-6)
-    ended = 0
-    for _ in range(10):
-        try:
-            found = run(parts).rows[0]
-            break
-        except UnfinishedError as error:
-            assert "resume=True" in str(error)
-            ended += 1
-            parts = replace(parts, resume=True)
-    assert ended >= 2
-    assert (found.ade, found.fde) == (expected.ade, expected.fde)
-
-
-def test_the_paper_size_runs_in_calls_until_its_epochs_are_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The command for a GPU, with batches and epochs for a CPU; sizes are the published ones (tested above)."""
-    monkeypatch.setattr(trainer, "PAPER_SIZES", replace(trainer.PAPER_SIZES, batches=(4, 2)))
-    monkeypatch.setattr(trainer, "PAPER_STEPS", 4)
-    asked = ["reproduce", "n-body-charged", "--method", "lam-slide", "--paper-size", "--device", "cpu"]
-    asked += ["--call", "0.001s", "--solver-steps", "1", "-o", str(tmp_path), "--workers", "1"]
-    asked += ["--train", "4", "--validation", "2", "--test", "2"]
-    calls = [CliRunner().invoke(app, [*asked, *more]) for more in ([], *3 * [["--resume"]])]
-    assert [call.exit_code for call in calls[:2]] == [1, 1]
-    assert "the same command again with --resume" in calls[0].stderr
-    done = [call for call in calls if call.exit_code == 0]
-    assert done
-    assert "lam-slide" in done[0].stdout
-    with (tmp_path / "lam-slide.csv").open() as handle:
-        rows = list(csv.DictReader(handle))
-    assert {row["stage"]: int(row["step"]) for row in rows} == {"autoencoder": 2, "flow": 2}
-    record = json.loads((tmp_path / "n-body-charged.json").read_text())
-    assert record["rows"][0]["n_parameters"] > 5_000_000
 
 
 @pytest.mark.parametrize(
