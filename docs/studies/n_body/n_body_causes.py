@@ -167,7 +167,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
     )
     seconds = run_stage(network, stage, loss, validate, place)
     state.unlink()
-    return Found(change.name, steps, round(seconds, 1), **errors, **code)
+    return Found(change.name, steps, round(seconds, 1), **(errors or validate()), **code)
 
 
 def _of_a_set(
