@@ -189,6 +189,26 @@ def extrapolate(given: Array, weights: Array) -> Array:
     return last + np.einsum("ts,nsad->ntad", weights, given - last)
 
 
+def motion_sizes(given: Array) -> tuple[float, float, float]:
+    """Return the sizes of what `motion_features` tells of these frames, nm."""
+    last, step, bend = (float(np.sqrt((part**2).mean())) for part in _motion(given))
+    return last, step, max(bend, 1e-3 * step)
+
+
+def motion_features(given: Array, sizes_nm: tuple[float, float, float]) -> Array:
+    """Given frames `(n, n_given, n_particles, 3)` nm -> what each particle does, `(n, n_particles, n_features)`
+    (`n_body_views.ParticleView`)."""
+    parts = [part[:, ::-1] / size for part, size in zip(_motion(given), sizes_nm, strict=True)]
+    return np.concatenate(parts, axis=1).swapaxes(1, 2).reshape(len(given), given.shape[2], -1)
+
+
+def _motion(given: Array) -> tuple[Array, Array, Array]:
+    """Return the last frame, the steps, and their changes, about each frame's centre: `(n, 1 or less, n_particles, 3)`
+    each."""
+    inside = given - given.mean(axis=2, keepdims=True)
+    return inside[:, -1:], np.diff(inside, axis=1), np.diff(inside, 2, axis=1)
+
+
 def latent_forecaster(
     settings: Settings, autoencoder: AutoencoderConfig, *, latents_per_token: int, width: int, n_layers: int,
     plain_flow: bool = False,

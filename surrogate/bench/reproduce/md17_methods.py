@@ -16,11 +16,11 @@ from surrogate.bench.reproduce.forecast_methods import (
     constant_velocity,
     frozen,
     latent_forecaster,
+    motion_sizes,
     n_parameters,
     sampled,
 )
 from surrogate.bench.reproduce.md17_views import ELEMENTS, Array, AtomView, BodyFrame, LinearForecast, MoleculeView
-from surrogate.bench.reproduce.n_body_views import motion_sizes
 from surrogate.data.molecule_windows import MoleculeWindows
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW
-from surrogate.bench.reproduce.n_body_views import motion_features
+from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, motion_features
 from surrogate.data.molecule_windows import MoleculeWindows
 from systems.chemistry.geometry import superposition
 

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surrogate.bench.reproduce.forecast_methods import N_GIVEN, N_NEW, Array, extrapolate
+from surrogate.bench.reproduce.forecast_methods import (
+    N_GIVEN,
+    N_NEW,
+    Array,
+    extrapolate,
+    motion_features,
+    motion_sizes,
+)
 from surrogate.data.particle_sets import ParticleSet
 
 if TYPE_CHECKING:
@@ -122,23 +129,3 @@ class ParticleView:
 
 def _centre(given: Array) -> Array:
     return given[:, -1:].mean(axis=2, keepdims=True)
-
-
-def motion_sizes(given: Array) -> tuple[float, float, float]:
-    """Return the sizes of what `motion_features` tells of these frames, nm."""
-    last, step, bend = (float(np.sqrt((part**2).mean())) for part in _motion(given))
-    return last, step, max(bend, 1e-3 * step)
-
-
-def motion_features(given: Array, sizes_nm: tuple[float, float, float]) -> Array:
-    """Given frames `(n, n_given, n_particles, 3)` nm -> what each particle does, `(n, n_particles, n_features)`
-    (`ParticleView`)."""
-    parts = [part[:, ::-1] / size for part, size in zip(_motion(given), sizes_nm, strict=True)]
-    return np.concatenate(parts, axis=1).swapaxes(1, 2).reshape(len(given), given.shape[2], -1)
-
-
-def _motion(given: Array) -> tuple[Array, Array, Array]:
-    """Return the last frame, the steps, and their changes, about each frame's centre: `(n, 1 or less, n_particles, 3)`
-    each."""
-    inside = given - given.mean(axis=2, keepdims=True)
-    return inside[:, -1:], np.diff(inside, axis=1), np.diff(inside, 2, axis=1)
