@@ -51,6 +51,15 @@ def frames(folder: Path) -> dict[str, Any]:
     return found
 
 
+def run_ids(folder: Path) -> dict[str, str]:
+    """Return by which run each file was begun: one that starts over has another."""
+    found = {}
+    for path in sorted(folder.glob("*/*.h5")):
+        with open_trajectory(path) as reader:
+            found[path.name] = reader.run_id
+    return found
+
+
 def disturbed(stage: StageOf, *, before: Callable[[], None] = lambda: None, after: Callable[[], None] = lambda: None,
               ) -> StageOf:  # fmt: skip
     def work(site: Site, record: Any) -> Any:
@@ -102,6 +111,7 @@ def test_kills_before_and_after_each_stage_change_nothing(
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     expected = run(whole, asked)
     assert ended(expected) == [(name, "done") for name in names]
+    begun: dict[str, str] = {}
     for k, name in enumerate(names):
         for moment in ({"before": kill}, {"after": kill}):
             with monkeypatch.context() as patch:
@@ -109,8 +119,10 @@ def test_kills_before_and_after_each_stage_change_nothing(
                 with pytest.raises(Killed):
                     run(killed, asked, resume=True)
             assert [entry.name for entry in read_run(killed).stages] == names[:k], "what had ended, and no more"
+            begun = run_ids(killed) | begun
     found = run(killed, asked, resume=True)
     assert ended(found) == ended(expected) and found["outcome"] == expected["outcome"]
+    assert run_ids(killed) == begun, "nothing was made twice"
     kept, undisturbed = frames(killed), frames(whole)
     assert len(kept) == {"md": rates.replicas, "surrogate": REPLICAS}[asked] + (rates is OPENMM)
     assert kept.keys() == undisturbed.keys()
