@@ -17,7 +17,7 @@ from systems.source import prepare
 def test_a_molecule_that_was_trained_on_gets_its_weights() -> None:
     weights, why = choose_weights(load("alanine-dipeptide"))
     assert weights.path.stem == "alanine-dipeptide"
-    assert "trained on this molecule" in why and "alanine-dipeptide-painet would do, too" in why
+    assert "trained on this molecule" in why and "alanine-dipeptide-painet, peptides would do, too" in why
 
 
 def test_an_unseen_molecule_gets_weights_that_cover_it_and_is_told() -> None:
@@ -26,7 +26,12 @@ def test_an_unseen_molecule_gets_weights_that_cover_it_and_is_told() -> None:
     assert "without having seen it" in why or "trained on this molecule" in why
 
 
-@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "sequence:ACE-GLY-NME"])
+def test_an_unseen_peptide_gets_the_weights_of_peptides() -> None:
+    weights, why = choose_weights(prepare("sequence:ACE-LEU-SER-NME"))
+    assert weights.path.stem == "peptides" and "without having seen it" in why
+
+
+@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "sequence:GLY-ALA"])
 def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> None:
     with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .* The nearest: .*does not cover"):
         choose_weights(prepare(scene))
@@ -46,4 +51,4 @@ def test_only_weights_that_cover_the_scene_are_loaded(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(choice, "load_weights", load_one)
     choose_weights(load("alanine-dipeptide"))
-    assert sorted(loaded) == ["alanine-dipeptide", "alanine-dipeptide-painet"]
+    assert sorted(loaded) == ["alanine-dipeptide", "alanine-dipeptide-painet", "peptides"]
