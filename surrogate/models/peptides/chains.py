@@ -25,6 +25,8 @@ from surrogate.models.peptides.phi_signs import is_positive
 # A number told in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
 _TINY = 1e-12
+# Dihedrals counted from a torsion scatter by 0.3 rad at most.
+_EITHER_SIDE_RAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class ChainCode(nn.Module):
     stiff_at: Tensor
     turning_at: Tensor
     filled: Tensor
+    kept: Tensor
 
     def __init__(self, layout: ChainLayout, scale: ChainScale) -> None:
         super().__init__()
@@ -102,7 +105,20 @@ class ChainCode(nn.Module):
         filled[self.turning_at] = True
         filled[self.turning_at + 1] = True
         self.register_buffer("filled", filled.reshape(self.n_residues, self.n_slots), persistent=False)
+        self.register_buffer("kept", self._unlabelled(scale).reshape(self.n_residues, self.n_slots), persistent=False)
         self.levels = _levels(layout)
+
+    def _unlabelled(self, scale: ChainScale) -> Tensor:
+        """Mark places `(n_residues * n_slots,)` that stay what the given frame has: dihedrals counted from a torsion
+        that lie on either side of it in the data. Which of two hydrogens on one carbon has which name differs between
+        molecules, and no motion turns one into the other."""
+        marked = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
+        for row, primary in enumerate(self.layout.primary):
+            k = 3 + 3 * row + 2
+            key = self.layout.keys[k]
+            if primary != row and self.layout.kinds[k] == STIFF and scale.deviation.get(key, 0.0) > _EITHER_SIDE_RAD:
+                marked[self.layout.residue_of[k] * self.n_slots + scale.slots[key]] = True
+        return marked
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""

@@ -329,7 +329,8 @@ class PeptideSlide(Surrogate):
                 return torch.where(filled, self.flow(o, tau, told), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
-            return self.frames_of(self.from_innovations(y, known[rows], times[rows], types), chain)
+            numbers = self.from_innovations(y, known[rows], times[rows], types)
+            return self.frames_of(torch.where(chain.code.kept, known[rows, None], numbers), chain)
 
         rows = torch.arange(len(known), device=known.device)
         frames = solve(rows, drawn)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
 
+from command_line import run
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide

@@ -135,3 +135,34 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
     alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
+
+
+def test_hydrogens_named_either_way_stay_where_the_given_frame_has_them() -> None:
+    """In the data HB2 and HB3 of serine stand on either side of its torsion; with one name they would not be kept."""
+    from dataclasses import replace
+
+    from surrogate.data.descriptions import describe
+
+    scene = build_peptide("ACE-SER-NME")
+    config = _config(scene)
+    assert config.scale is not None
+    wide = {key: 1.0 if key.startswith("SER dihedral HB") else value for key, value in config.scale.deviation.items()}
+    torch.manual_seed(0)
+    last = torch.tensor(scene.positions_nm).float().expand(2, 1, -1, -1)
+    between = []
+    for deviation in (wide, config.scale.deviation):
+        model = PeptideSlide(replace(config, scale=replace(config.scale, deviation=deviation)))
+        model = model.eval().requires_grad_(False)
+        model.lag_ps = 1.0
+        molecule = describe(model, scene)
+        assert molecule.chain is not None
+        kept = molecule.chain.code.kept
+        assert int(kept.sum()) == (2 if deviation is wide else 0) and not kept[[0, 2]].any()
+        noise = torch.randn(2, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
+        frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm[0].double().numpy()
+        at = {name: i for i, name in enumerate(scene.atom_names) if scene.residue_of_atom[i] == 1}
+        quads = [[at[name], at["CB"], at["CA"], at["OG"]] for name in ("HB2", "HB3")]
+        between.append(
+            np.abs(np.angle(np.exp(1j * (torsion(frames, quads) - torsion(scene.positions_nm, quads))))).max()
+        )
+    assert between[0] < 1e-3 < between[1]
