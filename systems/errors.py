@@ -30,11 +30,12 @@ class TrajectoryError(SurromdError):
 
 
 class OutOfDomainError(SurromdError):
-    """A scene that the weights were not trained for. `brief`: how it differs, without the advice."""
+    """A scene that the weights were not trained for. `brief`: how it differs, without the advice; `forcible`: they can
+    roll it all the same, if asked to."""
 
-    def __init__(self, message: str, brief: str = "") -> None:
+    def __init__(self, message: str, brief: str = "", *, forcible: bool = False) -> None:
         super().__init__(message)
-        self.brief = brief or message
+        self.brief, self.forcible = brief or message, forcible
 
 
 class WeightsError(SurromdError):

@@ -32,12 +32,12 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
         except OutOfDomainError as error:
-            refusals.append((len(error.args[0].split("; ")), name, error))
+            refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
             continue
         weights = load_weights(path)
         found.append((not match.seen, weights.model.carries_velocities, name, weights))
     if not found:
-        nearest = min(refusals, key=lambda one: one[:2])[2] if refusals else OutOfDomainError("none are shipped.")
+        nearest = min(refusals, key=lambda one: one[:3])[3] if refusals else OutOfDomainError("none are shipped.")
         raise OutOfDomainError(
             f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
         )

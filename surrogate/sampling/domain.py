@@ -101,6 +101,7 @@ def match_known(
     raise OutOfDomainError(
         f"{name} does not cover {scene.name}: {reasons}. These weights cover {domain.describe()}. {advice}",
         brief=f"{name} does not cover it: {reasons}",
+        forcible=not barred,
     )
 
 

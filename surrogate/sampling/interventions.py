@@ -33,6 +33,8 @@ FloatArray = npt.NDArray[np.floating[Any]]
 MOST_DRAWS = 8
 _DRAWS_FROM_LAST_VALID = 4
 MOST_MD_IN_A_ROW = 10
+# Invalid frames, after which unguarded rollouts end: a clash passes, a molecule that came apart does not.
+MOST_INVALID_IN_A_ROW = 4
 _MD_ATTEMPT, _BETWEEN_ATTEMPT = 1000, 2000
 # Under 'flag': so many chunks of each replica a model has to get one through. A frame now and then, as sound weights
 # have in long chunks, does not prove it wrong: of frames, so many must be caught, and more than one.
@@ -173,14 +175,19 @@ class _Advance:
         self.chunk.failure = (first, what)
 
     def judge(self) -> None:
-        """Enter in `chunk.failure` the row whose last frame is not finite, or which has no valid frame under 'flag'."""
+        """Enter in `chunk.failure` the row whose last frame is not finite, or which under 'flag' has had no valid frame
+        for a whole chunk, or for as many short ones as hold MOST_INVALID_IN_A_ROW frames."""
         if self.chunk.failure is not None:
             return
         for row in range(len(self.last)):
             if not finite(self.chunk.flags[row, -1]) or not np.isfinite(self.chunk.frames_nm[row, -1]).all():
                 self.chunk.failure = (row, "the model's frames are no longer finite")
-            elif self.plan.guard == "flag" and (self.chunk.flags[row] & np.uint16(INVALID | STILL)).all():
-                self.chunk.failure = (row, f"a chunk without one valid frame ({self._reasons(row)})")
+                continue
+            invalid = (self.chunk.flags[row] & np.uint16(INVALID | STILL)).all()
+            tally = self.tallies[row]
+            tally.invalid_in_a_row = tally.invalid_in_a_row + self.chunk.flags.shape[1] if invalid else 0
+            if self.plan.guard == "flag" and tally.invalid_in_a_row >= MOST_INVALID_IN_A_ROW:
+                self.chunk.failure = (row, f"{tally.invalid_in_a_row} frames and no valid one ({self._reasons(row)})")
 
     def add_md(self) -> None:
         """Append a stretch of MD to every row."""

@@ -41,7 +41,8 @@ class Tally:
 
     `chunks` drawn, of which `chunks_caught` held a frame that a guard caught; `frames_caught` and `reasons` count the
     frames of first draws, `frames` those that an intervention left, `draws` the further draws. `md_in_a_row`: chunks
-    that MD had to finish since the surrogate last got through one. `log` holds the first 200 interventions.
+    that MD had to finish since the surrogate last got through one. `invalid_in_a_row`: frames of the chunks since the
+    last one that held a valid frame. `log` holds the first 200 interventions.
     """
 
     chunks: int = 0
@@ -51,6 +52,7 @@ class Tally:
     frames: dict[str, int] = field(default_factory=dict)
     draws: int = 0
     md_in_a_row: int = 0
+    invalid_in_a_row: int = 0
     log: list[dict[str, Any]] = field(default_factory=list)
 
     def note_caught(self, flags: npt.NDArray[np.uint16], first_step: int) -> None:
@@ -72,7 +74,7 @@ class Tally:
 
     def to_record(self) -> dict[str, Any]:
         """Return what a trajectory's record keeps of it."""
-        kept = {k: v for k, v in asdict(self).items() if k != "md_in_a_row"}
+        kept = {k: v for k, v in asdict(self).items() if not k.endswith("_in_a_row")}
         bias = [why for mark, why in BIAS.items() if self.frames.get(MARKS[mark])]
         return {**kept, "share_of_chunks": self.chunks_caught / max(self.chunks, 1), "bias": bias}
 

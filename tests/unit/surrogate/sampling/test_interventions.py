@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,11 +26,11 @@ from scripted_model import (
 from surrogate.data.weights import TrainingDomain
 from surrogate.models.interface import Surrogate
 from surrogate.sampling.guards import CAUGHT
-from surrogate.sampling.interventions import none_through
+from surrogate.sampling.interventions import _Advance, none_through
 from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, REPAIRED, Tally
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import CHIRALITY, INVALID
+from systems.chemistry.validity import CHIRALITY, CLASH, INVALID
 from systems.errors import SimulationError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import frames_in
@@ -253,3 +254,18 @@ def test_a_batch_that_memory_does_not_hold_is_halved(tmp_path: Path, scene: Scen
     model.largest_batch = 0
     with pytest.raises(SimulationError, match="memory does not suffice for one replica"):
         rollout(scene, replace(cramped, model=model), [tmp_path / "one.h5"], config)
+
+
+def test_chunks_of_one_frame_end_a_rollout_only_when_several_in_a_row_are_invalid() -> None:
+    flags = np.zeros((1, 1), dtype=np.uint16)
+    helper = SimpleNamespace(
+        chunk=SimpleNamespace(flags=flags, frames_nm=np.zeros((1, 1, 3, 3)), failure=None), last=[None],
+        plan=SimpleNamespace(guard="flag"), tallies=[Tally()], _reasons=lambda row: "clash",
+    )  # fmt: skip
+    failed = []
+    for invalid in (1, 1, 1, 0, 1, 1, 1, 1):
+        flags[:] = CLASH if invalid else 0
+        _Advance.judge(cast(_Advance, helper))
+        failed.append(helper.chunk.failure is not None)
+    assert failed == [False] * 7 + [True]
+    assert helper.chunk.failure == (0, "4 frames and no valid one (clash)")
