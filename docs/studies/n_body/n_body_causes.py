@@ -31,7 +31,7 @@ from surrogate.bench.reproduce.n_body_methods import best_polynomial, set_foreca
 from surrogate.bench.reproduce.n_body_views import ParticleView, WindowView
 from surrogate.data.particle_sets import ParticleSet, read_set
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.codes.base import Code, Decoded
+from surrogate.models.lam_slide.codes.atom_code import AtomCode
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.losses import (
     FlowWindows,
@@ -252,26 +252,12 @@ def _of_particles(change: Change, train: ParticleSet, weights: Array | None) -> 
     return model, loss, forecast
 
 
-class ExactCode(Code):
-    """Particles' coordinates as they are: what stage two could do if stage one lost nothing."""
-
-    latent_dim = 3
+class ExactCode(AtomCode):
+    """Particles' coordinates as they are, each a latent: what stage two could do if stage one lost nothing."""
 
     def __init__(self, n_particles: int) -> None:
         super().__init__()
         self.n_latents = n_particles
-
-    def n_entities(self, n_atoms: int) -> int:
-        return n_atoms
-
-    def types(self, elements: Tensor) -> Tensor:
-        return elements
-
-    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
-        return x
-
-    def decode(self, latents: Tensor, identifiers: Tensor, *, with_types: bool = False) -> Decoded:
-        return Decoded(latents, None)
 
 
 def _code(model: LamSlide, draw: DrawWindows, batch: int, state: Path) -> None:
