@@ -193,9 +193,12 @@ def _relaxed(modeller: Any) -> Vector:
     """Minimise in ff14SB without charges: in vacuum these pull charged groups together and twist peptide bonds."""
     from openmm import Context, LocalEnergyMinimizer, NonbondedForce, Platform, VerletIntegrator, app, unit
 
-    system = app.ForceField("amber14/protein.ff14SB.xml").createSystem(
-        modeller.topology, nonbondedMethod=app.NoCutoff, removeCMMotion=False
-    )
+    try:
+        system = app.ForceField("amber14/protein.ff14SB.xml").createSystem(
+            modeller.topology, nonbondedMethod=app.NoCutoff, removeCMMotion=False
+        )
+    except ValueError as error:  # a neutral LYS at an uncapped end, for one
+        raise PreparationError(f"ff14SB lacks a residue of the sequence: {str(error).partition('.')[0]}.") from error
     for force in system.getForces():
         if isinstance(force, NonbondedForce):
             for k in range(force.getNumParticles()):

@@ -34,7 +34,8 @@ def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
         try:
             built = build_peptide("-".join(forms))
         except PreparationError as error:
-            raise InputError(f"{scene.name} is no chain of standard residues: {error}") from error
+            refusal = refusal or str(error)
+            continue
         if sum(element == "H" for element in built.elements) != hydrogens:
             continue
         try:

@@ -11,6 +11,7 @@ import torch
 
 from surrogate import api
 from surrogate.data.features.peptide_chains import chain_features
+from surrogate.data.features.standard_peptide import standard_peptide
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import Weights, load_weights, save_weights
@@ -20,7 +21,7 @@ from surrogate.models.peptides.trainer import normalise, with_scale
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.provenance import training_domain
-from systems.errors import InputError, OutOfDomainError
+from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.selection import reordered
@@ -87,6 +88,13 @@ def test_residues_and_ends_without_training_are_refused_for_good(weights: Weight
     for force in (False, True):
         with pytest.raises(OutOfDomainError, match="residues: "):
             match_domain(build_peptide(sequence), weights, force=force)
+
+
+def test_a_form_that_the_force_field_lacks_at_an_end_hides_no_other() -> None:
+    with pytest.raises(PreparationError, match=r"ff14SB lacks .*LYS"):
+        build_peptide("HIE-LYN")
+    standard, _ = standard_peptide(build_peptide("HID-LYS"))
+    assert standard.name == "HID-LYS", "though HIE-LYN is tried before it"
 
 
 def test_d_residues_are_refused(weights: Weights) -> None:
