@@ -44,8 +44,9 @@ MOST_BURSTS, _LEAST_BURSTS = 300, 60
 _RELAXING_STEPS = 150
 # Of their share, what bursts are planned to take: their estimate is the least sure.
 _BURSTS_AIM = 0.7
-# The judge: processor seconds at all, and of an atom in a frame; what it is meant to take of a budget, and may.
-_JUDGE_S, _JUDGE_ATOM_S = 7.0, 3e-6
+# The judge: processor seconds until its libraries are loaded (while the last MD runs), then at all, of an atom, and of
+# an atom in a frame; what it is meant to take of a budget, and may.
+_JUDGE_LOADING_S, _JUDGE_S, _JUDGE_ATOM_S, _JUDGE_ATOM_FRAME_S = 3.5, 3.0, 0.055, 7e-7
 _JUDGE_SHARE, _MOST_FOR_REPORT = 0.1, 0.5
 # After so long it is known from a stage of MD how busy the machine is.
 _PACE_TOLD_S = 5.0
@@ -114,12 +115,18 @@ def least_budget_s(rates: Rates, way: Way) -> float:
     """Return the wall seconds that the stages of a way need to come to anything."""
     n_md = sum(name in MD_STAGES for name in _shares(rates, way))
     # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
-    return max(LEAST_BUDGET_S, (_JUDGE_S + 2.0 * n_md * _START_S) * min(rates.stretch, _MOST_STRETCH_FORESEEN))
+    seconds = _JUDGE_LOADING_S + _judge_s(rates, 0) + 2.0 * n_md * _START_S
+    return max(LEAST_BUDGET_S, seconds * min(rates.stretch, _MOST_STRETCH_FORESEEN))
 
 
 def report_s(rates: Rates, frames: float, stretch: float) -> float:
     """Return the wall seconds that judging so many frames takes, on one core; `stretch`: as of `Rates`, by now."""
-    return (_JUDGE_S + _JUDGE_ATOM_S * rates.n_atoms * frames) * max(1.0, stretch * rates.alone)
+    return _judge_s(rates, frames) * max(1.0, stretch * rates.alone)
+
+
+def _judge_s(rates: Rates, frames: float) -> float:
+    """Return the processor seconds of judging so many frames."""
+    return _JUDGE_S + (_JUDGE_ATOM_S + _JUDGE_ATOM_FRAME_S * frames) * rates.n_atoms
 
 
 def seconds_of_first(
@@ -201,8 +208,9 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
 
 def _frames(rates: Rates, budget_s: float) -> int:
     """Return how many frames in all the judge reads in its share of the budget."""
-    judge_s = max(1.5 * _JUDGE_S, _JUDGE_SHARE * budget_s) - _JUDGE_S
-    return int(min(_MOST_FRAMES, max(_LEAST_FRAMES, judge_s / (_JUDGE_ATOM_S * rates.n_atoms))))
+    at_all_s = _judge_s(rates, 0)
+    judge_s = max(0.5 * at_all_s, _JUDGE_SHARE * budget_s - at_all_s)
+    return int(min(_MOST_FRAMES, max(_LEAST_FRAMES, judge_s / (_JUDGE_ATOM_FRAME_S * rates.n_atoms))))
 
 
 def _interval(rates: Rates, least_ps: float) -> float:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -36,6 +38,8 @@ _LEAST_FRAMES = 20
 _OPTIMISING, _BESIDE_STEPS_S = 0.95, 20.0
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
+# What the judge takes a third of its time to load when it is first used.
+_OF_JUDGE = ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj")
 WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
 
 
@@ -227,6 +231,16 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         foreword=Foreword(found.headline, "How the budget was spent, and why", lines),
     )
     return replace(record, outcome=found)
+
+
+def load_judge() -> None:
+    """Load the judge's libraries beside other work, which the report would wait for."""
+
+    def load() -> None:
+        for name in _OF_JUDGE:
+            importlib.import_module(name)
+
+    threading.Thread(target=load, name="judge's libraries").start()
 
 
 def _nothing(site: Site, record: RunRecord) -> RunRecord | None:
