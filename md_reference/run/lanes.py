@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from md_reference.forces.small_molecules.parameter_cache import cache_folder
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, hottest_k
+from md_reference.run.platforms import LANES, PlatformChoice
 from systems.errors import InputError, SimulationError
 from systems.scene import FloatArray
 
@@ -100,6 +101,11 @@ def _program() -> ctypes.CDLL:
 def n_lanes() -> int:
     """How many copies a batch has. Raises LanesUnavailableError."""
     return int(_program().lanes())
+
+
+def lanes_choice() -> PlatformChoice:
+    """Return the platform as plans and records name it. Raises LanesUnavailableError."""
+    return PlatformChoice(LANES, 1, f"{n_lanes()} replicas at once on a core, forces checked against OpenMM's")
 
 
 class Lanes:

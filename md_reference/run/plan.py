@@ -16,7 +16,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
-from md_reference.run.lanes import Lanes, n_lanes
+from md_reference.run.lanes import Lanes, lanes_choice, n_lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.platforms import LANES, PlatformChoice, choose_platform, measured_platform
 from md_reference.run.timing import as_records
@@ -136,10 +136,6 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
         skipped=_skips(scene, config, n_constraints, planned, default),
         warnings=(*spec.warnings, *_warnings(scene, spec, config.timestep_ps)),
     )
-
-
-def lanes_choice() -> PlatformChoice:
-    return PlatformChoice(LANES, 1, f"{n_lanes()} replicas at once on a core")
 
 
 def _time_lanes_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> float:

@@ -13,9 +13,9 @@ from typing import Any
 
 from md_reference.forces.forcefield import resolve
 from md_reference.run.config import MDConfig, check_run
-from md_reference.run.lanes import n_lanes
+from md_reference.run.lanes import lanes_choice, n_lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.plan import lanes_choice, line_of_run
+from md_reference.run.plan import line_of_run
 from md_reference.run.platforms import LANES, measured_platform
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.run.simulate_lanes import simulate_batch
@@ -42,14 +42,15 @@ def simulate_replicas(
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressFn | None = None,
-    announce: Callable[[str], None] | None = None,
+    announce: Callable[[str | SimulationError], None] | None = None,
     workers: int | None = None,
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
     small scenes the fastest use of them. On platform lanes up to sixteen replicas share a process. The platform is
-    measured once, for all, and `announce` gets the plan in one line; `progress` counts the frames of all replicas.
+    measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
+    run, which it may raise to end them too; `progress` counts the frames of all replicas.
     Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
     by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
     stay on disk.
@@ -108,16 +109,22 @@ def simulate_replicas(
                     if process.exitcode != 0:
                         _collect(board.errors, reasons, k)
                         failures[k] = reasons.get(k, f"exit code {process.exitcode}")
+                        if announce is not None and (waiting or running):
+                            announce(_error(failures, jobs))
         finally:
             for process in running.values():
                 process.terminate()
             for process in running.values():
                 process.join()
     if failures:
-        k = min(failures)
-        failed = sum(len(jobs[i]) for i in failures)
-        raise SimulationError(f"{failed} of {len(outs)} replicas failed; replica {jobs[k][0]}: {failures[k]}")
+        raise _error(failures, jobs)
     return list(outs)
+
+
+def _error(failures: dict[int, str], jobs: list[list[int]]) -> SimulationError:
+    k = min(failures)
+    failed, of_all = sum(len(jobs[i]) for i in failures), sum(map(len, jobs))
+    return SimulationError(f"{failed} of {of_all} replicas failed; replica {jobs[k][0]}: {failures[k]}")
 
 
 def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine
-from md_reference.run.lanes import Lanes, n_lanes
-from md_reference.run.platforms import LANES, PlatformChoice
+from md_reference.run.lanes import Lanes, lanes_choice, n_lanes
+from md_reference.run.platforms import LANES
 from md_reference.run.run_summary import summarise
 from md_reference.run.simulate import ProgressFn, already_complete, record_of, stand_of, tell_preparing
 from systems.errors import InputError, SimulationError
@@ -41,7 +41,6 @@ from systems.units import format_time_ps
 
 # Frames are computed for about so long, then written and checkpointed.
 _BLOCK_S = 2.0
-_CHOICE = PlatformChoice(LANES, 1, "replicas in the lanes of one core, energies and forces checked against OpenMM's")
 
 
 def simulate_batch(
@@ -79,7 +78,7 @@ def simulate_batch(
         kept = last_supported(state_path, list(outs)) if resume and state_path.exists() else None
         batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
         batch.start(starts_nm, asked_to_stop, progress)
-        record = record_of(scene, config, _CHOICE)
+        record = record_of(scene, config, lanes_choice())
         with ExitStack() as stack:
             writers = []
             for k, out in enumerate(outs):

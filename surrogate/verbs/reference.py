@@ -74,7 +74,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
             resume=options.resume,
             overwrite=options.overwrite,
             progress=progress,
-            announce=None if options.quiet else lambda line: tell(molecule.name, line),
+            announce=None if options.quiet else lambda said: tell(molecule.name, str(said)),
         )
 
 

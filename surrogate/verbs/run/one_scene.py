@@ -25,7 +25,7 @@ from surrogate.verbs.run.decision import (
     least_budget_s,
     seconds_of_first,
 )
-from surrogate.verbs.run.rates import measure
+from surrogate.verbs.run.rates import by_openmm, measure
 from surrogate.verbs.run.run_record import (
     RUN_NAME,
     RunRecord,
@@ -38,7 +38,7 @@ from surrogate.verbs.run.stage_clock import Clock, Pace
 from surrogate.verbs.run.stages import STAGES, Site, load_judge, md_options
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
-from systems.errors import InputError, SurromdError
+from systems.errors import InputError, SimulationError, SurromdError
 from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.claim import Claim
 
@@ -158,6 +158,8 @@ class _Run:
 
     def _do(self, name: Stage) -> None:
         stage, record = STAGES[name], self.record
+        rates = record.rates
+        assert rates is not None
         frames = self._frames(name) if name in MD_STAGES else 0
         left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
 
@@ -165,8 +167,7 @@ class _Run:
             # The report is made however long it takes: without it all else was in vain.
             if name == "report":
                 return math.inf
-            assert record.rates is not None
-            return seconds_of_first(self._pending, record.rates, every_ps, left_s, frames, pace)
+            return seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace)
 
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
@@ -175,9 +176,12 @@ class _Run:
         try:
             done = self.clock.work(name, may_take, lambda: stage.work(self.site, record))
         except SurromdError as error:
-            if not stage.may_fail:
+            if name in MD_STAGES and isinstance(error, SimulationError) and rates.at_once > 1:
+                self._by_openmm(name, str(error))
+            elif stage.may_fail:
+                self._failed(name, str(error))
+            else:
                 raise
-            self._failed(name, str(error))
             return
         finally:
             self.kept.stage = ""
@@ -197,12 +201,23 @@ class _Run:
         self._ended(STAGES[name].found(self.site, self.record) or self.record, StageEntry(name, "failed", 0.0, reason))
         if name in _OF_SURROGATE and not self.record.trajectory and self.decision.way != "md":
             self._by_md(f"{name} failed ({reason})")
+            self.say("MD for the rest of the budget")
 
     def _ended(self, found: RunRecord, entry: StageEntry) -> None:
         """Enter what a stage came to, and how it ended."""
         now = self.record  # with what is spent
         entry = replace(entry, wall_s=now.spent_in.get(entry.name, 0.0))
         self.keep(replace(found.with_stage(entry), spent_s=now.spent_s, spent_in=now.spent_in))
+
+    def _by_openmm(self, name: str, reason: str) -> None:
+        """Go on with a stage of MD by OpenMM where lanes have failed; their good frames stay."""
+        record, why = self.record, f"MD in lanes failed ({reason.rstrip('.')})"
+        assert record.rates is not None
+        rates = by_openmm(record.rates, self.site.scene, self.site.config, why)
+        self.keep(replace(record, rates=rates, lanes_failed=record.rates.replicas))
+        self.say(f"{why}: {name} by OpenMM")
+        if self.decision.way == "md":  # an only replica cannot judge itself
+            self._by_md(why)
 
     def _by_md(self, why: str) -> None:
         """Spend what is left on MD."""
@@ -214,7 +229,6 @@ class _Run:
         stages = tuple(stage for stage in decision.stages if stage.name not in ended)
         decision = replace(decision, stages=stages)
         self.keep(replace(self.record, decision=decision, trajectory=self.record.training))
-        self.say(f"{why}: MD for the rest of the budget")
 
 
 def _beside_training(record: RunRecord, decision: Decision) -> Decision:

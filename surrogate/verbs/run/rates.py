@@ -137,6 +137,16 @@ def _in_lanes(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
     return replace(rates, md=plan.line, md_ps_per_s=ps_per_s, platform=LANES, at_once=at_once)
 
 
+def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
+    """Return the rates without lanes, which is because of `why`."""
+    from md_reference.run.plan import plan_line
+    from md_reference.run.platforms import choose_platform
+
+    choice = choose_platform(scene.n_atoms, "auto", born=config.force.is_born)
+    line = plan_line(scene, config, choice, step_s=rates.step_s)
+    return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_lanes=why)
+
+
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float) -> Rolls:
     """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`: see `Rates`."""
     from surrogate.data.shipped import shipped_weights

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import math
 import threading
@@ -14,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 from surrogate.verbs.bursts import bursts
 from surrogate.verbs.compare import compare
 from surrogate.verbs.options import BurstOptions, MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
-from surrogate.verbs.reference import reference
+from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
 from surrogate.verbs.run.rates import REPLICAS, Rates, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
-from systems.errors import InputError
+from systems.errors import InputError, SimulationError
 from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.preparation import Preparation
@@ -69,48 +70,62 @@ def _rates_and_decision(record: RunRecord) -> tuple[Rates, Decision]:
 
 
 def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
-    """Return a stage of MD into `place`, by the fastest way, replicas on all cores."""
+    """Return a stage of MD into `place`, by the fastest way, replicas on all cores.
 
-    def out(site: Site) -> Path:
-        return site.folder / f"{place}.{site.options.format if name == 'md' else 'h5'}"
+    Where lanes have failed in this run, it is OpenMM's, in files beside theirs.
+    """
+
+    def outs(site: Site, replicas: int, mark: str = "") -> list[Path]:
+        from systems.trajectory.claim import replica_paths
+
+        return replica_paths(site.folder / f"{place}{mark}.{site.options.format if name == 'md' else 'h5'}", replicas)
+
+    def by_now(site: Site, record: RunRecord) -> list[Path]:
+        assert record.rates is not None
+        return outs(site, record.rates.replicas, "-openmm" if record.lanes_failed else "")
 
     def work(site: Site, record: RunRecord) -> RunRecord:
+        from md_reference.run.replicas import simulate_replicas
+
         rates, decision = _rates_and_decision(record)
         every_ps = decision.save_every_ps
         expected_ps = md_ps(rates, decision, name) / rates.replicas
-        out(site).parent.mkdir(exist_ok=True)
-        reference(
-            site.scene,
-            out(site),
-            options=md_options(
-                site.options,
-                time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
-                save_every_ps=every_ps,
-                equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
-                replicas=rates.replicas,
-                platform=rates.platform,
-                seed=site.options.seed + seed * _SEEDS_APART,
-                resume=True,
-            ),
+        config = replace(
+            site.config,
+            time_ps=every_ps * max(_LEAST_FRAMES, math.ceil(_AMPLE * rates.stretch * expected_ps / every_ps)),
+            save_every_ps=every_ps,
+            equilibrate_ps=min(site.config.equilibrate_ps, decision.equilibrate_ps),
+            platform=rates.platform,
+            seed=site.options.seed + seed * _SEEDS_APART,
         )
+        files = by_now(site, record)
+        files[0].parent.mkdir(exist_ok=True)
+
+        def heard(said: str | SimulationError) -> None:
+            if isinstance(said, SimulationError) and rates.at_once > 1:  # what is left of lanes is no reason to wait
+                raise said
+
+        with accounted_outputs(files):
+            simulate_replicas(site.scene, config, files, resume=True, announce=heard)
         done = found(site, record)
         if done is None:
             raise InputError("MD wrote no frames.")
         return done
 
     def found(site: Site, record: RunRecord) -> RunRecord | None:
-        from systems.trajectory.claim import replica_paths
-
-        replicas = _rates_and_decision(record)[0].replicas
-        files = _with_frames(site.folder, replica_paths(out(site), replicas))
-        if not files:
+        parts = [by_now(site, record)] + ([outs(site, record.lanes_failed)] if record.lanes_failed else [])
+        files = [_with_frames(site.folder, part) for part in parts]
+        together = tuple(itertools.chain(*files))
+        if not together:
             return None
-        if name == "held-out md":
-            return replace(record, held_out=files)
+        if name == "held-out md":  # beside what an only replica has left to it
+            return replace(record, held_out=tuple(dict.fromkeys((*record.held_out, *together))))
         if name == "training md":
-            return replace(record, training=files)
-        n_own = -(-len(files) // 2) if replicas > 1 else 1
-        return replace(record, trajectory=files[:n_own], held_out=files[n_own:])
+            return replace(record, training=together)
+        n_own = [-(-len(part) // 2) for part in files]
+        own = [part[:n] for part, n in zip(files, n_own, strict=True)]
+        held = [part[n:] for part, n in zip(files, n_own, strict=True)]
+        return replace(record, trajectory=tuple(itertools.chain(*own)), held_out=tuple(itertools.chain(*held)))
 
     return StageOf(work, found)
 

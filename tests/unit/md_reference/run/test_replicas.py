@@ -44,6 +44,18 @@ def test_a_failed_replica_is_named_and_the_others_are_kept(alanine_dipeptide: Sc
     assert told[-1][1] == 8
 
 
+def test_a_failure_is_told_at_once_and_may_end_the_others(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    outs = [tmp_path / "missing" / "a.h5", tmp_path / "b.h5"]
+
+    def heard(said: str | SimulationError) -> None:
+        if isinstance(said, SimulationError):
+            raise said
+
+    with pytest.raises(SimulationError, match=r"1 of 2 replicas failed; replica 0: .*missing"):
+        simulate_replicas(alanine_dipeptide, SHORT, outs, announce=heard, workers=1)
+    assert not outs[1].exists(), "it was waiting"
+
+
 def test_replicas_resume_and_keep_what_is_complete(alanine_dipeptide: Scene, tmp_path: Path) -> None:
     outs = [tmp_path / "a.h5", tmp_path / "b.h5"]
     simulate_replicas(alanine_dipeptide, SHORT, outs[:1])

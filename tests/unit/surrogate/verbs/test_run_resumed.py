@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from md_reference.run.lanes import Lanes
 from surrogate import api
 from surrogate.verbs.run import one_scene, stages
 from surrogate.verbs.run.decision import decide
 from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
 from surrogate.verbs.run.run_record import Outcome, RunRecord, read_run
 from surrogate.verbs.run.stages import Site, StageOf
+from systems.errors import SimulationError
 from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
 
@@ -128,6 +130,35 @@ def test_kills_before_and_after_each_stage_change_nothing(
     assert kept.keys() == undisturbed.keys()
     for name, positions in undisturbed.items():
         assert np.array_equal(kept[name], positions), name
+
+
+@needs_compiler
+@pytest.mark.parametrize("good_frames", [0, 5])
+def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
+    good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, step = [0], Lanes.step
+
+    def fails(self: Lanes, n: int) -> None:
+        count[0] += 1
+        if count[0] > good_frames + 1:  # the first equilibrates
+            raise SimulationError("a copy of the molecule blew up")
+        step(self, n)
+
+    monkeypatch.setattr(Lanes, "step", fails)
+    monkeypatch.setattr(one_scene, "measure", lambda *_: LANES)
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    found = run(tmp_path / "run", "md")
+    assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
+    assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
+    assert "MD in lanes failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
+    kept = frames(tmp_path / "run")
+    in_lanes = [len(positions) for name, positions in kept.items() if "openmm" not in name]
+    assert in_lanes == [good_frames] * (16 if good_frames else 0)
+    assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
+    judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
+    assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]
+    assert run(tmp_path / "run", "md", resume=True)["outcome"] == found["outcome"]
 
 
 def test_ctrl_c_in_each_stage_keeps_everything(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
