@@ -5,12 +5,14 @@
 Each kind of run is made once undisturbed. Then, `--trials` times, it is started anew, killed with all that descends
 from it after a random part of that time, and started again with `--resume` until it ends. Printed is a table: exact
 (all that the finished file holds is that of the undisturbed run), refused (one line, nothing changed), lost (anything
-else).
+else). Of `surromd run`, which the clock ends, exact means that it ends judged, and with every frame up to the last
+checkpoint before it was killed; a line says in which stage that was, and what was spent of the budget in the end.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import shutil
@@ -21,21 +23,27 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(REPOSITORY))
 
+from systems.trajectory.checkpoint import frames_in, read_checkpoints  # noqa: E402
 from systems.trajectory.codec import open_trajectory  # noqa: E402
 
 MD = ["reference", "alanine-dipeptide", "--time", "40ps", "--save-every", "100fs", "--equilibrate", "2ps", "--platform",
       "Reference", "--seed", "3", "--quiet"]  # fmt: skip
 ROLLOUT = ["rollout", "alanine-dipeptide", "--weights", "alanine-dipeptide", "--time", "2ns", "--precision", "fp32",
            "--seed", "1", "--quiet"]  # fmt: skip
-KINDS = {
+RUN = ["run", "alanine-dipeptide", "-o", "run", "--quiet", "--resume"]
+# The files of a finished run; none where they are not to be those of another one.
+KINDS: dict[str, tuple[list[str], list[str]]] = {
     "reference .h5": ([*MD, "-o", "a.h5"], ["a.h5"]),
     "reference .dcd": ([*MD, "-o", "a.dcd"], ["a.dcd"]),
     "reference x 2": ([*MD, "--replicas", "2", "-o", "a.h5"], ["a_r0.h5", "a_r1.h5"]),
     "rollout .h5": ([*ROLLOUT, "-o", "a.h5"], ["a.h5"]),
+    "run, MD": ([*RUN, "--way", "md", "--budget", "60s"], []),
+    "run, surrogate": ([*RUN, "--way", "surrogate", "--budget", "80s"], []),
 }
 
 
@@ -50,9 +58,54 @@ def whole(paths: list[Path]) -> list[bytes]:
     return found
 
 
+def frames(folder: Path) -> dict[str, Any]:
+    """Return the positions in each trajectory of a run's folder, as far as its checkpoint, if there is one, stands."""
+    found = {}
+    for path in sorted(folder.glob("run/*/*.h5")):
+        if frames_in(path):
+            with open_trajectory(path) as reader:
+                found[path.name] = reader.read()
+    for path in folder.glob("run/*/*.checkpoint"):
+        files = read_checkpoints(path)[0][0]["files"]
+        stem, _, first = path.name.removesuffix(".h5.checkpoint").partition("_r")
+        for k, entry in enumerate(files):
+            name = f"{stem}_r{int(first) + k}.h5" if first else f"{stem}.h5"
+            found[name] = found.get(name, [])[: entry["n_frames"]]
+    return found
+
+
+def record(folder: Path) -> dict[str, Any]:
+    path = folder / "run" / "run.json"
+    return dict(json.loads(path.read_text())) if path.exists() else {}
+
+
+def stage(folder: Path) -> str:
+    """Return what a run was doing when it was killed."""
+    found = record(folder)
+    if not found.get("decision"):
+        return "measuring" if found else "preparing"
+    ended = {entry["name"] for entry in found["stages"]}
+    return next((entry["name"] for entry in found["decision"]["stages"] if entry["name"] not in ended), "done")
+
+
+def judged(folder: Path, kept: dict[str, Any]) -> str:
+    """Return what came of a run that was gone on with; `kept`: its frames when it was killed."""
+    found, now = record(folder), frames(folder)
+    for name, positions in kept.items():
+        if len(now.get(name, ())) < len(positions) or (now[name][: len(positions)] != positions).any():
+            return f"lost: {name} had {len(positions)} frames, now {len(now.get(name, ()))}"
+    if not found["outcome"] or not (folder / "run" / "report.html").is_file():
+        return "lost: no report"
+    return "exact"
+
+
 def start(command: list[str], folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                             start_new_session=True)  # fmt: skip
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def trial(command: list[str], names: list[str], truth: list[bytes], after_s: float) -> tuple[str, bool]:
@@ -65,12 +118,18 @@ def trial(command: list[str], names: list[str], truth: list[bytes], after_s: flo
         if alive:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-        before = {path: path.read_bytes() for path in folder.iterdir()}
+        before = contents(folder)
+        kept, killed_in = ({}, "") if names else (frames(folder), stage(folder))
         again = start([*command, "--resume"], folder)
         _, said = again.communicate()
+        if not names:
+            spent = record(folder).get("spent_s", 0.0)
+            sys.stdout.write(f"    after {after_s:.0f} s, {killed_in}; {spent:.0f} s in the end\n")
         if again.returncode:
-            same = {path: path.read_bytes() for path in folder.iterdir()} == before
+            same = contents(folder) == before
             return ("refused" if same and len(said.splitlines()) == 1 else f"lost: {said.strip()}"), alive
+        if not names:
+            return judged(folder, kept), alive
         return ("exact" if whole([folder / name for name in names]) == truth else "lost: other frames"), alive
     except Exception as error:
         return f"lost: {type(error).__name__}: {error}", True
@@ -96,7 +155,8 @@ def main() -> None:
         shutil.rmtree(folder)
         counts, killed = Counter[str](), 0
         for _ in range(args.trials):
-            outcome, alive = trial([args.command, *words], names, truth, rng.uniform(0.1, 1.0) * span_s)
+            least = 0.1 if names else 0.02
+            outcome, alive = trial([args.command, *words], names, truth, rng.uniform(least, 1.0) * span_s)
             counts[outcome.partition(":")[0]] += 1
             killed += alive
             if outcome.startswith("lost"):

@@ -18,6 +18,7 @@ from surrogate.verbs.options import RunOptions
 from surrogate.verbs.reference import settle_run
 from surrogate.verbs.run.decision import (
     MD_STAGES,
+    RESTART_S,
     Decision,
     PlannedStage,
     Stage,
@@ -169,6 +170,11 @@ class _Run:
                 return math.inf
             return seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace)
 
+        if name in MD_STAGES and may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:
+            there = stage.found(self.site, record)
+            if there is not None and (name != "md" or there.held_out):  # processes would hardly have begun
+                self._ended(there, StageEntry(name, "out of time", 0.0))
+                return
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES and self._pending[1].name == "report":
@@ -268,7 +274,10 @@ def _decide(
 ) -> RunRecord:
     """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known."""
     rates = measure(scene, config, options.weights, options.cores)
-    decision = decide(rates, options.budget_s - spent_s(), options.way, save_every_ps=options.save_every_ps)
+    # On a machine so busy that measuring took what the stages need, they get it all the same.
+    least_s = min(options.budget_s, least_budget_s(rates, "md"))
+    left_s = max(options.budget_s - spent_s(), least_s)
+    decision = decide(rates, left_s, options.way, save_every_ps=options.save_every_ps)
     weights = rates.rolls.weights if decision.way == "rollout" and rates.rolls else ""
     return replace(record, rates=rates, decision=decision, weights=weights)
 

@@ -15,12 +15,13 @@ import pytest
 
 from md_reference.run.lanes import Lanes
 from surrogate import api
+from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run import one_scene, stages
-from surrogate.verbs.run.decision import decide
+from surrogate.verbs.run.decision import decide, least_budget_s
 from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
-from surrogate.verbs.run.run_record import Outcome, RunRecord, read_run
+from surrogate.verbs.run.run_record import Outcome, RunRecord, read_run, write_run
 from surrogate.verbs.run.stages import Site, StageOf
-from systems.errors import SimulationError
+from systems.errors import InputError, SimulationError
 from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
 
@@ -159,6 +160,32 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]
     assert run(tmp_path / "run", "md", resume=True)["outcome"] == found["outcome"]
+
+
+def test_a_stage_that_has_no_time_to_go_on_keeps_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = replace(OPENMM, cores=2)
+    monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    with monkeypatch.context() as patch:
+        patch.setitem(stages.STAGES, "md", disturbed(stages.STAGES["md"], after=kill))
+        with pytest.raises(Killed):
+            run(tmp_path, "md")
+    before = frames(tmp_path)
+    left_s = decide(rates, BUDGET_S, "md").seconds("report") + one_scene.RESTART_S - 0.5
+    write_run(tmp_path, replace(read_run(tmp_path), spent_s=BUDGET_S - left_s))
+    monkeypatch.setattr("md_reference.run.replicas.simulate_replicas", kill)
+    assert ended(run(tmp_path, "md", resume=True)) == [("md", "out of time"), ("report", "done")]
+    assert frames(tmp_path).keys() == before.keys() == {"md_r0.h5", "md_r1.h5"}
+
+
+def test_measuring_that_takes_the_budget_leaves_the_stages_the_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: OPENMM)
+    record: Any = replace(RunRecord("CCO", "CCO", "", "", {}), rates=OPENMM)
+    with pytest.raises(InputError, match="19 s are left, too few"):
+        one_scene._decide(record, None, None, RunOptions(budget_s=19.0), lambda: 0.0)  # type: ignore[arg-type]
+    late = one_scene._decide(record, None, None, RunOptions(budget_s=60.0), lambda: 59.0)  # type: ignore[arg-type]
+    assert late.decision is not None
+    assert 19.0 < sum(stage.seconds for stage in late.decision.stages) <= least_budget_s(OPENMM, "md")
 
 
 def test_ctrl_c_in_each_stage_keeps_everything(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
