@@ -8,6 +8,7 @@ import json
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,13 +35,17 @@ if TYPE_CHECKING:
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
 _AMPLE = 2.0
 _LEAST_FRAMES = 20
-# Of a training's time what may go into steps, and processor seconds that do not: frames are read, encoded, programs
-# loaded.
-_OPTIMISING, _BESIDE_STEPS_S = 0.95, 20.0
+# Of a training's time what may go into steps, and must; processor seconds that do not: weights are tried out, frames
+# read and encoded (of an atom in a frame), which may take so large a share.
+_OPTIMISING, _LEAST_OPTIMISING = 0.95, 0.1
+_BESIDE_STEPS_S, _ENCODING_S, _ENCODING = 9.0, 1.2e-5, 0.3
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
-# What the judge takes a third of its time to load when it is first used.
-_OF_JUDGE = ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj")
+# What a stage takes a third of its time, or ten seconds, to load when it is the first to.
+_LOADED_BEFORE: dict[Stage, tuple[str, ...]] = {
+    "report": ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj"),
+    "train": ("torch", "lightning_fabric", "matplotlib.backends.backend_svg", "surrogate.models.lam_slide.trainer"),
+}
 WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
 
 
@@ -144,29 +149,58 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
-    rates, decision = _rates_and_decision(record)
+    _, decision = _rates_and_decision(record)
     dear, seconds = decision.way == "potential", decision.seconds("train")
+    files, beside_s = _to_train_on(site, record, seconds)
+    if not dear and beside_s > (1.0 - _LEAST_OPTIMISING) * seconds:
+        raise InputError(f"it takes {beside_s:.0f} s beside its steps, and has {seconds:.0f} s.")
     options = TrainOptions(
         level=site.options.level if dear else None,
         # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
-        budget_s=seconds if dear else max(_OPTIMISING * seconds - _BESIDE_STEPS_S * rates.stretch, 0.3 * seconds),
+        budget_s=seconds if dear else min(seconds - beside_s, _OPTIMISING * seconds),
         seed=site.options.seed,
         resume=True,
         quiet=True,
     )
-    train(site.scene if dear else [site.folder / file for file in record.training], out, options=options)
-    return _trained(site, record) or record
+    train(site.scene if dear else files, out, options=options)
+    return _rolling(site, record) or record
+
+
+def _to_train_on(site: Site, record: RunRecord, seconds: float) -> tuple[list[Path], float]:
+    """Return as many of the files to train on as can be encoded in time, and the wall seconds of all but the steps."""
+    from systems.trajectory.checkpoint import frames_in
+
+    rates, _ = _rates_and_decision(record)
+    stretch = max(1.0, rates.stretch * rates.alone)
+    files: list[Path] = []
+    encoding_s = 0.0
+    for path in (site.folder / file for file in record.training):
+        encoding_s += stretch * _ENCODING_S * rates.n_atoms * frames_in(path)
+        if files and encoding_s > _ENCODING * seconds:
+            break
+        files.append(path)
+    return files, stretch * _BESIDE_STEPS_S + min(encoding_s, _ENCODING * seconds)
 
 
 def _trained(site: Site, record: RunRecord) -> RunRecord | None:
-    """Return the record with the weights that were trained, and how fast they roll."""
+    """Return the record with the weights that were trained, None where they roll nothing."""
+    with suppress(SimulationError):
+        return _rolling(site, record)
+    return None
+
+
+def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
+    """Return the record with the weights that were trained, and how fast they roll. Raises SimulationError."""
     from surrogate.data.weights import load_weights
 
     out = site.folder / WEIGHTS_NAME
     if not out.exists():
         return None
     rates, _ = _rates_and_decision(record)
-    rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
+    try:
+        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
+    except SimulationError as error:
+        raise SimulationError(f"its weights roll nothing: {str(error).partition(';')[0]}.") from error
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
 
 
@@ -248,14 +282,14 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     return replace(record, outcome=found)
 
 
-def load_judge() -> None:
-    """Load the judge's libraries beside other work, which the report would wait for."""
+def load_beside(coming: Stage) -> None:
+    """Load the libraries of a stage that is to come, beside other work."""
 
     def load() -> None:
-        for name in _OF_JUDGE:
+        for name in _LOADED_BEFORE.get(coming, ()):
             importlib.import_module(name)
 
-    threading.Thread(target=load, name="judge's libraries").start()
+    threading.Thread(target=load, name=f"libraries of {coming}").start()
 
 
 def _nothing(site: Site, record: RunRecord) -> RunRecord | None:

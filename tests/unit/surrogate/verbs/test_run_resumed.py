@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from md_reference.run.lanes import Lanes
+from quick_report import judged_at_once
 from surrogate import api
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run import one_scene, stages
 from surrogate.verbs.run.decision import decide, least_budget_s
 from surrogate.verbs.run.rates import REPLICAS, Rates, Rolls
-from surrogate.verbs.run.run_record import Outcome, RunRecord, read_run, write_run
+from surrogate.verbs.run.run_record import RunRecord, read_run, write_run
 from surrogate.verbs.run.stages import Site, StageOf
 from systems.errors import InputError, SimulationError
-from systems.trajectory.checkpoint import frames_in
 from systems.trajectory.codec import open_trajectory
 
 # As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock, and bursts are too dear.
@@ -85,15 +85,6 @@ def interrupt() -> None:
 
 def ended(found: dict[str, Any]) -> list[tuple[str, str]]:
     return [(stage["name"], stage["status"]) for stage in found["stages"]]
-
-
-def judged_at_once(site: Site, record: RunRecord) -> RunRecord:
-    """A report that only counts; the judge takes seconds, and is tested elsewhere."""
-    held_ps, rolled_ps = (
-        float(sum(frames_in(site.folder / file) for file in files)) for files in (record.held_out, record.trajectory)
-    )
-    (site.folder / stages.REPORT_NAME).write_text("judged")
-    return replace(record, outcome=Outcome("head", "close", "verdict", held_ps, rolled_ps))
 
 
 @pytest.fixture(params=WAYS)

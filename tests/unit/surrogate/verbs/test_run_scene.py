@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from quick_report import judged_at_once
 from surrogate import api
 from surrogate.verbs.run import one_scene, stages
 from surrogate.verbs.run.many_scenes import molecules_in
@@ -80,6 +81,40 @@ def test_md_that_was_made_to_train_on_is_not_made_in_vain(tmp_path: Path, monkey
     assert found["trajectory"] == found["training"] == ["reference/training_r0.h5", "reference/training_r1.h5"]
     assert found["held_out"] == ["reference/held_out_r0.h5", "reference/held_out_r1.h5"]
     assert "training diverged" in found["outcome"]["notes"][0]
+
+
+def test_weights_that_roll_nothing_end_the_training_and_not_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise SimulationError("31 frames and no valid one; try other weights")
+
+    def train(*_: object, **__: object) -> None:
+        (tmp_path / "run" / stages.WEIGHTS_NAME).touch()
+
+    monkeypatch.setattr(
+        one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="nothing", md_ps_per_s=0.01)
+    )
+    monkeypatch.setattr(stages, "train", train)
+    monkeypatch.setattr("surrogate.data.weights.load_weights", lambda path: path)
+    monkeypatch.setattr(stages, "rollout_rate", fail)
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
+    failed = next(stage for stage in found["stages"] if stage["name"] == "train")
+    assert failed["status"] == "failed" and failed["note"] == "its weights roll nothing: 31 frames and no valid one."
+    assert found["decision"]["way"] == "md" and found["outcome"] is not None and not found["weights"]
+
+
+def test_a_training_that_cannot_end_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    busy = replace(SLOW, rolls=None, coverage="nothing", stretch=30.0, md_ps_per_s=1e-3)
+    monkeypatch.setattr(one_scene, "measure", lambda *_: busy)
+    monkeypatch.setattr(stages, "train", begun)
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
+    assert found["stages"][1]["name"] == "train" and "beside its steps, and has" in found["stages"][1]["note"]
 
 
 def test_molecules_are_a_list_a_folder_or_a_campaign(tmp_path: Path) -> None:
