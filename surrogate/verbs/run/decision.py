@@ -103,7 +103,7 @@ def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: f
     budget_s *= _AIM
     most = _frames(rates, budget_s)
     found = _divided(rates, chosen, why, shares, budget_s, most)
-    every_ps = save_every_ps or _interval(rates, max(found.expected_md_ps, found.expected_rollout_ps) / most)
+    every_ps = save_every_ps or _interval(rates, chosen, max(found.expected_md_ps, found.expected_rollout_ps) / most)
     # Of a slow scene fewer frames come together than the judge could read.
     frames = min(most, int((found.expected_md_ps + found.expected_rollout_ps) / every_ps))
     return replace(_divided(rates, chosen, why, shares, budget_s, frames), save_every_ps=every_ps)
@@ -117,8 +117,13 @@ def least_budget_s(rates: Rates, way: Way) -> float:
     """Return the wall seconds that the stages of a way need to come to anything."""
     n_md = sum(name in MD_STAGES for name in _shares(rates, way))
     # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
-    seconds = _JUDGE_LOADING_S + _judge_s(rates, 0) + 2.0 * n_md * _START_S
-    return max(LEAST_BUDGET_S, seconds * min(rates.stretch, _MOST_STRETCH_FORESEEN))
+    judge_s = (_JUDGE_LOADING_S + _judge_s(rates, 0)) * min(rates.stretch, _MOST_STRETCH_FORESEEN)
+    return max(LEAST_BUDGET_S, judge_s + n_md * least_md_s(rates))
+
+
+def least_md_s(rates: Rates) -> float:
+    """Return the wall seconds in which a stage of MD comes to something."""
+    return 2.0 * _START_S * min(rates.stretch, _MOST_STRETCH_FORESEEN)
 
 
 def report_s(rates: Rates, frames: float, stretch: float) -> float:
@@ -215,9 +220,9 @@ def _frames(rates: Rates, budget_s: float) -> int:
     return int(min(_MOST_FRAMES, max(_LEAST_FRAMES, judge_s / (_JUDGE_ATOM_FRAME_S * rates.n_atoms))))
 
 
-def _interval(rates: Rates, least_ps: float) -> float:
+def _interval(rates: Rates, way: Way, least_ps: float) -> float:
     """Return the interval between saved frames: a round multiple of what the surrogate, or else MD, steps by."""
-    base_ps = rates.rolls.lag_ps if rates.rolls else 0.1 if rates.dear else 1.0
+    base_ps = rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.dear else 1.0
     return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
 
 

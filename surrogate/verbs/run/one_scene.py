@@ -24,6 +24,7 @@ from surrogate.verbs.run.decision import (
     Stage,
     decide,
     least_budget_s,
+    least_md_s,
     seconds_of_first,
 )
 from surrogate.verbs.run.rates import by_openmm, measure
@@ -162,19 +163,21 @@ class _Run:
         rates = record.rates
         assert rates is not None
         frames = self._frames(name) if name in MD_STAGES else 0
+        there = stage.found(self.site, record) if name in MD_STAGES else None
+        # Without MD to judge by all else was in vain.
+        least_s = least_md_s(rates) if name in MD_STAGES and there is None else 0.0
         left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
 
         def may_take(pace: Pace) -> float:
             # The report is made however long it takes: without it all else was in vain.
             if name == "report":
                 return math.inf
-            return seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace)
+            return max(least_s, seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace))
 
-        if name in MD_STAGES and may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:
-            there = stage.found(self.site, record)
-            if there is not None and (name != "md" or there.held_out):  # processes would hardly have begun
-                self._ended(there, StageEntry(name, "out of time", 0.0))
-                return
+        enough = there is not None and (name != "md" or bool(there.held_out))
+        if there is not None and enough and may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:
+            self._ended(there, StageEntry(name, "out of time", 0.0))  # processes would hardly have begun
+            return
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES:

@@ -142,9 +142,10 @@ def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
 
 
 def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
+    """Return the files that can be judged: one frame tells no interval."""
     from systems.trajectory.checkpoint import frames_in
 
-    return tuple(str(path.relative_to(folder)) for path in paths if path.exists() and frames_in(path))
+    return tuple(str(path.relative_to(folder)) for path in paths if frames_in(path) > 1)
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
@@ -228,6 +229,8 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=REPLICAS,
+            # Frames of a potential are what its level says, as far as it has learned it: nothing is to mend them by.
+            guard="flag" if rates.dear else "repair",
             resume=True,
             quiet=True,
         ),

@@ -169,6 +169,20 @@ def test_a_stage_that_has_no_time_to_go_on_keeps_its_frames(tmp_path: Path, monk
     assert frames(tmp_path).keys() == before.keys() == {"md_r0.h5", "md_r1.h5"}
 
 
+def test_md_that_judges_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, md_ps_per_s=0.01))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    with monkeypatch.context() as patch:
+        patch.setitem(stages.STAGES, "held-out md", disturbed(stages.STAGES["held-out md"], before=kill))
+        with pytest.raises(Killed):
+            run(tmp_path, "md")
+    write_run(tmp_path, replace(read_run(tmp_path), spent_s=BUDGET_S))
+    found = run(tmp_path, "md", resume=True)
+    assert found["outcome"]["held_out_ps"] >= 2.0 and "held-out md: for 8 s" in (tmp_path / "log.txt").read_text(
+        "utf-8"
+    )
+
+
 def test_measuring_that_takes_the_budget_leaves_the_stages_the_least(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: OPENMM)
     record: Any = replace(RunRecord("CCO", "CCO", "", "", {}), rates=OPENMM)
