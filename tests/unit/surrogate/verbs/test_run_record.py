@@ -24,7 +24,7 @@ from surrogate.verbs.run.run_record import (
     settings_of_run,
     write_run,
 )
-from systems.errors import InputError
+from systems.errors import InputError, PreparationError
 
 RATES = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 320.0, "", Rolls("alanine-dipeptide", 1.0, 1600.0))
 CHEAP = Costs(10.0, 0.0, 200.0, 60.0)
@@ -75,6 +75,19 @@ def test_folders_that_are_not_a_runs_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="`out`"):
         api.run("smiles:CCO", budget_s=60.0, quiet=True)
     assert (tmp_path / "thesis.tex").exists()
+
+
+def test_without_ambertools_a_run_ends_in_one_line_and_peptides_are_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in ("gaff", "ambertools"):
+        monkeypatch.setattr(f"md_reference.forces.small_molecules.{place}.find_ambertools", lambda: None)
+    monkeypatch.setenv("SURROMD_CACHE", str(tmp_path / "cache"))
+    for resume in (False, True):
+        with pytest.raises(PreparationError, match="GAFF2 parameters need AmberTools") as caught:
+            api.run("smiles:CCSCC", tmp_path / "run", budget_s=60.0, resume=resume, quiet=True)
+        assert "\n" not in str(caught.value)
+    api.run("sequence:ACE-GLY-NME", budget_s=60.0, dry_run=True, quiet=True)
 
 
 def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth:

@@ -38,6 +38,17 @@ WAYS = [
 Way = tuple[str, Rates, list[str]]
 
 
+@pytest.fixture(autouse=True)
+def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No run asks for a name or a host."""
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise AssertionError("a run asks the network")
+
+    monkeypatch.setattr("socket.socket.connect", refused)
+    monkeypatch.setattr("socket.getaddrinfo", refused)
+
+
 class Killed(BaseException):
     """Nobody catches it: what is on disk is what a kill leaves."""
 
