@@ -70,7 +70,8 @@ def frames(folder: Path) -> dict[str, Any]:
         stem, _, first = path.name.removesuffix(".h5.checkpoint").partition("_r")
         for k, entry in enumerate(files):
             name = f"{stem}_r{int(first) + k}.h5" if first else f"{stem}.h5"
-            found[name] = found.get(name, [])[: entry["n_frames"]]
+            if name in found:
+                found[name] = found[name][: entry["n_frames"]]
     return found
 
 

@@ -117,13 +117,13 @@ def least_budget_s(rates: Rates, way: Way) -> float:
     """Return the wall seconds that the stages of a way need to come to anything."""
     n_md = sum(name in MD_STAGES for name in _shares(rates, way))
     # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
-    judge_s = (_JUDGE_LOADING_S + _judge_s(rates, 0)) * min(rates.stretch, _MOST_STRETCH_FORESEEN)
-    return max(LEAST_BUDGET_S, judge_s + n_md * least_md_s(rates))
+    seconds = _JUDGE_LOADING_S + _judge_s(rates, 0) + 2.0 * n_md * _START_S
+    return max(LEAST_BUDGET_S, seconds * min(rates.stretch, _MOST_STRETCH_FORESEEN))
 
 
 def least_md_s(rates: Rates) -> float:
-    """Return the wall seconds in which a stage of MD comes to something."""
-    return 2.0 * _START_S * min(rates.stretch, _MOST_STRETCH_FORESEEN)
+    """Return the wall seconds in which a stage of MD comes to something, as busy as the machine is."""
+    return _START_S * max(2.0, rates.stretch)
 
 
 def report_s(rates: Rates, frames: float, stretch: float) -> float:

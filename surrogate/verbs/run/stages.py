@@ -289,8 +289,9 @@ def load_beside(coming: Stage) -> None:
     """Load the libraries of a stage that is to come, beside other work."""
 
     def load() -> None:
-        for name in _LOADED_BEFORE.get(coming, ()):
-            importlib.import_module(name)
+        with suppress(ImportError, RuntimeError):  # the stage says what is missing; or the program is at its end
+            for name in _LOADED_BEFORE.get(coming, ()):
+                importlib.import_module(name)
 
     threading.Thread(target=load, name=f"libraries of {coming}").start()
 
