@@ -162,11 +162,12 @@ class _Run:
         stage, record = STAGES[name], self.record
         rates = record.rates
         assert rates is not None
+        left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
         frames = self._frames(name) if name in MD_STAGES else 0
         there = stage.found(self.site, record) if name in MD_STAGES else None
-        # Without MD to judge by all else was in vain.
-        least_s = least_md_s(rates) if name in MD_STAGES and there is None else 0.0
-        left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
+        # Where less is left than was planned: without MD to judge by all else was in vain.
+        is_late = left_s < sum(pending.seconds for pending in self._pending)
+        least_s = least_md_s(rates) if name in MD_STAGES and there is None and is_late else 0.0
 
         def may_take(pace: Pace) -> float:
             # The report is made however long it takes: without it all else was in vain.
