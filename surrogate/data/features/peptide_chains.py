@@ -22,7 +22,8 @@ from surrogate.models.peptides.chains import (
     ChainScale,
     internal_coordinates,
 )
-from surrogate.models.peptides.phi_signs import UNSIGNED
+from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, RING, THREEFOLD, StatedTorsions
+from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, bonded_graph, ring_bonds
 from systems.errors import InputError
 from systems.scene import Scene
@@ -35,6 +36,11 @@ RIGID_NM = 2e-4
 _LENGTH, _ANGLE, _DIHEDRAL = "length", "angle", "dihedral"
 # Where the first residue's atoms are placed from: caps (ACE), then amino acids.
 _ROOTS = (("CH3", "C", "O"), ("N", "CA", "C"))
+# Glycine's phi has no higher barrier, proline's ring holds it.
+_FREE_PHI = ("GLY", "PRO")
+_BACKBONE = ("N", "CA", "C", "CH3")
+# Neighbours of an atom whose bonds point to the corners of a tetrahedron.
+_TETRAHEDRAL = {"C": 4, "N": 4, "O": 2, "S": 2}
 
 
 def chain_layout(scene: Scene) -> ChainLayout:
@@ -57,7 +63,7 @@ class _Builder:
         self.scene, self.graph = scene, graph
         self.ring = {frozenset(bond) for bond in ring_bonds(scene).tolist()}
         self.residue = scene.residue_of_atom.tolist()
-        self.names = scene.atom_names
+        self.names = self._names()
         self.placed: list[tuple[int, int, int, int]] = []
         self.primary: list[int] = []
         self.residue_of: list[int] = []
@@ -93,6 +99,32 @@ class _Builder:
             if all(name in at for name in names):
                 return at[names[0]], at[names[1]], at[names[2]]
         raise InputError(f"{self.scene.name} begins with {self.scene.residue_names[0]}, no cap and no amino acid.")
+
+    def _names(self) -> list[str]:
+        """Return the atoms' names, those of hydrogens on one atom given anew by where they stand.
+
+        Which of two hydrogens is HB2 differs between molecules and programs, and no motion turns one into the other.
+        """
+        names, x = list(self.scene.atom_names), self.scene.positions_nm
+        for near in range(self.scene.n_atoms):
+            hydrogens = [i for i in self.graph[near] if self.scene.elements[i] == "H"]
+            heavy = sorted((i for i in self.graph[near] if i not in hydrogens), key=lambda i: names[i])
+            if len(hydrogens) < 2 or not heavy:
+                continue
+            known = sorted(hydrogens, key=lambda i: names[i])
+            if len(hydrogens) == 2 and len(heavy) == 1:
+                # Flat, as amides are: the one on the side of what lies beyond, first by name, is the first.
+                beyond = min((i for i in self.graph[heavy[0]] if i != near), key=lambda i: names[i])
+                away = np.abs(torsion(x, [[i, near, heavy[0], beyond] for i in known]))
+                known = [known[k] for k in np.argsort(away, kind="stable")]
+            else:
+                # Around the bond to one neighbour, from another one or from the first hydrogen.
+                start = heavy[1] if len(heavy) > 1 else known[0]
+                turned = torsion(x, [[start, heavy[0], near, i] for i in known]) % (2 * np.pi)
+                known = [known[k] for k in np.argsort(np.where(np.array(known) == start, 0.0, turned), kind="stable")]
+            for atom, name in zip(known, sorted(names[i] for i in hydrogens), strict=True):
+                names[atom] = name
+        return names
 
     def _rank(self, atom: int, near: int) -> tuple[bool, bool, str]:
         """Sorts what lies beyond a bond: on along the backbone first, then heavy atoms, then by name."""
@@ -138,12 +170,44 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
     layout = settled(chain_layout(scene), config.scale)
     fitted = fitted_atoms(scene)
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
-    quads = [q for q in backbone_torsions(scene)["phi"].tolist() if layout.types[residue_of(scene, q)] not in UNSIGNED]
     return ChainFeatures(
         ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
-        torch.tensor([residue_of(scene, q) for q in quads], dtype=torch.long),
-        torch.tensor(quads, dtype=torch.long).reshape(-1, 4),
+        stated_torsions(scene, layout),
     )  # fmt: skip
+
+
+def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
+    """Return the torsions that have states: phi, and those of side chains about bonds between tetrahedral atoms or from
+    one to an aromatic ring, in the order in which they lie outwards."""
+    graph = bonded_graph(scene)
+    ring = {int(i) for i in ring_bonds(scene).flatten()}
+    rows = []
+    for q in backbone_torsions(scene)["phi"].tolist():
+        residue = residue_of(scene, q)
+        if layout.types[residue] not in _FREE_PHI:
+            # As the chain's layout has it, from the carbonyl's carbon back.
+            rows.append((q[::-1], residue, 0, PHI))
+    taken: dict[int, int] = {}
+    for row, quad in enumerate(layout.placed):
+        atom, near, next_, _ = quad
+        # The backbone's torsions place what is not beyond an atom of the side chain.
+        if (
+            layout.kinds[3 + 3 * row + 2] != TURNING
+            or scene.elements[atom] == "H"
+            or scene.atom_names[near] in _BACKBONE
+        ):
+            continue
+        kind = None
+        if all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_)):
+            kind = THREEFOLD
+        elif near in ring and atom in ring:
+            kind = RING
+        residue = int(scene.residue_of_atom[atom])
+        slot = taken.get(residue, 0) + 1
+        if kind is not None and slot < MOST_TORSIONS:
+            taken[residue] = slot
+            rows.append((list(quad), residue, slot, kind))
+    return StatedTorsions.of(rows, len(layout.types))
 
 
 def residue_of(scene: Scene, phi: Sequence[int]) -> int:

@@ -14,19 +14,18 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from surrogate.models.peptides.phi_signs import is_positive
+from surrogate.models.peptides.torsion_states import StatedTorsions
 
 # A number told in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
 _TINY = 1e-12
-# Dihedrals counted from a torsion scatter by 0.3 rad at most.
-_EITHER_SIDE_RAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,11 @@ class ChainLayout:
     @property
     def n_coordinates(self) -> int:
         return 3 + 3 * len(self.placed)
+
+    @property
+    def turning(self) -> list[tuple[int, int, int, int]]:
+        """The rows of `placed` whose dihedral is a torsion."""
+        return [row for k, row in enumerate(self.placed) if self.kinds[3 + 3 * k + 2] == TURNING]
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,6 @@ class ChainCode(nn.Module):
     stiff_at: Tensor
     turning_at: Tensor
     filled: Tensor
-    kept: Tensor
 
     def __init__(self, layout: ChainLayout, scale: ChainScale) -> None:
         super().__init__()
@@ -105,20 +108,7 @@ class ChainCode(nn.Module):
         filled[self.turning_at] = True
         filled[self.turning_at + 1] = True
         self.register_buffer("filled", filled.reshape(self.n_residues, self.n_slots), persistent=False)
-        self.register_buffer("kept", self._unlabelled(scale).reshape(self.n_residues, self.n_slots), persistent=False)
         self.levels = _levels(layout)
-
-    def _unlabelled(self, scale: ChainScale) -> Tensor:
-        """Mark places `(n_residues * n_slots,)` that stay what the given frame has: dihedrals counted from a torsion
-        that lie on either side of it in the data. Which of two hydrogens on one carbon has which name differs between
-        molecules, and no motion turns one into the other."""
-        marked = torch.zeros(self.n_residues * self.n_slots, dtype=torch.bool)
-        for row, primary in enumerate(self.layout.primary):
-            k = 3 + 3 * row + 2
-            key = self.layout.keys[k]
-            if primary != row and self.layout.kinds[k] == STIFF and scale.deviation.get(key, 0.0) > _EITHER_SIDE_RAD:
-                marked[self.layout.residue_of[k] * self.n_slots + scale.slots[key]] = True
-        return marked
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""
@@ -164,27 +154,38 @@ class ChainCode(nn.Module):
 @dataclass(frozen=True, eq=False)
 class ChainFeatures:
     """What a model of peptides is told of one: its `code`, the types of its residues and their neighbours as numbers
-    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, and of the
-    residues `signed` (n,) the four atoms of phi, `phi_quads` (n, 4)."""
+    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, and the
+    torsions that have states, `stated`."""
 
     code: ChainCode
     places: Tensor
     template_nm: npt.NDArray[np.float64]
     fitted: npt.NDArray[np.int64]
-    signed: Tensor
-    phi_quads: Tensor
+    stated: StatedTorsions
 
     def to(self, device: torch.device) -> ChainFeatures:
-        tensors = {name: getattr(self, name).to(device) for name in ("places", "signed", "phi_quads")}
-        return replace(self, code=copy.deepcopy(self.code).to(device), **tensors)
+        code = copy.deepcopy(self.code).to(device)
+        return replace(self, code=code, places=self.places.to(device), stated=self.stated.to(device))
 
-    def positive_phi(self, frames_nm: Tensor) -> Tensor:
-        """Return of frames `(..., n_atoms, 3)` which residues have phi on the left-handed side: `(..., n_residues)`."""
-        quads = self.phi_quads
-        phi = dihedral(*(frames_nm[..., quads[:, k], :].float() for k in range(4)))
-        found = phi.new_zeros(*phi.shape[:-1], len(self.places), dtype=torch.bool)
-        found[..., self.signed] = is_positive(phi)
-        return found
+    @cached_property
+    def signed(self) -> Tensor:
+        """The residues `(n,)` whose phi has two sides."""
+        return self.stated.residue[self.stated.slot == 0]
+
+    @cached_property
+    def state_at(self) -> Tensor:
+        """Which of its residue's torsions `(n_residues, n_slots)` each number tells of; -1 of those without states."""
+        found = torch.full_like(self.code.filled, -1, dtype=torch.long).flatten()
+        turning = dict(zip(self.code.layout.turning, self.code.turning_at.tolist(), strict=True))
+        for quad, slot in zip(self.stated.quads.tolist(), self.stated.slot.tolist(), strict=True):
+            at = turning[tuple(quad)]
+            found[at : at + 2] = slot
+        return found.reshape(self.code.filled.shape)
+
+    def states(self, frames_nm: Tensor) -> Tensor:
+        """Return the states of torsions `(..., n_residues, MOST_TORSIONS)` in frames `(..., n_atoms, 3)`."""
+        quads = self.stated.quads
+        return self.stated.states(dihedral(*(frames_nm[..., quads[:, k], :].float() for k in range(4))))
 
 
 def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, primary: Tensor) -> Tensor:

@@ -4,7 +4,8 @@ An entity's identifier is its residue's type, its neighbours' types and its plac
 internal coordinates of `models.peptides.chains`, so that no first stage is trained and nothing of an unseen sequence
 is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
-chunk has its own time, so that one model serves all spacings.
+chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
+(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from torch.nn import functional as F
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.further_noise import REDRAWS, SIDES, generators
+from surrogate.models.lam_slide.further_noise import REDRAWS, STATES, generators
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import ChainScale
-from surrogate.models.peptides.phi_signs import PhiCrossings, draw_sides, sides_of, times_apart
+from surrogate.models.peptides.torsion_states import MOST_STATES, MOST_TORSIONS, StateJumps, times_apart, told_states
 from surrogate.models.settings import build
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -38,7 +39,7 @@ _FAR = 6
 _LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
-# Chunks that disobey the sides of phi that were drawn for them are drawn again so often.
+# Chunks that disobey the states that were drawn for them are drawn again so often.
 MAX_REDRAWS = 4
 
 
@@ -117,8 +118,8 @@ class TypedLinear(nn.Module):
 
 class Told(NamedTuple):
     """What the evaluations of a chunk have in common: `types` (r,), `of_type` (r, width), `given` (b, 1, r, width) the
-    embedded frame, `of_frames` (b, t, r, width) the frames' times and the sides of phi, `rope` of the frames, and of
-    each layer the `biases` between residues.
+    embedded frame, `of_frames` (b, t, r, width) the frames' times and states, `rope` of the frames, and of each layer
+    the `biases` between residues.
     """
 
     types: Tensor
@@ -157,7 +158,7 @@ class PeptideFlow(nn.Module):
         self.of_known = TypedLinear(n_slots, c.width, n_types)
         self.of_type = nn.ModuleList(nn.Embedding(n_types, c.width) for _ in range(3))
         self.of_given = nn.Parameter(torch.randn(c.width) * 0.02)
-        self.of_side = nn.Parameter(torch.zeros(c.width))
+        self.of_states = TypedLinear(MOST_TORSIONS * MOST_STATES, c.width, n_types)
         n_waves = 16
         self.register_buffer("waves", math.pi * torch.linspace(1.0 / _LONGEST_WAVE, 4.0, n_waves), persistent=False)
         self.of_time = nn.Sequential(nn.Linear(2 * n_waves, c.width), nn.SiLU(), nn.Linear(c.width, c.width))
@@ -175,10 +176,11 @@ class PeptideFlow(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
         return skip * o + out * self._network(o * scale_in, tau, told)
 
-    def told(self, known: Tensor, times_ps: Tensor, places: Tensor, sides: Tensor) -> Told:
+    def told(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Told:
         """Return what all evaluations of a chunk have in common, of the given frame `known` (b, r, slots), `times_ps`
-        (b, t), `places` (r, 3), and the `sides` (b, t, r) that phi is on: 1, -1, or 0 where it has none."""
+        (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others (`told_states`)."""
         types = places[:, 0]
+        of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
         angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
         place = torch.arange(len(types), device=known.device)
@@ -186,8 +188,8 @@ class PeptideFlow(nn.Module):
         return Told(
             types,
             of_type,
-            self.of_known(known[:, None], types) + self.of_given,
-            self._of_times(times_ps)[:, :, None] + sides[..., None].to(self.of_side.dtype) * self.of_side,
+            self.of_known(known[:, None], types) + of_states[:, :1] + self.of_given,
+            self._of_times(times_ps)[:, :, None] + of_states[:, 1:],
             (angles.cos(), angles.sin()),
             [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
         )
@@ -213,7 +215,8 @@ class PeptideFlow(nn.Module):
 class PeptideSlide(Surrogate):
     """The flow between frames of a peptide, behind the contract of `surrogate.models.interface`.
 
-    `token_mean`, `token_scale` (types, slots): what makes a coordinate's numbers centred and of unit variance;
+    `token_mean` (types, states, slots), `token_scale` (types, slots): what makes a coordinate's numbers centred, for
+    each state of its torsion where that has states (else all are the first), and of unit variance;
     `correlation` (types, lags, slots): with the same coordinate of an earlier frame, at the configuration's lags.
     """
 
@@ -232,9 +235,9 @@ class PeptideSlide(Surrogate):
         self.config = config
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
-        self.crossings = PhiCrossings(n_slots, n_types)
+        self.jumps = StateJumps(n_slots, n_types)
         self.lag_ps = config.shortest_ps
-        self.register_buffer("token_mean", torch.zeros(n_types, n_slots))
+        self.register_buffer("token_mean", torch.zeros(n_types, MOST_STATES, n_slots))
         self.register_buffer("token_scale", torch.ones(n_types, n_slots))
         self.register_buffer("correlation", torch.zeros(n_types, len(config.lags_ps), n_slots))
 
@@ -265,16 +268,28 @@ class PeptideSlide(Surrogate):
         model.lag_ps = lag_ps
         return model
 
-    def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> Tensor:
-        """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places."""
-        types = chain.places[:, 0]
-        tokens = chain.code.encode(frames_nm)
-        return torch.where(chain.code.filled, (tokens - self.token_mean[types]) / self.token_scale[types], 0.0)
+    def normalised(self, frames_nm: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor]:
+        """Frames `(..., n_atoms, 3)` nm -> numbers `(..., n_residues, n_slots)`, zero in empty places, and the states
+        `(..., n_residues, MOST_TORSIONS)` of torsions."""
+        types, states = chain.places[:, 0], chain.states(frames_nm)
+        centred = chain.code.encode(frames_nm) - self.middle(states, chain)
+        return torch.where(chain.code.filled, centred / self.token_scale[types], 0.0), states
 
-    def frames_of(self, numbers: Tensor, chain: ChainFeatures) -> Tensor:
+    def middle(self, states: Tensor, chain: ChainFeatures) -> Tensor:
+        """Return from where numbers count, `(..., n_residues, n_slots)`, in `states` (..., n_residues,
+        MOST_TORSIONS)."""
+        at = chain.state_at.expand(*states.shape[:-1], -1)
+        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0)))
+        mean = self.token_mean[chain.places[:, 0]]
+        found = mean[:, 0].expand_as(own)
+        for state in range(1, MOST_STATES):
+            found = torch.where(own == state, mean[:, state], found)
+        return found
+
+    def frames_of(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
         """The inverse of `normalised`, each frame laid on the template by heavy atoms."""
         types = chain.places[:, 0]
-        frames = chain.code.decode(numbers.float() * self.token_scale[types] + self.token_mean[types])
+        frames = chain.code.decode(numbers.float() * self.token_scale[types] + self.middle(states, chain))
         flat = frames.flatten(0, -3).double().cpu().numpy()
         laid = superpose(flat, chain.template_nm, idx=chain.fitted)
         return torch.from_numpy(laid).float().reshape(frames.shape).to(frames.device)
@@ -313,45 +328,37 @@ class PeptideSlide(Surrogate):
         if chain is None:
             raise InputError("this model knows peptides by residues; make molecules by `data.descriptions.describe`.")
         types, filled = chain.places[:, 0], chain.code.filled
-        known = self.normalised(last_frames_nm[:, -1], chain)
+        known, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None
         ahead = self.lag_ps * torch.arange(1, self.n_new + 1, device=known.device)
         times = ahead.expand(len(known), -1).float()
         drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
-
-        positive = self._draw_sides(last_frames_nm[:, -1], known, times, chain, noise)
+        counts = chain.stated.counts
+        shape = (self.n_new, *counts.shape)
+        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators(noise, STATES)]).to(known)
+        apart = times_apart(times, self.config.forgotten_ps)
+        states = self.jumps.draw(known, now, chain.places, counts, times, apart, uniform)
+        of_states = told_states(torch.cat([now[:, None], states], dim=1), counts)
 
         def solve(rows: Tensor, drawn: Tensor) -> Tensor:
-            told = self.flow.told(known[rows], times[rows], chain.places, sides_of(positive[rows], chain.signed))
+            told = self.flow.told(known[rows], times[rows], chain.places, of_states[rows])
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 return torch.where(filled, self.flow(o, tau, told), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
-            numbers = self.from_innovations(y, known[rows], times[rows], types)
-            return self.frames_of(torch.where(chain.code.kept, known[rows, None], numbers), chain)
+            return self.frames_of(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
 
         rows = torch.arange(len(known), device=known.device)
         frames = solve(rows, drawn)
         for attempt in range(MAX_REDRAWS):
-            rows = rows[(chain.positive_phi(frames[rows]) != positive[rows]).any(-1).any(-1)]
+            rows = rows[(chain.states(frames[rows]) != states[rows]).flatten(1).any(-1)]
             if not len(rows):
                 break
             again = drawn.new_zeros(len(rows), *drawn.shape[1:])
-            shape = (*drawn.shape[1:2], int(filled.sum()))
             seeds = generators(noise[rows], REDRAWS, attempt)
-            again[..., filled] = torch.stack([torch.randn(shape, generator=g) for g in seeds]).to(again)
+            fresh = (*drawn.shape[1:2], int(filled.sum()))
+            again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
             frames[rows] = solve(rows, again)
         return Chunk(frames)
-
-    def _draw_sides(
-        self, last_nm: Tensor, known: Tensor, times_ps: Tensor, chain: ChainFeatures, noise: Tensor
-    ) -> Tensor:
-        """Return on which side of its barrier each residue's phi is to be in each new frame: `(b, t, r)`."""
-        logits = self.crossings(known, chain.places, times_ps, times_apart(times_ps, self.config.forgotten_ps))
-        shape = (times_ps.shape[1], len(chain.signed))
-        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators(noise, SIDES)])
-        every = logits.new_ones(*logits.shape[:3])
-        every[..., chain.signed] = uniform.to(logits)
-        return draw_sides(logits, chain.positive_phi(last_nm), every)

@@ -23,7 +23,7 @@ _EVEN_SHARE = 0.5
 _WHOLE_SHARE = 0.5
 # Share of windows whose later frames are drawn from equilibrium, at a time when the given one is forgotten.
 _FORGOTTEN_SHARE = 0.1
-# Share of windows that are made to hold a crossing of phi's barrier.
+# Share of windows that are made to hold a change of some torsion's state, of phi or of a side chain by turns.
 _CROSSING_SHARE = 0.15
 _LIKELIEST = 0.9
 _MARKOV_LAG_PS = 50.0
@@ -69,18 +69,18 @@ class PeptideSubject:
         for residue in self.chain.signed.tolist():
             name = self.frames.scene.residue_names[residue]
             if name in positive_phi_kt:
-                states = states + len(shares) * self._positive[kept, residue]
+                states = states + len(shares) * self._states[kept, residue, 0]
                 odds = float(np.exp(-positive_phi_kt[name]))
                 shares = np.concatenate([shares, shares * odds])
         return states, shares
 
     @cached_property
-    def _positive(self) -> npt.NDArray[np.bool_]:
-        """Which residues of each frame have phi on the left-handed side: `(n_frames, n_residues)`."""
+    def _states(self) -> npt.NDArray[np.int8]:
+        """The states of torsions in each frame: `(n_frames, n_residues, MOST_TORSIONS)`."""
         blocks = (
             self._frames(k, min(k + _BLOCK, self.frames.n_frames)) for k in range(0, self.frames.n_frames, _BLOCK)
         )
-        return torch.cat([self.chain.positive_phi(block).cpu() for block in blocks]).numpy()
+        return torch.cat([self.chain.states(block).to(torch.int8).cpu() for block in blocks]).numpy()
 
     def _frames(self, low: int, high: int) -> Tensor:
         return torch.from_numpy(self.frames.positions_nm(np.arange(low, high))).to(self.chain.places.device)
@@ -206,7 +206,7 @@ class PeptideSubject:
         """Draw windows as training sees them: half of the batches of whole chunks, the others of fewer frames.
 
         Returns frames and times as `windows` does, and which windows `(n,)` are as likely as there. The others hold a
-        crossing of phi's barrier: a flow that is told of it may see as many as it needs.
+        change of a torsion's state: a flow that is told of it may see as many as it needs.
         """
         later = config.chunk_frames
         if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
@@ -223,8 +223,8 @@ class PeptideSubject:
         equilibrium has it among those on its own side.
         """
         plain = torch.ones(len(idx), dtype=torch.bool)
-        crossings, relative = self._crossings
-        if not len(crossings):
+        kinds, relative = self._crossings
+        if not kinds:
             return idx, times, plain
         asked = (torch.rand(len(idx), generator=generator) < _CROSSING_SHARE) & (times[:, 0] < config.forgotten_ps)
         backwards = torch.rand(len(idx), generator=generator) < (0.0 if self.weights is None else 0.5)
@@ -233,6 +233,7 @@ class PeptideSubject:
             ahead = (times[row] / self.frames.lag_ps).round().long()
             span = int(ahead[-1])
             draws = torch.rand(3, _TRIES, generator=generator, dtype=torch.float64).numpy()
+            crossings = kinds[row % len(kinds)]
             first = crossings[(draws[0] * len(crossings)).astype(np.int64)] - (draws[1] * span).astype(np.int64)
             which = np.searchsorted(ranges[:, 0], first, side="right") - 1
             fits = (
@@ -248,13 +249,16 @@ class PeptideSubject:
         return idx, times, plain
 
     @cached_property
-    def _crossings(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-        """Return the frames after which some phi changes sides, and how likely each frame `(n_frames,)` is to be kept
-        so that those of one side are as in equilibrium, the likeliest (but for a few) always."""
-        positive = self._positive
-        pattern = (positive << np.arange(positive.shape[1])).sum(axis=1)
+    def _crossings(self) -> tuple[list[npt.NDArray[np.int64]], npt.NDArray[np.float64]]:
+        """Return the frames after which some phi changes its state, and those after which a side chain does, where
+        there are any; and how likely each frame `(n_frames,)` is to be kept so that those of one pattern of phi are as
+        in equilibrium, the likeliest (but for a few) always."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
-        found = [low + np.flatnonzero(np.diff(pattern[low:high])) for low, high in ranges]
+        kinds = []
+        for which in (slice(0, 1), slice(1, None)):
+            moved = (np.diff(self._states[:, :, which], axis=0) != 0).any(axis=(1, 2))
+            kinds.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
+        pattern = (self._states[:, :, 0] << np.arange(self._states.shape[1])).sum(axis=1)
         relative = np.ones(len(pattern))
         if self.weights is not None:
             for one in np.unique(pattern):
@@ -262,13 +266,13 @@ class PeptideSubject:
                 kept = self.weights[inside & (self.weights > 0)]
                 if len(kept):
                     relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
-        return np.concatenate(found), relative
+        return [some for some in kinds if len(some)], relative
 
     def seen(self, model: PeptideSlide, idx: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames, and which of their residues have
-        phi on the left-handed side, `(*idx.shape, n_residues)`."""
+        """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames, and the states of their torsions,
+        `(*idx.shape, n_residues, MOST_TORSIONS)`."""
         frames = torch.from_numpy(self.frames.positions_nm(idx.numpy())).to(model.token_mean.device)
-        return model.normalised(frames, self.chain), self.chain.positive_phi(frames)
+        return model.normalised(frames, self.chain)
 
 
 def _distinct(ahead: Tensor, longest: int) -> Tensor:

@@ -21,7 +21,7 @@ from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.phi_signs import crossing_loss, sides_of, times_apart
+from surrogate.models.peptides.torsion_states import MOST_STATES, times_apart, told_states
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
@@ -29,6 +29,7 @@ from systems.errors import InputError
 
 _MEASURED_FRAMES = 4000
 _MEASURED_PAIRS = 4000
+_LEAST_MEASURED = 300
 # Of one molecule; of many fewer of each, so that validation stays a small share of a training.
 _HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL = 128, 16, 1024
 # Flow times and noise of validation are the same each time.
@@ -161,17 +162,22 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     """
     rng = np.random.default_rng(seed)
     lags = model.config.lags_ps
-    n_types, n_slots = model.token_mean.shape
-    sums = torch.zeros(3, n_types, n_slots, dtype=torch.float64)
+    n_types, _, n_slots = model.token_mean.shape
+    sums = torch.zeros(3, n_types, MOST_STATES, n_slots, dtype=torch.float64)
     for subject in subjects:
-        tokens = subject.chain.code.encode(
-            torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + 100))
-        )
+        _count_middles(sums, subject)
+        frames = torch.from_numpy(subject.frames.some_nm(_MEASURED_FRAMES // len(subjects) + _LEAST_MEASURED))
+        tokens, states = subject.chain.code.encode(frames).double(), subject.chain.states(frames)
+        at = subject.chain.state_at
+        own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0).expand(len(states), -1, -1)))
         for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
-            for power in range(3):
-                sums[power, kind] += tokens[:, r].double().pow(power).sum(0)
+            for state in range(MOST_STATES):
+                inside = own[:, r] == state
+                for power in range(3):
+                    sums[power, kind, state] += (tokens[:, r].pow(power) * inside).sum(0)
     mean = sums[1] / sums[0].clamp(min=1)
-    variance = (sums[2] / sums[0].clamp(min=1) - mean.square()).clamp(min=0)
+    within = (sums[2] - sums[0] * mean.square()).clamp(min=0).sum(1)
+    variance = within / sums[0].sum(1).clamp(min=1)
     pairs = [_pairs(subject, n_slots) for subject in subjects]
     for subject, (cosine, places) in zip(subjects, pairs, strict=True):
         for r, slot in zip(cosine.tolist(), places.tolist(), strict=True):
@@ -204,6 +210,15 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     model.correlation.copy_(found.clamp(0.0, 1.0))
 
 
+def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
+    """Count one frame in the middle of each state, so that states never seen have a mean."""
+    stated, slots = subject.chain.stated, subject.chain.state_at
+    for residue, slot, middles in zip(stated.residue.tolist(), stated.slot.tolist(), stated.middles_deg, strict=True):
+        kind, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
+        for place, value in ((at, middles.deg2rad().cos()), (at + 1, middles.deg2rad().sin())):
+            sums[:, kind, :, place] += torch.stack([value**power for power in range(3)]).double()
+
+
 def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
     """Return residue and first slot of each torsion's two numbers."""
     at = subject.chain.code.turning_at
@@ -211,15 +226,15 @@ def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
 
 
 def peptide_loss(
-    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, positive: Tensor, times_ps: Tensor,
+    model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator, *, noisy: bool = True, plain: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-    """Flow matching on the innovations of windows, and the log-likelihood of crossings: `numbers` (b, 1 + t, r, slots)
-    and the sides of phi `positive` (b, 1 + t, r), the first frame given.
+    """Flow matching on the innovations of windows, and the log-likelihood of changes of state: `numbers`
+    (b, 1 + t, r, slots) and `states` (b, 1 + t, r, MOST_TORSIONS), the first frame given.
 
     The flow's error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the
-    given frame is disturbed as in training. `plain` (b,): windows that crossings are counted in; all where not given.
-    Returns the loss and its parts: of torsions' numbers, of stiff ones, of crossings.
+    given frame is disturbed as in training. `plain` (b,): windows that changes are counted in; all where not given.
+    Returns the loss and its parts: of torsions' numbers, of stiff ones, of changes of state.
     """
     c, filled = model.config, chain.code.filled
     known, later = numbers[:, 0], numbers[:, 1:]
@@ -230,7 +245,8 @@ def peptide_loss(
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
-    told = model.flow.told(known, times_ps, chain.places, sides_of(positive[:, 1:], chain.signed))
+    counts = chain.stated.counts
+    told = model.flow.told(known, times_ps, chain.places, told_states(states, counts))
     found = model.flow(alpha * target + sigma * noise, tau, told)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
     error = (found - target).square() * weight
@@ -240,9 +256,8 @@ def peptide_loss(
     of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
     share = c.turning_weight * turning.sum() / (c.turning_weight * turning.sum() + (filled & ~turning).sum())
     of_flow = share * of_turning + (1 - share) * of_stiff
-    counted = torch.zeros(len(numbers), numbers.shape[2], device=numbers.device)
-    counted[:, chain.signed] = 1.0 if plain is None else plain[:, None].to(counted)
-    logits = model.crossings(known, chain.places, times_ps, times_apart(times_ps, c.forgotten_ps))
-    of_crossings = crossing_loss(logits, positive, counted)
-    parts = {"flow": of_flow, "turning": of_turning, "stiff": of_stiff, "crossings": of_crossings}
-    return of_flow + of_crossings, {name: part.detach() for name, part in parts.items()}
+    counted = torch.ones(len(numbers), device=numbers.device) if plain is None else plain.to(numbers)
+    apart = times_apart(times_ps, c.forgotten_ps)
+    of_jumps = model.jumps.loss(known, states, chain.places, counts, times_ps, apart, counted)
+    parts = {"flow": of_flow, "turning": of_turning, "stiff": of_stiff, "jumps": of_jumps}
+    return of_flow + of_jumps, {name: part.detach() for name, part in parts.items()}

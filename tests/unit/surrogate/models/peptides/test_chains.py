@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
 
 from surrogate.data.features.peptide_chains import chain_layout, chain_scale, settled
-from surrogate.models.peptides.chains import RIGID, STIFF, TURNING, ChainCode, ChainLayout, ChainScale
+from surrogate.models.peptides.chains import (
+    RIGID,
+    STIFF,
+    TURNING,
+    ChainCode,
+    ChainLayout,
+    ChainScale,
+    internal_coordinates,
+)
 from systems.chemistry.validity import INVALID, check_frames, geometry_from_frames
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
@@ -130,3 +140,25 @@ def test_what_no_data_tell_of_is_refused(scale: ChainScale) -> None:
         settled(chain_layout(build_peptide("ACE-GLY-NME")), scale)
     with pytest.raises(InputError, match="no single peptide chain"):
         chain_layout(scene_from_smiles("CCO"))
+
+
+def test_hydrogens_are_named_by_where_they_stand() -> None:
+    """Exchanged names of CH2, of an amide's NH2 and of a methyl's hydrogens change no number and no key but a methyl's
+    torsion; with the names as they are, dihedrals of CH2 would turn by 120 degrees."""
+    scene = build_peptide("ACE-ASN-ALA-NME")
+    at = {(int(r), name): i for i, (r, name) in enumerate(zip(scene.residue_of_atom, scene.atom_names, strict=True))}
+    names = list(scene.atom_names)
+    for residue, one, other in ((1, "HB2", "HB3"), (1, "HD21", "HD22"), (2, "HB1", "HB2")):
+        i, j = at[residue, one], at[residue, other]
+        names[i], names[j] = names[j], names[i]
+    found, swapped = chain_layout(scene), chain_layout(replace(scene, atom_names=tuple(names)))
+    assert (found.keys, found.kinds, found.residue_of) == (swapped.keys, swapped.kinds, swapped.residue_of)
+    x = torch.tensor(scene.positions_nm)[None].double()
+    values = [
+        internal_coordinates(x, one.root, torch.tensor(one.placed), torch.tensor(one.primary))[0]
+        for one in (found, swapped)
+    ]
+    apart = torch.abs(torch.atan2((values[0] - values[1]).sin(), (values[0] - values[1]).cos()))
+    moved = [found.keys[k] for k in torch.nonzero(apart > 0.2)[:, 0].tolist()]
+    assert moved == ["ALA dihedral HB1 CB CA N"]
+    assert names != list(scene.atom_names)

@@ -1,0 +1,218 @@
+"""Which state each torsion with high barriers is in, drawn before the flow draws the frames that go with it.
+
+Phi > 0 is entered a few times in a microsecond, a side chain changes its rotamer a few times in a nanosecond. A flow
+that draws barrier crossings along with everything else leaks between the states, since between two modes of noise there
+is always some density. A small network of its own learns by log-likelihood how likely each torsion is to change its
+state from one frame to the next (a categorical draw cannot leak). The flow is told the outcome, draws only how far each
+torsion is from the middle of its state, and frames that disobey are drawn again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+# Beyond the second barrier phi > 0 is the far end of the strands' basin, which reaches across 180 degrees.
+POSITIVE_PHI_DEG = (0.0, 130.0)
+# Of one residue: phi, then those of its side chain outwards; and of one torsion.
+MOST_TORSIONS, MOST_STATES = 5, 3
+# Where the first state begins and how wide all but the last are, degrees: phi (negative, positive), a bond between
+# tetrahedral atoms (gauche+, trans, gauche-), and one to an aromatic ring (its two sides).
+PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
+THREEFOLD = (0.0, (120.0, 240.0))
+RING = (0.0, (180.0, 360.0))
+_WIDTH = 96
+_WAVES = 8
+# Before training, a torsion changes to another state once in so many frames (in logits).
+_RARELY = -5.0
+
+
+@dataclass(frozen=True, eq=False)
+class StatedTorsions:
+    """The torsions of one peptide that have states: `quads` (n, 4) atoms; `residue` and `slot` (n,), where their states
+    stand in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as above."""
+
+    quads: Tensor
+    residue: Tensor
+    slot: Tensor
+    first_deg: Tensor
+    edges_deg: Tensor
+    n_residues: int
+
+    @staticmethod
+    def of(
+        rows: list[tuple[list[int], int, int, tuple[float, tuple[float, float]]]], n_residues: int
+    ) -> StatedTorsions:
+        """Return those of `rows`: four atoms, residue, slot, and PHI, THREEFOLD or RING."""
+        whole = [
+            torch.tensor([row[k] for row in rows], dtype=torch.long).reshape(shape)
+            for k, shape in enumerate(((-1, 4), (-1,), (-1,)))
+        ]
+        first = torch.tensor([row[3][0] for row in rows]).reshape(-1)
+        return StatedTorsions(
+            *whole, first, torch.tensor([row[3][1] for row in rows]).reshape(-1, MOST_STATES - 1), n_residues
+        )
+
+    def to(self, device: torch.device) -> StatedTorsions:
+        tensors = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "n_residues"}
+        return replace(self, **tensors)
+
+    @property
+    def middles_deg(self) -> Tensor:
+        """The middle of each state, `(n, MOST_STATES)`, degrees; of no meaning where there are fewer."""
+        ends = F.pad(self.edges_deg, (1, 1))
+        ends[:, -1] = 360.0
+        return self.first_deg[:, None] + (ends[:, 1:] + ends[:, :-1]) / 2.0
+
+    @cached_property
+    def counts(self) -> Tensor:
+        """How many states each torsion has, `(n_residues, MOST_TORSIONS)`; 0 where there is none."""
+        found = self.residue.new_zeros(self.n_residues, MOST_TORSIONS)
+        found[self.residue, self.slot] = 1 + (self.edges_deg < 360.0).sum(-1)
+        return found
+
+    def states(self, angles: Tensor) -> Tensor:
+        """Angles of these torsions `(..., n)`, rad -> their states `(..., n_residues, MOST_TORSIONS)`; 0 where there is
+        no torsion."""
+        ahead = (angles.rad2deg() - self.first_deg) % 360.0
+        found = angles.new_zeros(*angles.shape[:-1], self.n_residues, MOST_TORSIONS, dtype=torch.long)
+        found[..., self.residue, self.slot] = (ahead[..., None] >= self.edges_deg).sum(-1)
+        return found
+
+
+def told_states(states: Tensor, counts: Tensor) -> Tensor:
+    """States `(..., r, MOST_TORSIONS)` -> numbers `(..., r, MOST_TORSIONS * MOST_STATES)`, 1 for the state that each
+    torsion is in, 0 for others and where `counts` (r, MOST_TORSIONS) says that there is none."""
+    return (F.one_hot(states, MOST_STATES) * (counts > 0)[..., None]).flatten(-2).float()
+
+
+class StateJumps(nn.Module):
+    """The odds that torsions change their states between a frame and the next.
+
+    They follow from the given frame and its states (of the residue and its two neighbours), the residue's type, the
+    states of the frame before and of the one before that, the new states of the residue's torsions before this one
+    (side chains turn two torsions at once), how long after the given frame it is and how far apart the frames are.
+    """
+
+    waves: Tensor
+
+    def __init__(self, n_slots: int, n_types: int) -> None:
+        super().__init__()
+        n_states = MOST_TORSIONS * MOST_STATES
+        self.of_residue = nn.ModuleList(nn.Linear(n_slots + n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_before = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_earlier = nn.Linear(n_states, _WIDTH, bias=False)
+        self.of_type = nn.ModuleList(nn.Embedding(n_types, _WIDTH) for _ in range(3))
+        self.register_buffer("waves", math.pi * torch.linspace(0.25, 2.0, _WAVES), persistent=False)
+        self.of_times = nn.Linear(4 * _WAVES + 2, _WIDTH)
+        self.of_new = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(MOST_TORSIONS))
+        self.of_torsion = nn.Embedding(MOST_TORSIONS, _WIDTH)
+        self.hidden = nn.Linear(_WIDTH, _WIDTH)
+        self.logits = nn.Linear(_WIDTH, MOST_STATES)
+        # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
+        self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        nn.init.zeros_(self.logits.weight)
+        nn.init.constant_(self.logits.bias, _RARELY)
+
+    def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
+        """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
+        `places` (r, 3) -> (b, r, width)."""
+        told = torch.cat([known.float(), told_states(states, counts)], dim=-1)
+        h = sum((of(x) for of, x in zip(self.of_residue, _beside(told), strict=True)), torch.zeros(()))
+        return h + sum((of(places[:, k]) for k, of in enumerate(self.of_type)), torch.zeros(()))
+
+    def of_frames(
+        self, known: Tensor, before: Tensor, earlier: Tensor, times_ps: Tensor, apart_ps: Tensor, counts: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`known` as `of_known` returns it; states `before` each frame and `earlier`, two before, `(b, t, r,
+        MOST_TORSIONS)`; `times_ps` and `apart_ps` (b, t) after the given frame and after the one before -> (b, t, r,
+        width), and the logarithms of `apart_ps`."""
+        told = told_states(before, counts)
+        h = sum((of(x) for of, x in zip(self.of_before, _beside(told), strict=True)), torch.zeros(()))
+        h = h + self.of_earlier(told_states(earlier, counts))
+        logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
+        angles = logs[..., None] * self.waves
+        waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
+        of_times = self.of_times(torch.cat([waves, logs], dim=-1))
+        return known[:, None] + h + of_times[:, :, None], logs[..., 1]
+
+    def odds(
+        self, torsion: int, h: Tensor, logs: Tensor, before: Tensor, new: Tensor, places: Tensor, counts: Tensor
+    ) -> Tensor:
+        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue; `h`, `logs` are
+        what `of_frames` returns, `new` like `before` the new states, of which those of torsions before it count."""
+        told = told_states(new, counts)
+        told[..., torsion * MOST_STATES :] = 0.0
+        h = F.silu(h + self.of_new[torsion](told) + self.of_torsion.weight[torsion])
+        now = before[..., torsion]
+        level, slope = self.of_change[:, places[:, 0], torsion]  # (r, from, to)
+        row = torch.arange(len(places), device=now.device)
+        found = self.logits(F.silu(self.hidden(h))) + level[row, now] + slope[row, now] * logs[..., None, None]
+        # To stay has the logit zero.
+        found = found.masked_fill(F.one_hot(now, MOST_STATES).bool(), 0.0)
+        absent = torch.arange(MOST_STATES, device=now.device) >= counts[:, torsion, None].clamp(min=1)
+        return found.masked_fill(absent, -torch.inf)
+
+    def loss(
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        plain: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """Return the negative log-likelihood of what torsions did, per frame and torsion, of windows `plain` (b,).
+
+        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first.
+        """
+        with torch.autocast(known.device.type, enabled=False):
+            before, new = states[:, :-1], states[:, 1:]
+            earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
+            common = self.of_known(known, states[:, 0], places, counts)
+            h, logs = self.of_frames(common, before, earlier, times_ps, apart_ps, counts)
+            total = known.new_zeros(())
+            for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
+                has = counts[:, torsion] > 0
+                logits = self.odds(torsion, h, logs, before, new, places, counts)[:, :, has]
+                each = F.cross_entropy(logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="none")
+                total = total + (each.view(len(known), -1).sum(1) * plain).sum()
+            found: Tensor = total / ((plain.sum() * times_ps.shape[1] * (counts > 0).sum()).clamp(min=1))
+            return found
+
+    def draw(
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        uniform: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
+        (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
+        with torch.autocast(known.device.type, enabled=False):
+            common = self.of_known(known, states, places, counts)
+            torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
+            before, earlier, found = states[:, None], states[:, None], []
+            for k in range(times_ps.shape[1]):
+                h, logs = self.of_frames(
+                    common, before, earlier, times_ps[:, k : k + 1], apart_ps[:, k : k + 1], counts
+                )
+                new = torch.zeros_like(before)
+                for torsion in torsions:
+                    share = self.odds(torsion, h, logs, before, new, places, counts).softmax(-1).cumsum(-1)
+                    at = uniform[:, k : k + 1, :, torsion, None]
+                    # Shares may end below one by rounding.
+                    drawn = (at >= share[..., :-1]).sum(-1)
+                    new[..., torsion] = torch.minimum(drawn, (counts[:, torsion] - 1).clamp(min=0))
+                found.append(new)
+                before, earlier = new, before
+            return torch.cat(found, dim=1)
+
+
+def times_apart(times_ps: Tensor, forgotten_ps: float) -> Tensor:
+    """Return the time `(b, t)` between each frame and the one before it; frames of endless times know none before."""
+    before = torch.cat([torch.zeros_like(times_ps[:, :1]), times_ps[:, :-1]], dim=1)
+    return torch.where(times_ps >= forgotten_ps, times_ps, times_ps - before)
+
+
+def _beside(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return of residues `(..., r, n)` each itself, the one before it and the one after it."""
+    none = torch.zeros_like(x[..., :1, :])
+    return x, torch.cat([none, x[..., :-1, :]], -2), torch.cat([x[..., 1:, :], none], -2)

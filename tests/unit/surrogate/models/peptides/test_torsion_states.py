@@ -1,0 +1,223 @@
+"""States of torsions: which they are, odds of changes that are learned by log-likelihood, and draws that follow them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from small_scenes import with_phi_turned
+from surrogate.data.descriptions import describe
+from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.torsion_states import (
+    MOST_TORSIONS,
+    PHI,
+    RING,
+    THREEFOLD,
+    StatedTorsions,
+    StateJumps,
+    times_apart,
+    told_states,
+)
+from systems.chemistry.geometry import torsion
+from systems.prepare.peptide import build_peptide
+from systems.scene import Scene
+
+
+@pytest.mark.parametrize(
+    ("kind", "degrees", "states"),
+    [
+        # Strands that reach across 180 degrees are not left-handed.
+        (PHI, [-170.0, -60.0, -1.0, 1.0, 60.0, 129.0, 131.0, 179.0], [0, 0, 0, 1, 1, 1, 0, 0]),
+        (THREEFOLD, [-179.0, -121.0, -119.0, -60.0, -1.0, 1.0, 119.0, 121.0, 180.0], [1, 1, 2, 2, 2, 0, 0, 1, 1]),
+        (RING, [-179.0, -1.0, 1.0, 179.0], [1, 1, 0, 0]),
+    ],
+)
+def test_states_of_angles(
+    kind: tuple[float, tuple[float, float]], degrees: list[float], states: list[int]
+) -> None:  # fmt: skip
+    stated = StatedTorsions.of([([0, 1, 2, 3], 1, 2, kind)], 3)
+    found = stated.states(torch.tensor(degrees).deg2rad()[:, None])
+    assert found.shape == (len(degrees), 3, MOST_TORSIONS)
+    assert found[:, 1, 2].tolist() == states and found.sum() == sum(states)
+    assert int(stated.counts.sum()) == int(stated.counts[1, 2]) == max(states) + 1
+    middles = stated.middles_deg[0, : max(states) + 1]
+    assert stated.states(middles.deg2rad()[:, None])[:, 1, 2].tolist() == list(range(max(states) + 1))
+
+
+def test_the_states_of_frames_are_those_of_their_torsions() -> None:
+    """Glycine has none; strands whose phi is turned by half a circle are left-handed; lysine has four beside phi, of
+    glutamate's three the last is flat, of phenylalanine's the second has two sides."""
+    scene = build_peptide("ACE-GLY-LYS-GLU-PHE-NME")
+    chain = chain_features(scene, _config(scene))
+    assert chain.stated.counts.tolist() == [
+        [0, 0, 0, 0, 0], [0, 0, 0, 0, 0], [2, 3, 3, 3, 3], [2, 3, 3, 0, 0], [2, 3, 2, 0, 0], [0, 0, 0, 0, 0]
+    ]  # fmt: skip
+    assert chain.signed.tolist() == [2, 3, 4]
+    both = np.stack([scene.positions_nm, with_phi_turned(scene)])
+    found = chain.states(torch.tensor(both))
+    quads = [_quad(scene, residue, names) for residue, names in ((2, ("CA", "CB", "CG", "CD")), (3, _CHI1))]
+    degrees = np.degrees(torsion(both, quads)) % 360.0
+    np.testing.assert_array_equal(found[:, 2, 2], degrees[:, 0] // 120.0)
+    np.testing.assert_array_equal(found[:, 3, 1], degrees[:, 1] // 120.0)
+    assert (found[0, 2:5, 0] != found[1, 2:5, 0]).all()
+    told = told_states(found, chain.stated.counts)
+    assert told.sum(-1).tolist() == [[0, 0, 5, 3, 3, 0]] * 2
+
+
+_CHI1 = ("N", "CA", "CB", "CG")
+
+
+def _quad(scene: Scene, residue: int, names: tuple[str, ...]) -> list[int]:
+    at = {name: i for i, name in enumerate(scene.atom_names) if scene.residue_of_atom[i] == residue}
+    return [at[name] for name in names]
+
+
+def _config(scene: Scene) -> PeptideConfig:
+    layout = chain_layout(scene)
+    rng = np.random.default_rng(0)
+    frames = (scene.positions_nm + 0.002 * rng.normal(size=(50, scene.n_atoms, 3))).astype(np.float32)
+    return PeptideConfig(
+        width=16, n_layers=1, n_heads=1, chunk_frames=4, types=tuple(sorted(set(layout.types))),
+        scale=chain_scale([(layout, frames)]),
+    )  # fmt: skip
+
+
+def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
+    scene = build_peptide("ACE-VAL-NME")
+    chain = chain_features(scene, _config(scene))
+    model = PeptideSlide(_config(scene)).requires_grad_(False)
+    model.token_mean.normal_(generator=torch.Generator().manual_seed(0))
+    frames = torch.tensor(scene.positions_nm)[None]
+    numbers, states = model.normalised(frames, chain)
+    stated = chain.state_at[1] == 1
+    assert int(stated.sum()) == 2, "cosine and sine of chi1"
+    other = (states + torch.tensor([0, 1, 0, 0, 0])) % 3
+    moved = (model.middle(other, chain) != model.middle(states, chain))[0]
+    assert torch.equal(moved[1], stated) and not moved[[0, 2]].any()
+    back = chain.code.encode(model.frames_of(numbers, states, chain))
+    torch.testing.assert_close(back, chain.code.encode(frames), rtol=0, atol=1e-4)
+
+
+def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
+    """Odds are set by hand: of two states and of three, one residue without any; a window that is not plain is none."""
+    jumps, counts = StateJumps(4, 2), torch.tensor([[2, 3, 0, 0, 0], [0, 0, 0, 0, 0]])
+    with torch.no_grad():
+        jumps.logits.bias.zero_()
+        jumps.of_change[0, 0, 0, 0, 1] = 1.0  # phi from negative to positive
+        jumps.of_change[1, 0, 0, 0, 1] = 0.5  # and with time
+        jumps.of_change[0, 0, 1, 2, :] = torch.tensor([-1.0, 2.0, 9.0])  # the last is not to change
+    states = torch.zeros(2, 2, 2, MOST_TORSIONS, dtype=torch.long)
+    states[:, :, 0] = torch.tensor([[0, 2, 0, 0, 0], [1, 1, 0, 0, 0]])
+    states[1] = states[1].flip(0)
+    time = torch.full((2, 1), 100.0)
+    places = torch.tensor([[0, 1, 1], [1, 0, 0]])
+    known = torch.zeros(2, 2, 4)
+    found = jumps.loss(known, states, places, counts, time, time, torch.tensor([1.0, 0.0]))
+    crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0)))
+    turns = np.exp(2.0) / (np.exp(-1.0) + np.exp(2.0) + 1.0)
+    assert float(found) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
+
+
+def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once() -> None:
+    """Of three states each is left for the next at a known rate; the second torsion turns when the first has."""
+    jumps, counts = StateJumps(4, 2).requires_grad_(False), torch.tensor([[0, 3, 3, 0, 0]])
+    jumps.logits.bias.fill_(-30.0)
+    rates = {(0, 1): 0.02, (1, 2): 0.1, (2, 0): 0.3}
+    for (a, b), rate in rates.items():
+        jumps.of_change[0, 0, 1, a, b] = 30.0 + float(np.log(rate / (1 - rate)))
+    seen = jumps.of_new[2].weight
+    n, frames = 400, 200
+    time = torch.ones(n, frames)
+    uniform = torch.rand(n, frames, 1, MOST_TORSIONS, generator=torch.Generator().manual_seed(0))
+    known, places = torch.zeros(n, 1, 4), torch.tensor([[0, 1, 1]])
+    start = torch.zeros(n, 1, MOST_TORSIONS, dtype=torch.long)
+    drawn = jumps.draw(known, start, places, counts, time, time, uniform)[:, :, 0]
+    assert drawn.shape == (n, frames, MOST_TORSIONS) and not drawn[..., [0, 2, 3, 4]].any()
+    before, after = drawn[:, :-1, 1], drawn[:, 1:, 1]
+    for a in range(3):
+        for b in set(range(3)) - {a}:
+            share = float(((before == a) & (after == b)).sum() / (before == a).sum())
+            assert share == pytest.approx(rates.get((a, b), 0.0), rel=0.1, abs=1e-9)
+    assert seen.shape[1] == told_states(start, counts).shape[-1]
+
+
+def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() -> None:
+    torch.manual_seed(0)
+    jumps, counts = StateJumps(4, 2).requires_grad_(False), torch.tensor([[2, 3, 3, 0, 0]])
+    torch.nn.init.normal_(jumps.logits.weight)
+    before = torch.zeros(1, 1, 1, MOST_TORSIONS, dtype=torch.long)
+    places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
+    common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
+    h, logs = jumps.of_frames(common, before, before, time, time, counts)
+
+    def odds(**moved: int) -> torch.Tensor:
+        new = before.clone()
+        for name, state in moved.items():
+            new[..., int(name[1:])] = state
+        return jumps.odds(1, h, logs, before, new, places, counts)
+
+    assert not torch.equal(odds(), odds(t0=1))
+    assert torch.equal(odds(), odds(t1=2)) and torch.equal(odds(), odds(t2=1))
+
+
+def test_times_between_frames_and_endless_ones() -> None:
+    times = torch.tensor([[1.0, 3.0, 7.0], [1e4, 1e4, 1e4]])
+    assert times_apart(times, 1e4).tolist() == [[1.0, 2.0, 4.0], [1e4, 1e4, 1e4]]
+
+
+def test_rates_of_two_residue_types_are_learned() -> None:
+    """One type leaves phi > 0 ten times as often as the other; frames of 1 and of 10 ps, odds accordingly."""
+    torch.manual_seed(0)
+    net, counts = StateJumps(6, 4), torch.tensor([[2, 0, 0, 0, 0], [2, 0, 0, 0, 0]])
+    places = torch.tensor([[2, 0, 3], [3, 2, 1]])
+    leaves = torch.tensor([0.002, 0.02])
+    optimiser = torch.optim.Adam(net.parameters(), lr=0.01)
+    generator = torch.Generator().manual_seed(1)
+    plain = torch.ones(1024)
+    for _ in range(300):
+        times = torch.where(torch.rand(1024, 1, generator=generator) < 0.5, 1.0, 10.0)
+        states = torch.zeros(1024, 2, 2, MOST_TORSIONS, dtype=torch.long)
+        states[:, 0, :, 0] = 1
+        states[:, 1, :, 0] = (torch.rand(1024, 2, generator=generator) >= leaves * times).long()
+        known = torch.randn(1024, 2, 6, generator=generator)
+        loss = net.loss(known, states, places, counts, times, times, plain)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    up = states[:1, 0]
+    for apart_ps in (1.0, 10.0):
+        time = torch.tensor([[apart_ps]])
+        common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
+        h, logs = net.of_frames(common, up[:, None], up[:, None], time, time, counts)
+        odds = net.odds(0, h, logs, up[:, None], up[:, None], places, counts)[0, 0].softmax(-1)[:, 0]
+        np.testing.assert_allclose(odds.detach(), leaves * apart_ps, rtol=0.35)
+
+
+def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_others() -> None:
+    """Before training numbers scatter about the ends of states, so frames disobey as often as not; with the odds at
+    nothing more of them stay in the given states after drawing again, and a row alone is drawn as it is in a batch."""
+    from surrogate.models.peptides import model as module
+
+    scene = build_peptide("ACE-ALA-NME")
+    torch.manual_seed(0)
+    model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
+    model.lag_ps = 1.0
+    torch.nn.init.constant_(model.jumps.logits.bias, -30.0)
+    molecule = describe(model, scene)
+    chain = molecule.chain
+    assert chain is not None
+    last = torch.tensor(scene.positions_nm).float().expand(60, 1, -1, -1)
+    noise = torch.randn(60, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
+    own = chain.states(last[0, 0])
+    shares = []
+    for most in (0, module.MAX_REDRAWS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, "MAX_REDRAWS", most)
+            frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
+        obeys = (chain.states(frames) == own).flatten(1).all(dim=1)
+        shares.append(float(obeys.float().mean()))
+    assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
+    alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
+    torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
