@@ -26,7 +26,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.lanes import Lanes
 from surrogate.bench.recipes.peptide_list import RESIDUES
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
-from surrogate.models.peptides.phi_signs import POSITIVE_PHI_DEG
+from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.prepare.peptide import build_peptide

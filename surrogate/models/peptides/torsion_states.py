@@ -23,6 +23,7 @@ POSITIVE_PHI_DEG = (0.0, 130.0)
 MOST_TORSIONS, MOST_STATES = 5, 3
 # Where the first state begins and how wide all but the last are, degrees: phi (negative, positive), a bond between
 # tetrahedral atoms (gauche+, trans, gauche-), and one to an aromatic ring (its two sides).
+Kind = tuple[float, tuple[float, float]]
 PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
 THREEFOLD = (0.0, (120.0, 240.0))
 RING = (0.0, (180.0, 360.0))

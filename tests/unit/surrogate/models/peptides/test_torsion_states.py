@@ -1,4 +1,4 @@
-"""States of torsions: which they are, odds of changes that are learned by log-likelihood, and draws that follow them."""
+"""States of torsions: which they are, odds of changes learned by log-likelihood, and draws that follow them."""
 
 from __future__ import annotations
 
