@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from surrogate.data.references import References
-from surrogate.data.weights import Weights
+from surrogate.data.weights import Weights, read_header
 from surrogate.models.settings import build
 from systems.errors import InputError
 
@@ -125,6 +125,14 @@ class Trainer(ABC):
         if request.longest_lag_ps is not None and not self.learns_lags:
             unknown.append("`longest_lag_ps`")
         _refuse(request.arch, unknown, "does not know it")
+        if request.start_from is not None:
+            if request.longest_lag_ps is not None:
+                raise InputError("`start_from` takes the configuration of its weights; leave `longest_lag_ps` out.")
+            if request.model:
+                raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
+            found = read_header(request.start_from).arch
+            if found != request.arch:
+                raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """Return the settings that suit the references where they differ from the defaults; those that the request

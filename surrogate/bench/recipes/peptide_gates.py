@@ -254,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         gate.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
         gate.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
     pairs.add_argument("--budget", help="wall time of a training, in place of steps")
+    pairs.add_argument("--from", dest="start", type=Path, help="weights that the training goes on from")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")

@@ -26,12 +26,16 @@ if TYPE_CHECKING:
 _VALIDATE_S = 300.0
 
 
-def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, budget_s: float | None = None) -> None:
+def train_on_pairs(
+    runs: Path, out: Path, n_pairs: int, *, steps: int | None, budget_s: float | None = None, start: Path | None = None
+) -> None:
     """Train on all monomers below `runs` and the first `n_pairs` capped pairs that are there; what is there stays.
 
-    Free energies of phi > 0 are those in the folder of `out`. Raises InputError when fewer pairs have runs.
+    `start`: weights to go on from. Free energies of phi > 0 are those in the folder of `out`. Raises InputError when
+    fewer pairs have runs.
     """
     from surrogate.data.frames import collect_frames
+    from surrogate.data.weights import load_weights
     from surrogate.models.lam_slide.trainer import is_trained
     from surrogate.models.peptides.model import PeptideConfig
     from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
@@ -49,7 +53,8 @@ def train_on_pairs(runs: Path, out: Path, n_pairs: int, *, steps: int | None, bu
         steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
         validate_every_s=_VALIDATE_S,
     )  # fmt: skip
-    train_peptides(sets, out, PeptideConfig(), training, resume=True)
+    known_weights = None if start is None else load_weights(start)
+    train_peptides(sets, out, PeptideConfig(), training, start=known_weights, resume=True)
 
 
 def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
@@ -93,7 +98,8 @@ def pairs_gate(a: argparse.Namespace) -> None:
     for n_pairs in a.pairs:
         out = a.folder / f"pairs-{n_pairs}.safetensors"
         budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
-        train_on_pairs(a.train, out, n_pairs, steps=a.steps if a.budget is None else None, budget_s=budget_s)
+        steps = a.steps if a.budget is None else None
+        train_on_pairs(a.train, out, n_pairs, steps=steps, budget_s=budget_s, start=a.start)
         weights = load_weights(out)
         for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
             runs = sorted(path for path in molecule.rglob("*.h5") if not path.name.startswith("."))

@@ -39,14 +39,6 @@ class LamSlideTrainer(Trainer):
         super().check(request)
         if request.steps is not None and request.steps < 2:
             raise InputError("`steps` must be at least 2: one for each stage.")
-        if request.start_from is not None:
-            if request.longest_lag_ps is not None:
-                raise InputError("`start_from` takes the configuration of its weights; leave `longest_lag_ps` out.")
-            if request.model:
-                raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
-            found = read_header(request.start_from).arch
-            if found != request.arch:
-                raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """See `Trainer.choose`."""

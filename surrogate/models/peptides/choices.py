@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from surrogate.data.references import References
+from surrogate.data.weights import load_weights, read_header
 from surrogate.models.peptides.model import PeptideConfig
 from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
 from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
@@ -16,15 +17,17 @@ _SPAN = 0.9
 class PeptideTrainer(Trainer):
     """One flow for peptides of any sequence and any spacing of frames."""
 
+    goes_on = True
     learns_lags = True
 
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """See `Trainer.choose`."""
         survey, known = references.survey, PeptideConfig()
         found = []
-        if "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
+        going_on = request.start_from is not None
+        if not going_on and "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
             found.append(Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
-        if "longest_ps" not in request.model:
+        if not going_on and "longest_ps" not in request.model:
             reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
             if request.longest_lag_ps is not None:
                 found.append(Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
@@ -38,15 +41,17 @@ class PeptideTrainer(Trainer):
         """See `Trainer.settings`."""
         asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
         training = request.settings(PeptideTraining, asked)
-        return Settings(PeptideConfig.from_dict(request.model), training, frozenset(asked))
+        model = request.model if request.start_from is None else read_header(request.start_from).config
+        return Settings(PeptideConfig.from_dict(model), training, frozenset(asked))
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         """See `Trainer.prepare`."""
         settings, sets = self.settings(request), references.sets()
+        start = None if request.start_from is None else load_weights(request.start_from)
 
         def run(advance: AdvanceFn) -> Path:
             return train_peptides(
-                sets.trained, request.out, settings.model, settings.training, unseen=sets.unseen,
+                sets.trained, request.out, settings.model, settings.training, unseen=sets.unseen, start=start,
                 resume=request.resume, progress=lambda stage, share, metrics: advance(stage, share),
             )  # fmt: skip
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
-from surrogate.data.weights import save_weights
+from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
@@ -67,23 +67,28 @@ def train_peptides(
     training: PeptideTraining,
     *,
     unseen: Sequence[TrainingFrames] = (),
+    start: Weights | None = None,
     resume: bool = False,
     progress: ProgressFn | None = None,
 ) -> Path:
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves.
 
-    `unseen`: sequences held out whole, whose loss the curves show. Every frame of `sets` outside the split is trained
-    on; windows start anywhere. Raises InputError for scenes that are no chains, SimulationError when training diverges.
+    `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
+    Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
+    no chains, SimulationError when training diverges.
     """
     out = Path(out)
     torch.manual_seed(training.seed)
-    config = with_scale(config, sets)
+    config = with_scale(config if start is None else start.model.config, sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (
         [PeptideSubject(f, chain_features(f.scene, config).to(device)) for f in some] for some in (sets, unseen)
     )
-    normalise(model, subjects, training.seed)
+    if start is None:
+        normalise(model, subjects, training.seed)
+    else:
+        model.load_state_dict(start.model.state_dict())
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     stage = StageConfig(
@@ -122,7 +127,7 @@ def train_peptides(
         settings: dict[str, Any] = {"seed": training.seed, "flow_s": round(spent_s, 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
-        save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings))
+        save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
     state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")
     if not resume and is_first_process():

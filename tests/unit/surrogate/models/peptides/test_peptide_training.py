@@ -14,10 +14,13 @@ from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights
+from surrogate.models.peptides.choices import PeptideTrainer
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import PeptideTraining, normalise, train_peptides, with_scale
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.training.trainer import TrainingRequest
+from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
 
@@ -193,3 +196,29 @@ def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frame
         with open_trajectory(trajectory) as reader:
             assert reader.n_frames == 6
             assert np.isfinite(reader.read()).all()
+
+
+def test_a_training_goes_on_from_weights_with_their_scales(tmp_path: Path, frames: TrainingFrames) -> None:
+    """A few steps at a rate of nothing leave all as it was; new frames would have other scales."""
+    first = PeptideTraining(steps=3, batch=8, validate_every_s=1e9)
+    start = load_weights(train_peptides([frames], tmp_path / "a.safetensors", SMALL, first))
+    calmer = replace(frames, coordinates=np.repeat(frames.coordinates[:400], 2, axis=0))
+    still = replace(first, learning_rate=1e-12)
+    found = load_weights(train_peptides([calmer], tmp_path / "b.safetensors", SMALL, still, start=start))
+    anew = load_weights(train_peptides([calmer], tmp_path / "c.safetensors", SMALL, still))
+    for name, value in start.model.state_dict().items():
+        torch.testing.assert_close(found.model.state_dict()[name], value, rtol=0, atol=2e-3)
+    assert not torch.equal(anew.model.correlation, start.model.correlation)
+    assert found.model.config == start.model.config
+
+
+def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, frames: TrainingFrames) -> None:
+    out = train_peptides([frames], tmp_path / "a.safetensors", SMALL, PeptideTraining(steps=1, batch=4))
+    request = TrainingRequest("lam-slide-peptides", tmp_path / "b.safetensors", steps=2, start_from=out)
+    trainer = PeptideTrainer()
+    trainer.check(request)
+    assert trainer.settings(request).model == load_weights(out).model.config
+    with pytest.raises(InputError, match=r"leave \[model\] of `config` out"):
+        trainer.check(replace(request, model={"width": 64}))
+    with pytest.raises(InputError, match="holds lam-slide-peptides, not lam-slide"):
+        trainer.check(replace(request, arch="lam-slide"))
