@@ -50,14 +50,10 @@ class StatedTorsions:
         rows: list[tuple[list[int], int, int, tuple[float, tuple[float, float]]]], n_residues: int
     ) -> StatedTorsions:
         """Return those of `rows`: four atoms, residue, slot, and PHI, THREEFOLD or RING."""
-        whole = [
-            torch.tensor([row[k] for row in rows], dtype=torch.long).reshape(shape)
-            for k, shape in enumerate(((-1, 4), (-1,), (-1,)))
-        ]
-        first = torch.tensor([row[3][0] for row in rows]).reshape(-1)
-        return StatedTorsions(
-            *whole, first, torch.tensor([row[3][1] for row in rows]).reshape(-1, MOST_STATES - 1), n_residues
-        )
+        quads, residue, slot = (torch.tensor([row[k] for row in rows], dtype=torch.long) for k in range(3))
+        first = torch.tensor([kind[0] for *_, kind in rows])
+        edges = torch.tensor([kind[1] for *_, kind in rows]).reshape(-1, MOST_STATES - 1)
+        return StatedTorsions(quads.reshape(-1, 4), residue, slot, first, edges, n_residues)
 
     def to(self, device: torch.device) -> StatedTorsions:
         tensors = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "n_residues"}
