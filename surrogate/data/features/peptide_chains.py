@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,16 @@ from surrogate.models.peptides.chains import (
     ChainScale,
     internal_coordinates,
 )
-from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, RING, THREEFOLD, StatedTorsions
+from surrogate.models.peptides.torsion_states import (
+    FIRST_OF_SIDE_CHAIN,
+    MOST_TORSIONS,
+    PHI,
+    PSI,
+    RING,
+    THREEFOLD,
+    Kind,
+    StatedTorsions,
+)
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, bonded_graph, ring_bonds
 from systems.errors import InputError
@@ -177,42 +186,26 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
 
 
 def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
-    """Return the torsions that have states: phi, and those of side chains about bonds between tetrahedral atoms or from
-    one to an aromatic ring, in the order in which they lie outwards."""
+    """Return the torsions that have states: phi, psi, and in side chains those about bonds between tetrahedral atoms or
+    from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them."""
     graph = bonded_graph(scene)
     ring = {int(i) for i in ring_bonds(scene).flatten()}
-    rows = []
-    for q in backbone_torsions(scene)["phi"].tolist():
-        residue = residue_of(scene, q)
-        if layout.types[residue] not in _FREE_PHI:
-            # As the chain's layout has it, from the carbonyl's carbon back.
-            rows.append((q[::-1], residue, 0, PHI))
+    rows: list[tuple[list[int], int, int, Kind]] = []
     taken: dict[int, int] = {}
-    for row, quad in enumerate(layout.placed):
-        atom, near, next_, _ = quad
-        # The backbone's torsions place what is not beyond an atom of the side chain.
-        if (
-            layout.kinds[3 + 3 * row + 2] != TURNING
-            or scene.elements[atom] == "H"
-            or scene.atom_names[near] in _BACKBONE
-        ):
-            continue
-        kind = None
-        if all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_)):
-            kind = THREEFOLD
-        elif near in ring and atom in ring:
-            kind = RING
-        residue = int(scene.residue_of_atom[atom])
-        slot = taken.get(residue, 0) + 1
-        if kind is not None and slot < MOST_TORSIONS:
-            taken[residue] = slot
-            rows.append((list(quad), residue, slot, kind))
+    for atom, near, next_, last in layout.turning:
+        residue, names = int(scene.residue_of_atom[near]), tuple(scene.atom_names[i] for i in (atom, near, next_))
+        if names[1:] == ("CA", "N"):
+            if layout.types[residue] not in _FREE_PHI:
+                rows.append(([atom, near, next_, last], residue, 0, PHI))
+        elif names == ("N", "C", "CA"):
+            rows.append(([atom, near, next_, last], residue, 1, PSI))
+        elif names[1] not in _BACKBONE:
+            tetrahedral = all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_))
+            slot = taken.get(residue, FIRST_OF_SIDE_CHAIN)
+            if (tetrahedral or (near in ring and atom in ring)) and slot < MOST_TORSIONS:
+                taken[residue] = slot + 1
+                rows.append(([atom, near, next_, last], residue, slot, THREEFOLD if tetrahedral else RING))
     return StatedTorsions.of(rows, len(layout.types))
-
-
-def residue_of(scene: Scene, phi: Sequence[int]) -> int:
-    """Return the residue that the torsion phi of these four atoms belongs to."""
-    return int(scene.residue_of_atom[phi[2]])
 
 
 def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -> ChainScale:

@@ -15,6 +15,7 @@ from surrogate.data.equilibrium import equilibrium_weights
 from surrogate.data.frames import TrainingFrames
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.torsion_states import FIRST_OF_SIDE_CHAIN
 from systems.errors import InputError
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
@@ -255,8 +256,8 @@ class PeptideSubject:
         in equilibrium, the likeliest (but for a few) always."""
         ranges = self.frames.split.ranges(self.frames.starts, validation=False)
         kinds = []
-        for which in (slice(0, 1), slice(1, None)):
-            moved = (np.diff(self._states[:, :, which], axis=0) != 0).any(axis=(1, 2))
+        for which in self._rare_torsions():
+            moved = (np.diff(self._states[:, which[0], which[1]], axis=0) != 0).any(axis=1)
             kinds.append(np.concatenate([low + np.flatnonzero(moved[low : high - 1]) for low, high in ranges]))
         pattern = (self._states[:, :, 0] << np.arange(self._states.shape[1])).sum(axis=1)
         relative = np.ones(len(pattern))
@@ -267,6 +268,14 @@ class PeptideSubject:
                 if len(kept):
                     relative[inside] = self.weights[inside] / np.quantile(kept, _LIKELIEST)
         return [some for some in kinds if len(some)], relative
+
+    def _rare_torsions(self) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+        """Return residues and slots of phi, and those of heavy side chains: psi and rotors turn often enough."""
+        stated = self.chain.stated.to(torch.device("cpu"))
+        residue, slot = stated.residue.numpy(), stated.slot.numpy()
+        rotor = np.array([self.frames.scene.elements[quad[0]] == "H" for quad in stated.quads.tolist()], dtype=bool)
+        masks = (slot == 0, (slot >= FIRST_OF_SIDE_CHAIN) & ~rotor)
+        return [(residue[which], slot[which]) for which in masks]
 
     def seen(self, model: PeptideSlide, idx: Tensor) -> tuple[Tensor, Tensor]:
         """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames, and the states of their torsions,

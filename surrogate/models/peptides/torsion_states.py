@@ -1,10 +1,10 @@
-"""Which state each torsion with high barriers is in, drawn before the flow draws the frames that go with it.
+"""Which state each torsion with barriers is in, drawn before the flow draws the frames that go with it.
 
-Phi > 0 is entered a few times in a microsecond, a side chain changes its rotamer a few times in a nanosecond. A flow
-that draws barrier crossings along with everything else leaks between the states, since between two modes of noise there
-is always some density. A small network of its own learns by log-likelihood how likely each torsion is to change its
-state from one frame to the next (a categorical draw cannot leak). The flow is told the outcome, draws only how far each
-torsion is from the middle of its state, and frames that disobey are drawn again.
+Phi > 0 is entered a few times in a microsecond, psi and side chains turn a few times in a nanosecond. A flow that draws
+barrier crossings along with everything else leaks between the states, since between two modes of noise there is always
+some density. A small network of its own learns by log-likelihood how likely each torsion is to change its state from
+one frame to the next (a categorical draw cannot leak). The flow is told the outcome, draws only how far each torsion is
+from the middle of its state, and frames that disobey are drawn again.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from torch.nn import functional as F
 
 # Beyond the second barrier phi > 0 is the far end of the strands' basin, which reaches across 180 degrees.
 POSITIVE_PHI_DEG = (0.0, 130.0)
-# Of one residue: phi, then those of its side chain outwards; and of one torsion.
-MOST_TORSIONS, MOST_STATES = 5, 3
-# Where the first state begins and how wide all but the last are, degrees: phi (negative, positive), a bond between
-# tetrahedral atoms (gauche+, trans, gauche-), and one to an aromatic ring (its two sides).
+# Of one residue: phi, psi, then those of its side chain outwards; and of one torsion.
+MOST_TORSIONS, MOST_STATES = 7, 3
+FIRST_OF_SIDE_CHAIN = 2
+# Where the first state begins and where the next ones do, counted from there, degrees: phi (negative, positive), psi
+# (strands, helices), a bond between tetrahedral atoms (gauche+, trans, gauche-), one to an aromatic ring (its sides).
 Kind = tuple[float, tuple[float, float]]
 PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
+PSI = (90.0, (150.0, 360.0))
 THREEFOLD = (0.0, (120.0, 240.0))
 RING = (0.0, (180.0, 360.0))
 _WIDTH = 96
@@ -36,7 +38,7 @@ _RARELY = -5.0
 @dataclass(frozen=True, eq=False)
 class StatedTorsions:
     """The torsions of one peptide that have states: `quads` (n, 4) atoms; `residue` and `slot` (n,), where their states
-    stand in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as above."""
+    stand in `(n_residues, MOST_TORSIONS)`; `first_deg` (n,), `edges_deg` (n, 2) as of PHI."""
 
     quads: Tensor
     residue: Tensor
@@ -49,7 +51,7 @@ class StatedTorsions:
     def of(
         rows: list[tuple[list[int], int, int, tuple[float, tuple[float, float]]]], n_residues: int
     ) -> StatedTorsions:
-        """Return those of `rows`: four atoms, residue, slot, and PHI, THREEFOLD or RING."""
+        """Return those of `rows`: four atoms, residue, slot, and PHI, PSI, THREEFOLD or RING."""
         quads, residue, slot = (torch.tensor([row[k] for row in rows], dtype=torch.long) for k in range(3))
         first = torch.tensor([kind[0] for *_, kind in rows])
         edges = torch.tensor([kind[1] for *_, kind in rows]).reshape(-1, MOST_STATES - 1)
