@@ -9,10 +9,12 @@ import torch
 from small_scenes import with_phi_turned
 from surrogate.data.descriptions import describe
 from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
+from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.torsion_states import (
     MOST_TORSIONS,
     PHI,
+    PSI,
     RING,
     THREEFOLD,
     StatedTorsions,
@@ -30,6 +32,7 @@ from systems.scene import Scene
     [
         # Strands that reach across 180 degrees are not left-handed.
         (PHI, [-170.0, -60.0, -1.0, 1.0, 60.0, 129.0, 131.0, 179.0], [0, 0, 0, 1, 1, 1, 0, 0]),
+        (PSI, [-179.0, -121.0, -119.0, -40.0, 89.0, 91.0, 140.0], [0, 0, 1, 1, 1, 0, 0]),
         (THREEFOLD, [-179.0, -121.0, -119.0, -60.0, -1.0, 1.0, 119.0, 121.0, 180.0], [1, 1, 2, 2, 2, 0, 0, 1, 1]),
         (RING, [-179.0, -1.0, 1.0, 179.0], [1, 1, 0, 0]),
     ],
@@ -47,23 +50,24 @@ def test_states_of_angles(
 
 
 def test_the_states_of_frames_are_those_of_their_torsions() -> None:
-    """Glycine has none; strands whose phi is turned by half a circle are left-handed; lysine has four beside phi, of
-    glutamate's three the last is flat, of phenylalanine's the second has two sides."""
+    """Glycine has psi alone; strands whose phi is turned by half a circle are left-handed; lysine has four and its
+    ammonium's rotor, of glutamate's three the last is flat, of phenylalanine's the second has two sides."""
     scene = build_peptide("ACE-GLY-LYS-GLU-PHE-NME")
     chain = chain_features(scene, _config(scene))
     assert chain.stated.counts.tolist() == [
-        [0, 0, 0, 0, 0], [0, 0, 0, 0, 0], [2, 3, 3, 3, 3], [2, 3, 3, 0, 0], [2, 3, 2, 0, 0], [0, 0, 0, 0, 0]
+        [0, 0, 0, 0, 0, 0, 0], [0, 2, 0, 0, 0, 0, 0], [2, 2, 3, 3, 3, 3, 3], [2, 2, 3, 3, 0, 0, 0],
+        [2, 2, 3, 2, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0],
     ]  # fmt: skip
     assert chain.signed.tolist() == [2, 3, 4]
     both = np.stack([scene.positions_nm, with_phi_turned(scene)])
     found = chain.states(torch.tensor(both))
     quads = [_quad(scene, residue, names) for residue, names in ((2, ("CA", "CB", "CG", "CD")), (3, _CHI1))]
     degrees = np.degrees(torsion(both, quads)) % 360.0
-    np.testing.assert_array_equal(found[:, 2, 2], degrees[:, 0] // 120.0)
-    np.testing.assert_array_equal(found[:, 3, 1], degrees[:, 1] // 120.0)
+    np.testing.assert_array_equal(found[:, 2, 3], degrees[:, 0] // 120.0)
+    np.testing.assert_array_equal(found[:, 3, 2], degrees[:, 1] // 120.0)
     assert (found[0, 2:5, 0] != found[1, 2:5, 0]).all()
     told = told_states(found, chain.stated.counts)
-    assert told.sum(-1).tolist() == [[0, 0, 5, 3, 3, 0]] * 2
+    assert told.sum(-1).tolist() == [[0, 1, 7, 4, 4, 0]] * 2
 
 
 _CHI1 = ("N", "CA", "CB", "CG")
@@ -72,6 +76,10 @@ _CHI1 = ("N", "CA", "CB", "CG")
 def _quad(scene: Scene, residue: int, names: tuple[str, ...]) -> list[int]:
     at = {name: i for i, name in enumerate(scene.atom_names) if scene.residue_of_atom[i] == residue}
     return [at[name] for name in names]
+
+
+def _counts(*rows: list[int]) -> torch.Tensor:
+    return torch.tensor([row + [0] * (MOST_TORSIONS - len(row)) for row in rows])
 
 
 def _config(scene: Scene) -> PeptideConfig:
@@ -91,9 +99,9 @@ def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
     model.token_mean.normal_(generator=torch.Generator().manual_seed(0))
     frames = torch.tensor(scene.positions_nm)[None]
     numbers, states = model.normalised(frames, chain)
-    stated = chain.state_at[1] == 1
+    stated = chain.state_at[1] == 2
     assert int(stated.sum()) == 2, "cosine and sine of chi1"
-    other = (states + torch.tensor([0, 1, 0, 0, 0])) % 3
+    other = (states + torch.tensor([0, 0, 1, 0, 0, 0, 0])) % 3
     moved = (model.middle(other, chain) != model.middle(states, chain))[0]
     assert torch.equal(moved[1], stated) and not moved[[0, 2]].any()
     back = chain.code.encode(model.frames_of(numbers, states, chain))
@@ -102,14 +110,14 @@ def test_numbers_count_from_the_middle_of_the_state_and_come_back() -> None:
 
 def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     """Odds are set by hand: of two states and of three, one residue without any; a window that is not plain is none."""
-    jumps, counts = StateJumps(4, 2), torch.tensor([[2, 3, 0, 0, 0], [0, 0, 0, 0, 0]])
+    jumps, counts = StateJumps(4, 2), _counts([2, 3], [])
     with torch.no_grad():
         jumps.logits.bias.zero_()
         jumps.of_change[0, 0, 0, 0, 1] = 1.0  # phi from negative to positive
         jumps.of_change[1, 0, 0, 0, 1] = 0.5  # and with time
         jumps.of_change[0, 0, 1, 2, :] = torch.tensor([-1.0, 2.0, 9.0])  # the last is not to change
     states = torch.zeros(2, 2, 2, MOST_TORSIONS, dtype=torch.long)
-    states[:, :, 0] = torch.tensor([[0, 2, 0, 0, 0], [1, 1, 0, 0, 0]])
+    states[:, :, 0] = torch.stack([_counts([0, 2])[0], _counts([1, 1])[0]])
     states[1] = states[1].flip(0)
     time = torch.full((2, 1), 100.0)
     places = torch.tensor([[0, 1, 1], [1, 0, 0]])
@@ -122,7 +130,7 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
 
 def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once() -> None:
     """Of three states each is left for the next at a known rate; the second torsion turns when the first has."""
-    jumps, counts = StateJumps(4, 2).requires_grad_(False), torch.tensor([[0, 3, 3, 0, 0]])
+    jumps, counts = StateJumps(4, 2).requires_grad_(False), _counts([0, 3, 3])
     jumps.logits.bias.fill_(-30.0)
     rates = {(0, 1): 0.02, (1, 2): 0.1, (2, 0): 0.3}
     for (a, b), rate in rates.items():
@@ -134,7 +142,7 @@ def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once()
     known, places = torch.zeros(n, 1, 4), torch.tensor([[0, 1, 1]])
     start = torch.zeros(n, 1, MOST_TORSIONS, dtype=torch.long)
     drawn = jumps.draw(known, start, places, counts, time, time, uniform)[:, :, 0]
-    assert drawn.shape == (n, frames, MOST_TORSIONS) and not drawn[..., [0, 2, 3, 4]].any()
+    assert drawn.shape == (n, frames, MOST_TORSIONS) and not drawn[..., [0, *range(2, MOST_TORSIONS)]].any()
     before, after = drawn[:, :-1, 1], drawn[:, 1:, 1]
     for a in range(3):
         for b in set(range(3)) - {a}:
@@ -145,7 +153,7 @@ def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once()
 
 def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() -> None:
     torch.manual_seed(0)
-    jumps, counts = StateJumps(4, 2).requires_grad_(False), torch.tensor([[2, 3, 3, 0, 0]])
+    jumps, counts = StateJumps(4, 2).requires_grad_(False), _counts([2, 3, 3])
     torch.nn.init.normal_(jumps.logits.weight)
     before = torch.zeros(1, 1, 1, MOST_TORSIONS, dtype=torch.long)
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
@@ -170,7 +178,7 @@ def test_times_between_frames_and_endless_ones() -> None:
 def test_rates_of_two_residue_types_are_learned() -> None:
     """One type leaves phi > 0 ten times as often as the other; frames of 1 and of 10 ps, odds accordingly."""
     torch.manual_seed(0)
-    net, counts = StateJumps(6, 4), torch.tensor([[2, 0, 0, 0, 0], [2, 0, 0, 0, 0]])
+    net, counts = StateJumps(6, 4), _counts([2], [2])
     places = torch.tensor([[2, 0, 3], [3, 2, 1]])
     leaves = torch.tensor([0.002, 0.02])
     optimiser = torch.optim.Adam(net.parameters(), lr=0.01)
@@ -195,8 +203,20 @@ def test_rates_of_two_residue_types_are_learned() -> None:
         np.testing.assert_allclose(odds.detach(), leaves * apart_ps, rtol=0.35)
 
 
+def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
+    """Return means `(types, states, slots)` that are the middles of states."""
+    found = torch.zeros_like(model.token_mean)
+    for residue, slot, middles in zip(
+        chain.stated.residue.tolist(), chain.stated.slot.tolist(), chain.stated.middles_deg.deg2rad(), strict=True
+    ):
+        at = int(torch.nonzero(chain.state_at[residue] == slot)[0])
+        found[chain.places[residue, 0], :, at] = middles.cos()
+        found[chain.places[residue, 0], :, at + 1] = middles.sin()
+    return found
+
+
 def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_others() -> None:
-    """Before training numbers scatter about the ends of states, so frames disobey as often as not; with the odds at
+    """With numbers that scatter too widely about the middles of states, many frames disobey; with the odds of changes at
     nothing more of them stay in the given states after drawing again, and a row alone is drawn as it is in a batch."""
     from surrogate.models.peptides import model as module
 
@@ -211,6 +231,8 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     last = torch.tensor(scene.positions_nm).float().expand(60, 1, -1, -1)
     noise = torch.randn(60, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
     own = chain.states(last[0, 0])
+    model.token_scale[chain.places[1, 0]] = 0.6
+    model.token_mean.copy_(_middles(model, chain))
     shares = []
     for most in (0, module.MAX_REDRAWS):
         with pytest.MonkeyPatch.context() as patch:
