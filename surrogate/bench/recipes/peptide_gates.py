@@ -18,6 +18,8 @@ themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numb
 `peptide_runs`), the model rolls each molecule below `--test` as long and as often as MD did. Distances over MD's own
 scatter, beside the library of monomers' torsions (`peptide_scores`).
 
+`verdicts`: what `surromd compare` says of the rollouts that `pairs` left in FOLDER (`--rollouts`, a folder of it).
+
 `free-energy`: of phi > 0 of a capped residue, in kT, by two well-tempered metadynamics runs, which must agree, and by
 the runs of `--md`. What is finished in FOLDER is not done again.
 """
@@ -50,6 +52,7 @@ from surrogate.bench.recipes.peptide_rollouts import (
     rolled,
     thinned,
 )
+from surrogate.bench.recipes.peptide_verdicts import verdicts_gate
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from systems.chemistry.validity import Geometry
 
@@ -237,9 +240,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse and run one gate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     gates = parser.add_subparsers(dest="gate", required=True)
-    names = ("lag", "seeds", "code", "pairs", "free-energy")
-    lag, seeds, code, pairs, energy = (gates.add_parser(name) for name in names)
-    for gate in (lag, seeds, code, pairs, energy):
+    names = ("lag", "seeds", "code", "pairs", "verdicts", "free-energy")
+    lag, seeds, code, pairs, verdicts, energy = (gates.add_parser(name) for name in names)
+    for gate in (lag, seeds, code, pairs, verdicts, energy):
         gate.add_argument("folder", type=Path)
     for gate in (lag, seeds, pairs):
         gate.add_argument("--steps", type=int, default=STEPS, help="optimisation steps of the training")
@@ -252,16 +255,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     lag.add_argument("--plain", action="store_true", help="train on the coordinates themselves, not on innovations")
     for gate in (code, pairs):
         gate.add_argument("--train", type=Path, required=True, help="`train` in a folder of `peptide_runs`")
+    for gate in (code, pairs, verdicts):
         gate.add_argument("--test", type=Path, required=True, help="`test` in a folder of `peptide_runs`")
     pairs.add_argument("--budget", help="wall time of a training, in place of steps")
     pairs.add_argument("--from", dest="start", type=Path, help="weights that the training goes on from")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
+    verdicts.add_argument("--rollouts", required=True, help="folder of rollouts in FOLDER, such as pairs-60")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")
     energy.add_argument("--md", type=Path, nargs="*", default=(), help="long runs of the same molecule")
     a = parser.parse_args(arguments)
     a.folder.mkdir(parents=True, exist_ok=True)
-    gate_of = dict(zip(names, (lag_gate, seeds_gate, code_gate, pairs_gate, free_energy_gate), strict=True))
+    gate_of = dict(
+        zip(names, (lag_gate, seeds_gate, code_gate, pairs_gate, verdicts_gate, free_energy_gate), strict=True)
+    )
     gate_of[a.gate](a)
 
 

@@ -13,7 +13,10 @@ RESIDUES = (
 # Never trained on. Monomers are tested on long runs of their own: their residues are all in training.
 TEST_PAIRS = (("LEU", "SER"), ("VAL", "ASN"), ("PHE", "GLY"), ("LYS", "GLU"), ("ALA", "PRO"), ("TRP", "THR"))
 TEST_MONOMERS = ("ALA", "ASN", "PHE")
-TEST_CHAINS = (("ALA", "SER", "VAL", "LEU"), ("GLY", "TYR", "GLU", "LYS"))
+TEST_CHAINS = (
+    ("SER", "LEU", "ALA"), ("ALA", "SER", "VAL", "LEU"), ("GLY", "TYR", "GLU", "LYS"),
+    ("VAL", "GLY", "ASP", "ALA", "PHE"), ("ALA", "LYS", "LEU", "GLU", "THR", "ILE"),
+)  # fmt: skip
 TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"),)
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
@@ -70,8 +73,8 @@ def held_out_peptides() -> tuple[Peptide, ...]:
     return (
         *(Peptide(pair, True, _TEST_STARTS, 30_000.0) for pair in TEST_PAIRS),
         *(Peptide((residue,), True, _TEST_STARTS, 50_000.0) for residue in TEST_MONOMERS),
-        *(Peptide(residues, True, _TEST_STARTS, 30_000.0) for residues in TEST_CHAINS),
-        *(Peptide(residues, False, _TEST_STARTS, 30_000.0) for residues in TEST_FREE_CHAINS),
+        *(Peptide(residues, True, _TEST_STARTS, 10_000.0) for residues in TEST_CHAINS),
+        *(Peptide(residues, False, _TEST_STARTS, 10_000.0) for residues in TEST_FREE_CHAINS),
     )
 
 

@@ -68,7 +68,7 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
     scene, truth, time_ps = thinned(runs)
     turns = turns_of(scene)
     model = rolled(weights, scene, [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))], time_ps)
-    fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS)
+    fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True)
     geometry = Geometry.from_dict(fitted.domain.geometry)
     valid = [
         float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some])) for some in (truth, model)

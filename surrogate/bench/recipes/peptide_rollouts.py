@@ -41,13 +41,18 @@ def thinned(paths: Sequence[Path], apart_ps: float = FRAMES_PS) -> tuple[Scene, 
 def rolled(
     weights: Weights, scene: Scene, outs: Sequence[Path], time_ps: float, lag_ps: float = FRAMES_PS
 ) -> list[FloatArray]:  # fmt: skip
-    """Return the frames of unguarded rollouts; those that are there are read."""
+    """Return the frames of unguarded rollouts, of molecules longer than any in training too; those that are there are
+    read."""
     from surrogate.sampling.runner import RolloutConfig, rollout
 
     if not all(out.exists() for out in outs):
         outs[0].parent.mkdir(parents=True, exist_ok=True)
         rollout(
-            scene, weights, outs, RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=1, guard="off"), overwrite=True
+            scene,
+            weights,
+            outs,
+            RolloutConfig(time_ps=time_ps, lag_ps=lag_ps, seed=1, guard="off", force=True),
+            overwrite=True,
         )
     return [thinned([out], lag_ps)[1][0] for out in outs]
 
