@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from surrogate.bench.cost_error.effective_page import effective_lines, plot_effective
+from surrogate.bench.cost_error.sweep_settings import OURS
 from surrogate.bench.stress.stress_page import table
 from systems.files.whole_file import create_whole
 
@@ -44,7 +45,7 @@ def markdown(result: dict[str, Any]) -> str:
         f"{config['rounds']} parts [least, greatest]; 95 % intervals in brackets elsewhere.",
         "",
         *([result["machine"]["about"], ""] if "machine" in result else []),
-        "## OpenMM",
+        "## MD",
         "",
         *table([_md_row(row, md) for row in md["cost"]]),
         "",
@@ -99,7 +100,7 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
     figure = Figure(figsize=(8.2, 5.4), layout="constrained")
     axes = figure.add_subplot()
     md = result["md"]
-    for cost, style in zip((c for c in md["cost"] if not c["plain"]), _MD_STYLES, strict=False):
+    for cost, style in zip((c for c in md["cost"] if c["way"] == OURS), _MD_STYLES, strict=False):
         x = 1e-3 * np.asarray(md["lengths_ps"]) * cost["cpu_s_per_ns"]["mean"]
         label = f"OpenMM, {cost['timestep_fs']:g} fs"
         axes.plot(x, md["errors"], style, color="black", lw=1.4 if style == "-" else 0.9, label=label)

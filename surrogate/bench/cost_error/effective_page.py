@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from surrogate.bench.cost_error.effective_samples import break_even, pareto_front
+from surrogate.bench.cost_error.sweep_settings import LANES
 from surrogate.bench.stress.stress_page import table
 
 
@@ -19,12 +20,12 @@ def effective_lines(result: dict[str, Any], sound_percent: float) -> list[str]:
         return ["No torsion relaxes 50 times over in the MD at hand: effective samples are not counted.", ""]
     points = _points(result, sound_percent)
     front = set(pareto_front([(one["rate"], one["distance"]) for one in points]))
-    best = max(one["rate"] for one in points if one["md"])
+    best = max(one["rate"] for one in points if one["md"] and one["way"] != LANES)
     rows = [
         {
             "what": one["name"],
             "effective samples/s": f"{one['rate']:.3g}",
-            "over the fastest MD": f"{one['rate'] / best:.3g}",
+            "over OpenMM": f"{one['rate'] / best:.3g}",
             "JSD": f"{one['distance']:.3f}",
             "front": "yes" if k in front else "",
         }
@@ -38,7 +39,7 @@ def effective_lines(result: dict[str, Any], sound_percent: float) -> list[str]:
         f"Simulated time over 2 max(τ, τ of MD) of {slow['name']} (MD: {slow['tau_ps']:.1f} ps, {slow['samples']:.0f} "
         f"of them at hand), a processor second; distances after {1e-3 * result['config']['time_ps']:g} ns, of MD of "
         f"that length, too. Front: none is both faster and nearer. Settings under {sound_percent:g} % of whole frames "
-        "are left out. Plain: OpenMM's own files and defaults.",
+        "are left out. Over OpenMM: at its fastest. Plain: its own files and defaults. In lanes: sixteen at once.",
         "",
         *_break_even(result, points, best, slow["tau_ps"]),
     ]
@@ -63,7 +64,7 @@ def _break_even(result: dict[str, Any], points: list[dict[str, Any]], md_rate: f
         lines.append(f"- {_name(row)}: " + "; ".join(words))
     if not lines:
         return []
-    return ["Paid for, beside the fastest MD, after:", "", *lines, ""]
+    return ["Paid for, beside OpenMM at its fastest, after:", "", *lines, ""]
 
 
 def plot_effective(result: dict[str, Any], path: Path, sound_percent: float, form: str = "svg") -> None:
@@ -90,7 +91,7 @@ def plot_effective(result: dict[str, Any], path: Path, sound_percent: float, for
              ylabel="Jensen-Shannon distance of the φ/ψ map to held-out MD",
              title=f"{result['scene']}: effective samples against distance")  # fmt: skip
     axes.grid(alpha=0.25)
-    axes.plot([], [], "s", color="black", label="OpenMM")
+    axes.plot([], [], "s", color="black", label="MD")
     axes.plot([], [], "o", color="#d62728", label="surrogate")
     axes.legend(frameon=False, fontsize=8.5)
     figure.savefig(path, format=form, dpi=140)
@@ -108,6 +109,7 @@ def _points(result: dict[str, Any], sound_percent: float) -> list[dict[str, Any]
             "rate": 1e3 / cost["cpu_s_per_ns"]["mean"] / (2.0 * slow["tau_ps"]),
             "distance": distance,
             "md": True,
+            "way": cost["way"],
         }
         for cost in md["cost"]
     ]

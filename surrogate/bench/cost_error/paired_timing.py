@@ -1,4 +1,4 @@
-"""Timing of the surrogate and of OpenMM by turns, in processor seconds for a ns."""
+"""Timing of the surrogate and of MD by turns, in processor seconds for a ns."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
+import numpy as np
+
+from surrogate.bench.cost_error.sweep_settings import LANES, OURS, PLAIN, CostErrorConfig, Setting
 from surrogate.bench.rolling import Frames, Roller
 from surrogate.bench.stress.other_arithmetic import openmm_of
 from systems.errors import SurromdError
 
 if TYPE_CHECKING:
+    from md_reference.run.lanes import Lanes
     from surrogate.data.weights import Weights
     from surrogate.sampling.chunks import ChunkSampler
 
@@ -53,36 +56,65 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
 
 
 def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
-    """Return processor and wall seconds of OpenMM for a ns at each time step, by turns: our set-up, and what OpenMM's
-    manual makes of the model on one thread (`md_setups.plain`), where it knows the force field.
+    """Return processor and wall seconds of MD for a ns, by turns: OpenMM as it is set up here at each time step, MD in
+    lanes at the longest where it runs, and what OpenMM's manual makes of the model on one thread (`md_setups.plain`),
+    where it knows the force field.
 
     A plain step is timed once: it takes the same at any time step, of which 4 fs wants heavier hydrogens.
     """
     with ExitStack() as stack:
         engines = {dt: stack.enter_context(openmm_of(weights.domain, dt, config.seed)) for dt in TIMESTEPS_PS}
         found: dict[float, list[tuple[float, float]]] = {dt: [] for dt in TIMESTEPS_PS}
-        simple = _plain_steps(weights, config)
+        simple, lanes = _plain_steps(weights, config), _in_lanes(weights, config)
         steps: list[tuple[float, float]] = []
+        together: list[tuple[float, float]] = []
         for _ in range(config.rounds):
             for dt, engine in engines.items():
                 n = _steps(config.slice_ps, dt)
                 found[dt].append(_seconds_per_ns(config.slice_ps, lambda e=engine, n=n: e.step(n)))  # type: ignore[misc]
+            if lanes is not None:
+                n = _steps(config.slice_ps, lanes.timestep_ps)
+                together.append(_seconds_per_ns(config.slice_ps * lanes.n_lanes, lambda n=n: lanes.step(n)))  # type: ignore[misc]
             if simple is not None:
                 steps.append(_seconds_per_ns(_steps(config.slice_ps, TIMESTEPS_PS[-1]), simple))
-    rows = [_md_cost("", dt, times) for dt, times in found.items()]
+    rows = [_md_cost(OURS, dt, times) for dt, times in found.items()]
     if steps:
-        rows += [_md_cost(", plain", dt, [(cpu / dt, wall / dt) for cpu, wall in steps]) for dt in TIMESTEPS_PS]
-    return rows
+        rows += [_md_cost(PLAIN, dt, [(cpu / dt, wall / dt) for cpu, wall in steps]) for dt in TIMESTEPS_PS]
+    return rows + ([_md_cost(LANES, TIMESTEPS_PS[-1], together)] if lanes is not None else [])
 
 
-def _md_cost(how: str, timestep_ps: float, times: Sequence[tuple[float, float]]) -> dict[str, Any]:
+def _md_cost(way: str, timestep_ps: float, times: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    name = {OURS: "OpenMM, {:g} fs", PLAIN: "OpenMM, {:g} fs, plain", LANES: "MD in lanes, {:g} fs"}[way]
     return {
-        "label": f"OpenMM, {1e3 * timestep_ps:g} fs{how}",
-        "plain": bool(how),
+        "label": name.format(1e3 * timestep_ps),
+        "way": way,
         "timestep_fs": 1e3 * timestep_ps,
         "cpu_s_per_ns": _spread([cpu for cpu, _ in times]),
         "wall_s_per_ns": _spread([wall for _, wall in times]),
     }
+
+
+def _in_lanes(weights: Weights, config: CostErrorConfig) -> Lanes | None:
+    """Return copies of the molecule in lanes, settled; None where this machine or the force field has none."""
+    from md_reference.forces.forcefield import build_system, resolve
+    from md_reference.forces.spec import ForceFieldSpec
+    from md_reference.run.lanes import Lanes, LanesUnavailableError
+
+    domain = weights.domain
+    try:
+        system = build_system(domain.scene, resolve(domain.scene, ForceFieldSpec.of(domain.conditions)))
+        lanes = Lanes(
+            system, temperature_k=domain.conditions["temperature_k"],
+            friction_per_ps=domain.conditions.get("friction_per_ps") or 1.0, timestep_ps=TIMESTEPS_PS[-1],
+            seed=config.seed,
+        )  # fmt: skip
+    except (KeyError, LanesUnavailableError):
+        return None
+    lanes.check(system, domain.scene.positions_nm)
+    lanes.set_positions(np.repeat(domain.scene.positions_nm[None], lanes.n_lanes, axis=0))
+    lanes.thermalise()
+    lanes.step(_steps(config.slice_ps, TIMESTEPS_PS[-1]))
+    return lanes
 
 
 def _plain_steps(weights: Weights, config: CostErrorConfig) -> Callable[[], object] | None:
