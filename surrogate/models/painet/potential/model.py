@@ -15,10 +15,15 @@ from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
 from surrogate.models.painet.potential.gradient import CompiledGradient, GradientFn, gradient_of
+from surrogate.models.painet.potential.rigid import RigidBonds
 from systems.errors import InputError
+from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
 
 _HYDROGEN = 1
+# Longer steps hold bonds to hydrogen rigid, as reference MD does.
+_FLEXIBLE_PS = 0.002
+_RELAXED_ROUNDS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,8 @@ class PainetPotential(Surrogate):
     exact gradient as forces, so that momentum, angular momentum and energy are kept.
 
     As a surrogate its chunk is MD on this potential: Langevin middle (Zhang 2019) or velocity Verlet, in double
-    precision. Energies are `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training.
+    precision, bonds to hydrogen rigid at steps above 2 fs. Energies are `energy_offset_kj_mol` plus the network's times
+    `energy_scale_kj_mol`, both of training.
     """
 
     arch: ClassVar[str] = "painet-potential"
@@ -68,6 +74,31 @@ class PainetPotential(Surrogate):
         model.config, model._known = replace(self.config, **changes), None
         _ = model.steps_per_frame
         return model
+
+    def features(self, scene: Scene) -> RigidBonds | None:
+        """See `Surrogate.features`: bonds to hydrogen, as long as at the nearest minimum of the energy; None where they
+        are flexible."""
+        molecule = Molecule.of(scene)
+        bonds = [pair for pair in molecule.bonds.tolist() if any(molecule.elements[i] == _HYDROGEN for i in pair)]
+        if self.config.timestep_ps <= _FLEXIBLE_PS or not bonds:
+            return None
+        rest_nm = self._minimum_nm(torch.tensor(scene.positions_nm, dtype=torch.float64), molecule)
+        return RigidBonds.of(rest_nm, torch.tensor(bonds), self.masses_da(molecule))
+
+    def _minimum_nm(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
+        fabric = self.fabric(molecule)
+        with torch.inference_mode(False), torch.enable_grad():
+            x = positions_nm.clone().requires_grad_(True)
+            descent = torch.optim.LBFGS([x], max_iter=_RELAXED_ROUNDS, line_search_fn="strong_wolfe")
+
+            def energy() -> Tensor:
+                descent.zero_grad()
+                total = self.members(x[None], fabric).mean()
+                (x.grad,) = torch.autograd.grad(total, x)
+                return total.detach()
+
+            descent.step(energy)
+            return x.detach()
 
     def compile_forces(self) -> None:
         """See `Surrogate.compile_forces`."""
@@ -133,6 +164,9 @@ class PainetPotential(Surrogate):
             share = masses / masses.sum()
             drawn = thermal * draws[:, :, 0]
             drawn = drawn - (share * drawn).sum(-2, keepdim=True)
+            if (rigid := self._rigid(molecule, self.config.timestep_ps)) is not None:
+                x = rigid.place(x, x)
+                drawn = rigid.project(drawn, x)
             v = drawn if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
             frames = []
             move = self.verlet if self.config.ensemble == "nve" else self.langevin
@@ -173,27 +207,48 @@ class PainetPotential(Surrogate):
         lost = math.sqrt(1.0 - kept * kept) * thermal
         share = masses / masses.sum()
         v = v - (share * v).sum(-2, keepdim=True)
+        rigid = self._rigid(molecule, dt)
         for k in range(draw.shape[2]):
             v = v + dt * self.forces(x, molecule) / masses
-            x = x + 0.5 * dt * v
+            if rigid is not None:
+                v = rigid.project(v, x)
+            free = x + 0.5 * dt * v
             v = kept * v + lost * draw[:, :, k]
             v = v - (share * v).sum(-2, keepdim=True)
-            x = x + 0.5 * dt * v
+            x, v = _drift(x, free, v, 0.5 * dt, rigid, dt)
         return x, v
 
     def verlet(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
                ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The same by velocity Verlet, a leapfrog that shows velocities at full steps; without a bath."""
         dt = self.config.timestep_ps
+        rigid = self._rigid(molecule, dt)
         force = self.forces(x, molecule)
         for _ in range(draw.shape[2]):
             v = v + 0.5 * dt * force / masses
-            x = x + dt * v
+            x, v = _drift(x, x, v, dt, rigid, dt)
             force = self.forces(x, molecule)
             v = v + 0.5 * dt * force / masses
+            if rigid is not None:
+                v = rigid.project(v, x)
         return x, v
+
+    @staticmethod
+    def _rigid(molecule: Molecule, timestep_ps: float) -> RigidBonds | None:
+        return molecule.own if timestep_ps > _FLEXIBLE_PS else None
 
     def set_scales(self, energies_kj_mol: Tensor, forces_kj_mol_nm: Tensor) -> None:
         """Take the units of what is learned from samples: mean energy, and the root mean square force over 0.1 nm."""
         self.energy_offset_kj_mol.fill_(float(energies_kj_mol.mean()))
         self.energy_scale_kj_mol.fill_(max(0.1 * float(forces_kj_mol_nm.square().mean().sqrt()), 1e-3))
+
+
+def _drift(before: Tensor, x: Tensor, v: Tensor, ahead_ps: float, rigid: RigidBonds | None, step_ps: float
+           ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return positions `ahead_ps` after `x`, and velocities; where bonds are rigid, placed along those of `before`,
+    `step_ps` ago, and the velocities that this takes."""
+    free = x + ahead_ps * v
+    if rigid is None:
+        return free, v
+    placed = rigid.place(free, before)
+    return placed, v + (placed - free) / step_ps
