@@ -42,7 +42,7 @@ class RolloutConfig:
     force: bool = option("Roll a scene that leaves the training domain, marked.", False)
     temperature_k: float | None = option("Refused if it is not that of weights that learned frames.", None)
     friction_per_ps: float | None = option("Of the bath, of a learned potential.", None, within=(0.0, None))
-    timestep_ps: float | None = option("Integration step, of a learned potential.", None)
+    timestep_ps: float | None = option("Of a learned potential; above 2fs bonds to hydrogen are rigid.", None)
     hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
     ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
     solver: str | None = option(

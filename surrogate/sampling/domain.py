@@ -131,6 +131,8 @@ def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
         return weights
     model, domain = weights.model.in_bath(asked), weights.domain
     told = {name: value for name, value in asked.items() if name in domain.conditions}
+    if "constrain_hydrogens" in domain.conditions:
+        told["constrain_hydrogens"] = model.config.constrain_hydrogens
     return replace(weights, model=model, domain=replace(domain, conditions={**domain.conditions, **told}))
 
 

@@ -22,7 +22,7 @@ from surrogate.models.painet.potential.model import PainetPotential
 from systems.errors import InputError
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4,
-                        n_members=2, n_new=2, lag_ps=0.002)  # fmt: skip
+                        n_members=2, n_new=2, lag_ps=0.002, timestep_ps=0.001, hydrogen_mass_da=None)  # fmt: skip
 
 
 def lively(config: PotentialConfig = SMALL) -> PainetPotential:

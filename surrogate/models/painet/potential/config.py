@@ -8,6 +8,8 @@ from typing import Any
 from surrogate.models.settings import build
 from systems.errors import InputError
 
+LONGEST_FLEXIBLE_PS = 0.002
+
 
 @dataclass(frozen=True)
 class PotentialConfig:
@@ -20,6 +22,7 @@ class PotentialConfig:
 
     A chunk is `n_new` frames `lag_ps` apart, in steps of `timestep_ps`, in a Langevin bath at `temperature_k`
     with `friction_per_ps`, or with `ensemble` 'nve' without one; hydrogens weigh `hydrogen_mass_da`, if any is given.
+    As of reference MD, steps are of 4 fs, hydrogens of 3 Da and their bonds rigid (`constrain_hydrogens`).
     """
 
     width: int = 64
@@ -39,11 +42,11 @@ class PotentialConfig:
     psi_limit: float = 0.95
     n_new: int = 10
     lag_ps: float = 0.1
-    timestep_ps: float = 0.001
+    timestep_ps: float = 0.004
     temperature_k: float = 300.0
     friction_per_ps: float = 1.0
     ensemble: str = "nvt"
-    hydrogen_mass_da: float | None = None
+    hydrogen_mass_da: float | None = 3.0
 
     def __post_init__(self) -> None:
         if self.attention not in ("auto", "linear", "dense"):
@@ -58,6 +61,11 @@ class PotentialConfig:
             raise InputError(f"n_radial = {self.n_radial} must be at least 2.")
         if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
             raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
+
+    @property
+    def constrain_hydrogens(self) -> bool:
+        """Whether bonds to hydrogen are rigid, as reference MD's are: at steps above 2 fs."""
+        return self.timestep_ps > LONGEST_FLEXIBLE_PS
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

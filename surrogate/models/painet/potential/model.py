@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.config import LONGEST_FLEXIBLE_PS, PotentialConfig
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
 from surrogate.models.painet.potential.gradient import CompiledGradient, GradientFn, gradient_of
@@ -21,8 +21,6 @@ from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
 
 _HYDROGEN = 1
-# Longer steps hold bonds to hydrogen rigid, as reference MD does.
-_FLEXIBLE_PS = 0.002
 _RELAXED_ROUNDS = 100
 
 
@@ -80,7 +78,7 @@ class PainetPotential(Surrogate):
         are flexible."""
         molecule = Molecule.of(scene)
         bonds = [pair for pair in molecule.bonds.tolist() if any(molecule.elements[i] == _HYDROGEN for i in pair)]
-        if self.config.timestep_ps <= _FLEXIBLE_PS or not bonds:
+        if not (self.config.constrain_hydrogens and bonds):
             return None
         rest_nm = self._minimum_nm(torch.tensor(scene.positions_nm, dtype=torch.float64), molecule)
         return RigidBonds.of(rest_nm, torch.tensor(bonds), self.masses_da(molecule))
@@ -235,7 +233,7 @@ class PainetPotential(Surrogate):
 
     @staticmethod
     def _rigid(molecule: Molecule, timestep_ps: float) -> RigidBonds | None:
-        return molecule.own if timestep_ps > _FLEXIBLE_PS else None
+        return molecule.own if timestep_ps > LONGEST_FLEXIBLE_PS else None
 
     def set_scales(self, energies_kj_mol: Tensor, forces_kj_mol_nm: Tensor) -> None:
         """Take the units of what is learned from samples: mean energy, and the root mean square force over 0.1 nm."""

@@ -348,7 +348,7 @@ def domain_of(scene: Scene, samples: Samples, moving: Any, config: PotentialConf
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
-        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": False,
+        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
     }  # fmt: skip
     frames = TrainingFrames(scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
                             conditions, ())  # fmt: skip

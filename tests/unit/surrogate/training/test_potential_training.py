@@ -22,7 +22,7 @@ from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
 
 SMALL = PotentialConfig(width=24, n_radial=8, n_scalars=6, n_vectors=4, n_tensors=2, n_heads=2, head_dim=4, n_new=2,
-                        lag_ps=0.01)  # fmt: skip
+                        lag_ps=0.01, timestep_ps=0.001)  # fmt: skip
 QUICK = PotentialTraining(steps=12, batch=8, first=24, most=60, rounds=2, tolerance_kj_mol_nm=0.0,
                           temperatures_k=(300.0, 600.0))  # fmt: skip
 
