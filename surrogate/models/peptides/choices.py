@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from surrogate.data.references import References
 from surrogate.data.weights import load_weights, read_header
 from surrogate.models.peptides.model import PeptideConfig
-from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
+from surrogate.models.peptides.trainer import JUMPS_SHARE, PeptideTraining, train_peptides
 from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
 
 # Share of the longest trajectory that a window may span: its end is held out.
@@ -49,10 +50,14 @@ class PeptideTrainer(Trainer):
         settings, sets = self.settings(request), references.sets()
         start = None if request.start_from is None else load_weights(request.start_from)
 
+        def report(advance: AdvanceFn, stage: str, share: float, metrics: dict[str, float]) -> None:
+            done = 1 - JUMPS_SHARE if stage == "jumps" else 0.0
+            advance(stage, done + share * (JUMPS_SHARE if stage == "jumps" else 1 - JUMPS_SHARE))
+
         def run(advance: AdvanceFn) -> Path:
             return train_peptides(
                 sets.trained, request.out, settings.model, settings.training, unseen=sets.unseen, start=start,
-                resume=request.resume, progress=lambda stage, share, metrics: advance(stage, share),
+                resume=request.resume, progress=partial(report, advance),
             )  # fmt: skip
 
         return Prepared(sets.names, run)

@@ -203,11 +203,11 @@ class PeptideSubject:
         assert self.weights is not None
         return np.cumsum(self.weights)
 
-    def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw windows as training sees them: half of the batches of whole chunks, the others of fewer frames.
+    def batch(self, n: int, config: PeptideConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw windows as a flow sees them: half of the batches of whole chunks, the others of fewer frames.
 
-        Returns frames and times as `windows` does, and which windows `(n,)` are as likely as there. The others hold a
-        change of a torsion's state: a flow that is told of it may see as many as it needs.
+        Returns frames and times as `windows` does. Some windows hold a change of a torsion's state: a flow that is told
+        of it may see as many as it needs.
         """
         later = config.chunk_frames
         if float(torch.rand(1, generator=generator)) >= _WHOLE_SHARE:
@@ -217,16 +217,15 @@ class PeptideSubject:
 
     def _with_crossings(
         self, idx: Tensor, times: Tensor, config: PeptideConfig, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         """Put windows over crossings in the place of some, their spacing kept; half are read backwards if any are.
 
         Read forwards, crossings need no weights. Backwards, the frame that the run came from must be as likely as
         equilibrium has it among those on its own side.
         """
-        plain = torch.ones(len(idx), dtype=torch.bool)
         kinds, relative = self._crossings
         if not kinds:
-            return idx, times, plain
+            return idx, times
         asked = (torch.rand(len(idx), generator=generator) < _CROSSING_SHARE) & (times[:, 0] < config.forgotten_ps)
         backwards = torch.rand(len(idx), generator=generator) < (0.0 if self.weights is None else 0.5)
         ranges = np.array(self.frames.split.ranges(self.frames.starts, validation=False))
@@ -246,8 +245,7 @@ class PeptideSubject:
                 start = int(first[fits][0])
                 steps = torch.cat([ahead.new_zeros(1), ahead])
                 idx[row] = start + (span - steps if bool(backwards[row]) else steps)
-                plain[row] = False
-        return idx, times, plain
+        return idx, times
 
     @cached_property
     def _crossings(self) -> tuple[list[npt.NDArray[np.int64]], npt.NDArray[np.float64]]:
@@ -276,6 +274,10 @@ class PeptideSubject:
         rotor = np.array([self.frames.scene.elements[quad[0]] == "H" for quad in stated.quads.tolist()], dtype=bool)
         masks = (slot == 0, (slot >= FIRST_OF_SIDE_CHAIN) & ~rotor)
         return [(residue[which], slot[which]) for which in masks]
+
+    def states(self, idx: Tensor) -> Tensor:
+        """Return the states of torsions `(*idx.shape, n_residues, MOST_TORSIONS)` in frames."""
+        return torch.from_numpy(self._states[idx.numpy()]).long()
 
     def seen(self, model: PeptideSlide, idx: Tensor) -> tuple[Tensor, Tensor]:
         """Return the model's numbers `(*idx.shape, n_residues, n_slots)` of frames, and the states of their torsions,

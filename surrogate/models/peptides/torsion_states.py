@@ -158,10 +158,9 @@ class StateJumps(nn.Module):
         return found.masked_fill(absent, -torch.inf)
 
     def loss(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
-        plain: Tensor,
-    ) -> Tensor:  # fmt: skip
-        """Return the negative log-likelihood of what torsions did, per frame and torsion, of windows `plain` (b,).
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor
+    ) -> Tensor:
+        """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
         `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first.
         """
@@ -174,10 +173,10 @@ class StateJumps(nn.Module):
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
                 logits = self.odds(torsion, h, logs, before, new, places, counts)[:, :, has]
-                each = F.cross_entropy(logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="none")
-                total = total + (each.view(len(known), -1).sum(1) * plain).sum()
-            found: Tensor = total / ((plain.sum() * times_ps.shape[1] * (counts > 0).sum()).clamp(min=1))
-            return found
+                total = total + F.cross_entropy(
+                    logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="sum"
+                )
+            return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(
         self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,

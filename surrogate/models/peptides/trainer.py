@@ -34,6 +34,9 @@ _LEAST_MEASURED = 300
 _HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL = 128, 16, 1024
 # Flow times and noise of validation are the same each time.
 _HELD_SEED = 0
+# Of the budget, for the odds that torsions change their states: a small network, of which a step costs a tenth.
+JUMPS_SHARE = 0.2
+_JUMPS_BATCH = 128
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
 _LEAST_SCALE = 0.05
 
@@ -73,6 +76,8 @@ def train_peptides(
 ) -> Path:
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves.
 
+    First the flow, told what states torsions are in, then the odds of these states, which share nothing with it.
+
     `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
     Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
     no chains, SimulationError when training diverges.
@@ -91,10 +96,14 @@ def train_peptides(
         model.load_state_dict(start.model.state_dict())
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
-    stage = StageConfig(
-        "flow", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
+    flow_s, jumps_s = (
+        None if training.budget_s is None else share * training.budget_s for share in (1 - JUMPS_SHARE, JUMPS_SHARE)
+    )
+    shared = StageConfig(
+        "flow", training.batch, training.learning_rate, flow_s, training.steps, seed=training.seed,
         bf16=training.bf16, validate_every_s=training.validate_every_s,
     )  # fmt: skip
+    stages = (shared, replace(shared, name="jumps", batch=_JUMPS_BATCH, budget_s=jumps_s, bf16=False))
     n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // (len(subjects) + len(held_out))))
     held = [
         (name, subject, *subject.windows(n_held, config, torch.Generator().manual_seed(_HELD_SEED),
@@ -102,20 +111,32 @@ def train_peptides(
         for name, some in (("validation", subjects), ("unseen", held_out)) for subject in some
     ]  # fmt: skip
 
-    def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    def flow_loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
-        idx, times, plain = subject.batch(training.batch, config, generator)
-        return peptide_loss(model, subject.chain, *subject.seen(model, idx), times.to(device), generator, plain=plain)
+        idx, times = subject.batch(training.batch, config, generator)
+        return peptide_loss(model, subject.chain, *subject.seen(model, idx), times.to(device), generator)
+
+    def jumps_loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        subject = subjects[pick(subjects, generator)]
+        idx, times = subject.windows(_JUMPS_BATCH, config, generator)
+        known, _ = subject.seen(model, idx[:, 0])
+        loss = state_loss(model, subject.chain, known, subject.states(idx).to(device), times.to(device), generator)
+        return loss, {"jumps": loss.detach()}
 
     @torch.no_grad()
-    def validate() -> dict[str, float]:
+    def validate(stage: StageConfig) -> dict[str, float]:
         found: dict[str, list[float]] = {}
         for name, subject, idx, times in held:
             generator = torch.Generator().manual_seed(_HELD_SEED)
-            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
-                _, terms = peptide_loss(
-                    model, subject.chain, *subject.seen(model, idx), times.to(device), generator, noisy=False
-                )
+            numbers, states = subject.seen(model, idx)
+            if stage.name == "jumps":
+                loss = state_loss(model, subject.chain, numbers[:, 0], states, times.to(device), generator, noisy=False)
+                terms = {"jumps": loss}
+            else:
+                with torch.autocast(device.type, dtype=torch.bfloat16, enabled=stage.bf16):
+                    terms = peptide_loss(
+                        model, subject.chain, numbers, states, times.to(device), generator, noisy=False
+                    )[1]
             for key, value in terms.items():
                 found.setdefault(f"{name}_{key}", []).append(float(value))
         return {key: float(np.mean(values)) for key, values in found.items()}
@@ -124,20 +145,31 @@ def train_peptides(
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=True)
 
     def write(spent_s: float) -> None:
-        settings: dict[str, Any] = {"seed": training.seed, "flow_s": round(spent_s, 1)}
+        settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(spent_s, 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
-    state, log = out.with_name(f"{out.stem}.flow.train.safetensors"), out.with_suffix(".csv")
+    states, log = (
+        [out.with_name(f"{out.stem}.{stage.name}.train.safetensors") for stage in stages],
+        out.with_suffix(".csv"),
+    )
     if not resume and is_first_process():
-        for path in (state, log):
+        for path in (*states, log):
             path.unlink(missing_ok=True)
-    place = StagePlace(state, log, device, resume)
-    spent = run_stage(model, stage, loss_fn, validate, place, progress=progress, on_save=write)
+    spent_s = 0.0
+    for stage, loss_fn, trained, state in zip(
+        stages, (flow_loss, jumps_loss), (model, model.jumps), states, strict=True
+    ):
+        before_s, place = spent_s, StagePlace(state, log, device, resume)
+        spent_s += run_stage(
+            trained, stage, loss_fn, lambda stage=stage: validate(stage), place, progress=progress,
+            on_save=lambda spent_s, before_s=before_s: write(before_s + spent_s),
+        )  # fmt: skip
     if is_first_process():
-        write(spent)
-        state.unlink(missing_ok=True)
+        write(spent_s)
+        for path in states:
+            path.unlink(missing_ok=True)
     wait_for_all()
     return out
 
@@ -232,26 +264,24 @@ def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
 
 def peptide_loss(
     model: PeptideSlide, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
-    generator: torch.Generator, *, noisy: bool = True, plain: Tensor | None = None,
+    generator: torch.Generator, *, noisy: bool = True,
 ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-    """Flow matching on the innovations of windows, and the log-likelihood of changes of state: `numbers`
-    (b, 1 + t, r, slots) and `states` (b, 1 + t, r, MOST_TORSIONS), the first frame given.
+    """Flow matching on the innovations of windows: `numbers` (b, 1 + t, r, slots) and `states` (b, 1 + t, r,
+    MOST_TORSIONS), the first frame given.
 
-    The flow's error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the
-    given frame is disturbed as in training. `plain` (b,): windows that changes are counted in; all where not given.
-    Returns the loss and its parts: of torsions' numbers, of stiff ones, of changes of state.
+    The error is divided by c_out^2, so that every flow time asks for the same relative precision. `noisy`: the given
+    frame is disturbed as in training. Returns the loss and its parts: of torsions' numbers, of stiff ones.
     """
     c, filled = model.config, chain.code.filled
     known, later = numbers[:, 0], numbers[:, 1:]
     if noisy:
-        known = known + c.conditioning_noise * filled * torch.randn(known.shape, generator=generator).to(known.device)
+        known = _disturbed(known, chain, c, generator)
     target = model.innovations(later, known, times_ps, chain.places[:, 0])
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
-    counts = chain.stated.counts
-    told = model.flow.told(known, times_ps, chain.places, told_states(states, counts))
+    told = model.flow.told(known, times_ps, chain.places, told_states(states, chain.stated.counts))
     found = model.flow(alpha * target + sigma * noise, tau, told)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
     error = (found - target).square() * weight
@@ -260,9 +290,22 @@ def peptide_loss(
     turning = turning.reshape(filled.shape)
     of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
     share = c.turning_weight * turning.sum() / (c.turning_weight * turning.sum() + (filled & ~turning).sum())
-    of_flow = share * of_turning + (1 - share) * of_stiff
-    counted = torch.ones(len(numbers), device=numbers.device) if plain is None else plain.to(numbers)
-    apart = times_apart(times_ps, c.forgotten_ps)
-    of_jumps = model.jumps.loss(known, states, chain.places, counts, times_ps, apart, counted)
-    parts = {"flow": of_flow, "turning": of_turning, "stiff": of_stiff, "jumps": of_jumps}
-    return of_flow + of_jumps, {name: part.detach() for name, part in parts.items()}
+    loss = share * of_turning + (1 - share) * of_stiff
+    return loss, {"flow": loss.detach(), "turning": of_turning.detach(), "stiff": of_stiff.detach()}
+
+
+def state_loss(
+    model: PeptideSlide, chain: ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
+    generator: torch.Generator, *, noisy: bool = True,
+) -> Tensor:  # fmt: skip
+    """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
+    `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t); otherwise as `peptide_loss`."""
+    if noisy:
+        known = _disturbed(known, chain, model.config, generator)
+    apart = times_apart(times_ps, model.config.forgotten_ps)
+    return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart)
+
+
+def _disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+    noise = torch.randn(known.shape, generator=generator).to(known.device)
+    return known + config.conditioning_noise * chain.code.filled * noise
