@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,28 +145,24 @@ def train_peptides(
     domains = [training_domain(f, strides=_strides(config, f)) for f in sets]
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=True)
 
-    def write(spent_s: float) -> None:
-        settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(spent_s, 1)}
+    def write(*spent_s: float) -> None:
+        settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
-    states, log = (
-        [out.with_name(f"{out.stem}.{stage.name}.train.safetensors") for stage in stages],
-        out.with_suffix(".csv"),
-    )
+    log = out.with_suffix(".csv")
+    states = [out.with_name(f"{out.stem}.{stage.name}.train.safetensors") for stage in stages]
     if not resume and is_first_process():
         for path in (*states, log):
             path.unlink(missing_ok=True)
     spent_s = 0.0
-    for stage, loss_fn, trained, state in zip(
-        stages, (flow_loss, jumps_loss), (model, model.jumps), states, strict=True
-    ):
-        before_s, place = spent_s, StagePlace(state, log, device, resume)
+    parts = ((model.flow, flow_loss), (model.jumps, jumps_loss))
+    for stage, (trained, loss_fn), state in zip(stages, parts, states, strict=True):
+        place = StagePlace(state, log, device, resume)
         spent_s += run_stage(
-            trained, stage, loss_fn, lambda stage=stage: validate(stage), place, progress=progress,
-            on_save=lambda spent_s, before_s=before_s: write(before_s + spent_s),
-        )  # fmt: skip
+            trained, stage, loss_fn, partial(validate, stage), place, progress=progress, on_save=partial(write, spent_s)
+        )
     if is_first_process():
         write(spent_s)
         for path in states:
