@@ -62,7 +62,15 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
 
     The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
     """
-    from surrogate.bench.recipes.peptide_scores import angles, floor, library, score, turns_of
+    from surrogate.bench.recipes.peptide_scores import (
+        angles,
+        floor,
+        library,
+        rarely_positive,
+        score,
+        turns_of,
+        without,
+    )
     from surrogate.sampling.domain import fit_weights
 
     scene, truth, time_ps = thinned(runs)
@@ -83,6 +91,8 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
     drawn = [
         library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
     ]  # fmt: skip
+    rare = rarely_positive(turns, truth)
+    truth, model, drawn = (without(x, rare) for x in (truth, model, drawn))
     return [
         replace(floor(turns, truth), valid=valid[0]),
         replace(score(turns, truth, model, "model"), valid=valid[1]),

@@ -4,7 +4,8 @@ Figures are Jensen-Shannon distances of 50 bins (36 x 36 of joint maps), means o
 and chi, each folded by its symmetry. The floor is the mean over pairs of independent MD runs; a source's figure is the
 mean over each of its runs against each of MD's, of equal length and as many frames. The library draws each residue's
 torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat on joint maps
-of neighbours, or it has learned nothing of pairs.
+of neighbours, or it has learned nothing of pairs. A phi > 0 that MD enters fewer than ten times in all leaves the maps
+of all sources: how often it is visited is chance, and a matter of free energies (`peptide_gates seeds`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy.typing as npt
 
 from surrogate.judge.measure.distributions import distance
 from surrogate.judge.measure.torsions import find_torsions
+from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
 from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 _BINS, _JOINT_BINS = 50, 36
+_LEAST_ENTRIES = 10
 _POSITIVE_CORE, _NEGATIVE_CORE = (30.0, 90.0), (-175.0, -45.0)  # of phi, degrees
 
 
@@ -96,6 +99,20 @@ def library(
             if t.residue == k:
                 out[:, j] = rows[:, column[t.kind]]
     return out
+
+
+def rarely_positive(turns: Sequence[Turn], truth: Sequence[FloatArray]) -> list[int]:
+    """Return the places of phi in `turns` that enter the left-handed side fewer than ten times in all of MD."""
+    phi = [k for k, t in enumerate(turns) if t.kind == "phi"]
+    return [k for k in phi if crossings([x[:, k] for x in truth], 1.0)["entries"] < _LEAST_ENTRIES]
+
+
+def without(runs: Sequence[FloatArray], rare: Sequence[int]) -> list[FloatArray]:
+    """Return runs of torsions `(n_frames, n_turns)` without frames in which one of the phi at `rare` is on the left-
+    handed side; runs that spend half of their time there are left out."""
+    low, high = np.radians(POSITIVE_PHI_DEG)
+    kept = [x[~((x[:, rare] > low) & (x[:, rare] < high)).any(axis=1)] for x in runs]
+    return [x for x, whole in zip(kept, runs, strict=True) if len(x) >= len(whole) / 2]
 
 
 def score(turns: Sequence[Turn], truth: Sequence[FloatArray], source: Sequence[FloatArray], name: str) -> Scores:

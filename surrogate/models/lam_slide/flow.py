@@ -102,6 +102,23 @@ def fitted(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: st
     Math. 19, 65, 1972) of a width a little below the ratio of noise to signal there, which is what the step decides
     about. The grid is that of `multistep`. Second order; from about 10 steps on `multistep` is the better.
     """
+    return _exponential(
+        predict, noise, n_steps, interpolant, lambda left: (1.0 - FITTED_BELOW / n_steps) * left / (1.0 - left)
+    )
+
+
+def gaussian(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str) -> Tensor:
+    """`fitted` to one width, that of numbers of unit variance: exact where these are Gaussian at any number of steps.
+
+    For models whose every number is an innovation of unit variance (`models.peptides`), bonds and angles included,
+    which `multistep` in ten steps leaves 13 % too wide.
+    """
+    return _exponential(predict, noise, n_steps, interpolant, lambda left: 1.0)
+
+
+def _exponential(
+    predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: str, width_at: Callable[[float], float]
+) -> Tensor:
     if interpolant != "linear":
         raise ValueError(f"the fitted solver integrates the linear interpolant, not {interpolant!r}")
     o = noise
@@ -111,7 +128,7 @@ def fitted(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: st
         prediction = predict(o, torch.full((1,), 1.0 - left, device=o.device, dtype=torch.float32))
         ahead = prediction
         if before is not None:
-            width = (1.0 - FITTED_BELOW / n_steps) * left / (1.0 - left)
+            width = width_at(left)
             ahead = prediction + fitted_share(levels[k - 1], left, right, width) * (prediction - before)
         o, before = ahead + (right / left) * (o - ahead), prediction
     return o
@@ -162,6 +179,7 @@ def dopri5(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: st
 SOLVERS: dict[str, Callable[[DataPrediction, Tensor, int, str], Tensor]] = {
     "multistep": multistep,
     "fitted": fitted,
+    "gaussian": gaussian,
     "euler": euler,
     "dopri5": dopri5,
 }

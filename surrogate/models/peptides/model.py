@@ -221,7 +221,7 @@ class PeptideSlide(Surrogate):
     """
 
     arch: ClassVar[str] = "lam-slide-peptides"
-    solvers = flow.solvers_for("linear")
+    solvers = ("gaussian", *flow.solvers_for("linear"))
     float32_layers: tuple[str, ...] = ("flow.of_time",)
     config: PeptideConfig
     token_mean: Tensor

@@ -172,6 +172,15 @@ def test_few_fitted_steps_keep_wide_directions(n_steps: int, within: float) -> N
     assert n_steps == 2 or errors["multistep"] > 2.5 * errors["fitted"], errors
 
 
+@pytest.mark.parametrize("n_steps", [3, 6, 10])
+def test_gaussian_steps_keep_unit_variance_and_multistep_does_not(n_steps: int) -> None:
+    """The first step knows no earlier prediction, which costs a little where steps are few."""
+    errors = {solver: abs(relative_width(solver, 1.0, n_steps) - 1) for solver in ("gaussian", "multistep", "euler")}
+    assert errors["gaussian"] < (0.06 if n_steps == 3 else 0.01), errors
+    assert min(errors["multistep"], errors["euler"]) > 3 * errors["gaussian"], errors
+    assert abs(relative_width("gaussian", 0.3, 40) - 1) < 0.01, "of other widths it is of second order, too"
+
+
 @pytest.mark.parametrize("width", [2.0, 0.4, 0.2])
 def test_fitted_is_of_second_order(width: float) -> None:
     errors = [abs(relative_width("fitted", width, n) - 1) for n in (40, 80, 160)]

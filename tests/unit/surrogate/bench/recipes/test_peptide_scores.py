@@ -7,13 +7,16 @@ import pytest
 
 from surrogate.bench.recipes.peptide_scores import (
     FloatArray,
+    Turn,
     angles,
     crossings,
     floor,
     library,
+    rarely_positive,
     rebuilt,
     score,
     turns_of,
+    without,
 )
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
@@ -49,6 +52,22 @@ def test_crossings_count_whole_ways_between_cores() -> None:
     assert found["entries_per_ns"] == pytest.approx(2 / 1.4, rel=0.01)
     assert found["exits_per_ns"] == pytest.approx(2 / 0.9, rel=0.01)
     assert crossings([np.radians([10.0, 20.0])], 1.0)["entries"] == 0
+
+
+def test_a_positive_phi_that_md_hardly_enters_leaves_the_maps() -> None:
+    """The first phi is entered twice in all, the second twelve times: frames with the first above 0 go, and a run that
+    is mostly there goes whole."""
+    turns = [Turn("phi", 0, (0, 1, 2, 3)), Turn("phi", 1, (0, 1, 2, 3)), Turn("psi", 0, (0, 1, 2, 3))]
+    often = np.radians(np.tile([-60.0, -60.0, 60.0, 60.0], 6))
+    seldom = np.radians(np.r_[np.full(20, -60.0), np.full(4, 60.0)])
+    runs = [np.stack([seldom, often, np.arange(24.0)], axis=1)] * 2
+    rare = rarely_positive(turns, runs)
+    assert rare == [0]
+    stuck = np.stack([np.radians(np.full(24, 60.0)), often, np.arange(24.0)], axis=1)
+    found = without([*runs, stuck], rare)
+    assert [len(x) for x in found] == [20, 20] and found[0][:, 2].tolist() == list(range(20))
+    # Beyond the second barrier it is the far end of the strands' basin.
+    assert len(without([np.radians([[170.0, 60.0, 0.0]])], rare)) == 1
 
 
 def test_what_a_code_loses_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
