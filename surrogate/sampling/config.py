@@ -46,11 +46,9 @@ class RolloutConfig:
     hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
     ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
     solver: str | None = option(
-        "multistep, fitted (for 2 to 10 steps), gaussian (of peptides), euler or dopri5.",
-        None,
-        unset="the one that suits",
+        "multistep, fitted (few steps), gaussian (peptides), euler or dopri5.", None, unset="the one that suits",
         section="sampling",
-    )
+    )  # fmt: skip
     solver_steps: int = option("Solver steps per chunk.", 10, within=(1, None), section="sampling")
     precision: str = option("Of the network.", "auto", choices=("auto", "fp32", "bf16"), section="sampling")
     compile: bool = option(

@@ -111,7 +111,7 @@ def gaussian(predict: DataPrediction, noise: Tensor, n_steps: int, interpolant: 
     """`fitted` to one width, that of numbers of unit variance: exact where these are Gaussian at any number of steps.
 
     For models whose every number is an innovation of unit variance (`models.peptides`), bonds and angles included,
-    which `multistep` in ten steps leaves 13 % too wide.
+    which `multistep` leaves too wide.
     """
     return _exponential(predict, noise, n_steps, interpolant, lambda left: 1.0)
 

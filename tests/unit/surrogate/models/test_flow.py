@@ -177,7 +177,7 @@ def test_gaussian_steps_keep_unit_variance_and_multistep_does_not(n_steps: int) 
     """The first step knows no earlier prediction, which costs a little where steps are few."""
     errors = {solver: abs(relative_width(solver, 1.0, n_steps) - 1) for solver in ("gaussian", "multistep", "euler")}
     assert errors["gaussian"] < (0.06 if n_steps == 3 else 0.01), errors
-    assert min(errors["multistep"], errors["euler"]) > 3 * errors["gaussian"], errors
+    assert min(errors["multistep"], errors["euler"]) > 2.5 * errors["gaussian"], errors
     assert abs(relative_width("gaussian", 0.3, 40) - 1) < 0.01, "of other widths it is of second order, too"
 
 
