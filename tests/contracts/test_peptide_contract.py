@@ -14,6 +14,7 @@ from surrogate.data.features.peptide_chains import chain_layout, chain_scale
 from surrogate.models.conformance import SurrogateContract
 from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.torsion_states import MOST_TORSIONS, told_states
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -75,7 +76,7 @@ def test_innovations_come_back_and_have_unit_variance_for_a_process_of_these_cor
     rho = model.correlation_at(times[:1], types)
     assert 0.85 < float(rho[0, 0].mean()) < 0.91 and 0.2 < float(rho[0, 2].mean()) < 0.4
     generator = torch.Generator().manual_seed(0)
-    n_slots = model.token_mean.shape[1]
+    n_slots = model.token_mean.shape[-1]
     known = torch.randn(20_000, 2, n_slots, generator=generator)
     later = rho * known[:, None] + (1 - rho**2).sqrt() * torch.randn(20_000, 3, 2, n_slots, generator=generator)
     y = model.innovations(later, known, times, types)
@@ -91,23 +92,24 @@ def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
     model = small_model()
     chain = describe(model, scene_of(33)).chain
     assert chain is not None
-    n_slots = model.token_mean.shape[1]
+    n_slots = model.token_mean.shape[-1]
     o, known = torch.randn(2, 5, 4, n_slots), torch.randn(2, 4, n_slots)
     times = torch.arange(1.0, 6.0).expand(2, -1)
     tau = torch.full((2,), 0.5)
-    sides = torch.ones(2, 5, 4)
+    states = torch.zeros(2, 6, 4, MOST_TORSIONS, dtype=torch.long)
+    told, other_states = (told_states(x, chain.stated.counts) for x in (states, 1 - states))
 
     def found(o: Tensor, *told: Tensor) -> Tensor:
         return model.flow(o, tau, model.flow.told(*told))
 
-    base = found(o, known, times, chain.places, sides)
+    base = found(o, known, times, chain.places, told)
     swapped = chain.places.clone()
     swapped[1, 2] = swapped[2, 2]
     for other in (
-        found(o, known, 7 * times, chain.places, sides),
-        found(o, known, times, swapped, sides),
-        found(o, known, times, chain.places, -sides),
-        found(o.flip(2), known.flip(1), times, chain.places.flip(0), sides).flip(2),
+        found(o, known, 7 * times, chain.places, told),
+        found(o, known, times, swapped, told),
+        found(o, known, times, chain.places, other_states),
+        found(o.flip(2), known.flip(1), times, chain.places.flip(0), told).flip(2),
     ):
         assert float((other - base).abs().max()) > 1e-3
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import shutil
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -148,3 +150,14 @@ def test_what_it_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(lanes.shutil, "which", lambda _: None)
     with pytest.raises(LanesUnavailableError, match="which platform lanes needs"):
         lanes._program.__wrapped__()
+
+
+def test_the_process_keeps_its_arithmetic() -> None:
+    """A library linked with fast mathematics has every later calculation round the smallest numbers to zero. Asked in a
+    process of its own, which nothing else has changed."""
+    code = (
+        "import numpy as np; from md_reference.run.lanes import n_lanes; x = np.array([1e-310]);"
+        "assert n_lanes() and x[0] / 10 > 0"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -27,7 +27,9 @@ def test_forgetting_too_fast_earns_nothing_and_too_slowly_costs() -> None:
     assert samples_per_second(2.0, 5.0, 25.0) == right
     assert samples_per_second(2.0, 50.0, 25.0) == pytest.approx(right / 2)
     assert samples_per_second(2.0, None, 25.0) is None and samples_per_second(2.0, float("nan"), 25.0) is None
-    md = {"slowest": {"tau_ps": 25.0}, "cost": [{"cpu_s_per_ns": {"mean": cost}} for cost in (32.0, 8.0)]}
+    md = {"slowest": {"tau_ps": 25.0}, "cost": [
+        {"way": way, "cpu_s_per_ns": {"mean": cost}} for way, cost in (("ours", 32.0), ("ours", 8.0), ("lanes", 0.5))
+    ]}  # fmt: skip
     row: dict[str, Any] = {"cpu_s_per_ns": {"mean": 2.0}}
     assert effective_row(row, 20.0, md)["effective_over_md"] == pytest.approx(4.0), "of the fastest MD"
     assert effective_row(row, 20.0, md | {"slowest": None}) == {}
@@ -83,7 +85,7 @@ def test_all_trainings_and_all_frames_that_weights_saw_are_counted_once() -> Non
 def test_a_page_leaves_broken_molecules_out_of_the_front() -> None:
     md = {
         "slowest": {"torsion": 0, "name": "cos ψ", "tau_ps": 25.0, "samples": 4000.0},
-        "cost": [{"label": "OpenMM, 4 fs", "plain": False, "cpu_s_per_ns": {"mean": 8.0}}],
+        "cost": [{"label": "OpenMM, 4 fs", "way": "ours", "cpu_s_per_ns": {"mean": 8.0}}],
         "lengths_ps": [1e3, 1e5], "errors": [0.3, 0.05], "floor": 0.05, "length_ps": 1e5,
     }  # fmt: skip
     row = {

@@ -237,6 +237,6 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
             frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
         obeys = (chain.states(frames) == own).flatten(1).all(dim=1)
         shares.append(float(obeys.float().mean()))
-    assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
+    assert shares[0] < 0.85 and shares[1] > shares[0] + 0.1
     alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
