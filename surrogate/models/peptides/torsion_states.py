@@ -48,9 +48,7 @@ class StatedTorsions:
     n_residues: int
 
     @staticmethod
-    def of(
-        rows: list[tuple[list[int], int, int, tuple[float, tuple[float, float]]]], n_residues: int
-    ) -> StatedTorsions:
+    def of(rows: list[tuple[list[int], int, int, Kind]], n_residues: int) -> StatedTorsions:
         """Return those of `rows`: four atoms, residue, slot, and PHI, PSI, THREEFOLD or RING."""
         quads, residue, slot = (torch.tensor([row[k] for row in rows], dtype=torch.long) for k in range(3))
         first = torch.tensor([kind[0] for *_, kind in rows])

@@ -228,7 +228,7 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     last = torch.tensor(scene.positions_nm).float().expand(60, 1, -1, -1)
     noise = torch.randn(60, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
     own = chain.states(last[0, 0])
-    model.token_scale[chain.places[1, 0]] = 0.6
+    model.token_scale[chain.places[1, 0]] = 0.75
     model.token_mean.copy_(_middles(model, chain))
     shares = []
     for most in (0, module.MAX_REDRAWS):
@@ -237,6 +237,6 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
             frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
         obeys = (chain.states(frames) == own).flatten(1).all(dim=1)
         shares.append(float(obeys.float().mean()))
-    assert shares[0] < 0.85 and shares[1] > shares[0] + 0.1
+    assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
     alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
