@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -74,6 +75,7 @@ class _Builder:
         self.residue = scene.residue_of_atom.tolist()
         self.names = self._names()
         self.placed: list[tuple[int, int, int, int]] = []
+        self.closing: list[bool] = []
         self.primary: list[int] = []
         self.residue_of: list[int] = []
         self.keys: list[str] = []
@@ -89,18 +91,30 @@ class _Builder:
             # From the root's middle the other two stand beside an atom, not behind it.
             next_ = before.get(near, a)
             last = c if near == b else before.get(next_, c if near == a else a)
-            alone = near == b or frozenset((near, next_)) in self.ring
             beyond = sorted((i for i in self.graph[near] if i not in seen), key=lambda i: self._rank(i, near))
             first = len(self.placed)
             for atom in beyond:
+                across = self._ring_neighbours(atom, seen - {near})
+                beside = self._ring_neighbours(near, seen - {next_})
                 seen.add(atom)
                 queue.append(atom)
                 before[atom] = near
-                self._place(atom, near, next_, last, None if alone else first)
+                if across:
+                    self._close(atom, near, across[0], next_)
+                elif beside and near != b:
+                    # Beside the rest of a ring, whatever that does.
+                    self._place(atom, near, next_, beside[0], None)
+                else:
+                    self._place(atom, near, next_, last, None if near == b else first)
         return ChainLayout(
-            self.scene.n_atoms, root, tuple(self.placed), tuple(self.primary), tuple(self.residue_of),
-            tuple(self.keys), tuple(self.kinds), tuple(self.scene.residue_names),
+            self.scene.n_atoms, root, tuple(self.placed), tuple(self.closing), tuple(self.primary),
+            tuple(self.residue_of), tuple(self.keys), tuple(self.kinds), tuple(self.scene.residue_names),
         )  # fmt: skip
+
+    def _ring_neighbours(self, atom: int, among: set[int]) -> list[int]:
+        """Return those of its neighbours `among` some atoms to which a bond of a ring leads, by name."""
+        found = [i for i in self.graph[atom] if i in among and frozenset((atom, i)) in self.ring]
+        return sorted(found, key=lambda i: self.names[i])
 
     def _root(self) -> tuple[int, int, int]:
         at = {self.names[i]: i for i in range(self.scene.n_atoms) if self.residue[i] == 0}
@@ -145,6 +159,7 @@ class _Builder:
         """Place an atom by three; `first`: the row whose dihedral about the same bond is the torsion, if one is."""
         row = len(self.placed)
         self.placed.append((atom, near, next_, last))
+        self.closing.append(False)
         self.primary.append(row if first is None else first)
         # Counted from the torsion, a dihedral does not depend on what the torsion is counted from.
         origin = last if first in (None, row) else self.placed[first or 0][0]
@@ -152,7 +167,18 @@ class _Builder:
         owner = self.residue[near] if self.names[atom] == "N" else self.residue[atom]
         self._add(
             owner, (_LENGTH, (atom, near)), (_ANGLE, (atom, near, next_)), (_DIHEDRAL, (atom, near, next_, origin)),
-            turning=first == row,
+            turning=first == row and frozenset((near, next_)) not in self.ring,
+        )  # fmt: skip
+
+    def _close(self, atom: int, near: int, across: int, beside: int) -> None:
+        """Place the atom that closes a ring by its bonds to both sides, and how far it is out of the plane through them
+        and the atom `beside` one: the pucker of a saturated ring, which has two sides as torsions have."""
+        self.primary.append(len(self.placed))
+        self.placed.append((atom, near, across, beside))
+        self.closing.append(True)
+        self._add(
+            self.residue[atom], (_LENGTH, (atom, near)), (_LENGTH, (atom, across)),
+            (_DIHEDRAL, (atom, near, across, beside)), turning=self.graph.degree[atom] == _TETRAHEDRAL["C"],
         )  # fmt: skip
 
     def _add(self, owner: int, *coordinates: tuple[str, tuple[int, ...]], turning: bool = False) -> None:
@@ -187,7 +213,8 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
 
 def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
     """Return the torsions that have states: phi, psi, and in side chains those about bonds between tetrahedral atoms or
-    from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them."""
+    from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them; and the
+    side of its plane to which a saturated ring (of proline) is puckered."""
     graph = bonded_graph(scene)
     ring = {int(i) for i in ring_bonds(scene).flatten()}
     rows: list[tuple[list[int], int, int, Kind]] = []
@@ -199,6 +226,9 @@ def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
                 rows.append(([atom, near, next_, last], residue, 0, PHI))
         elif names == ("N", "C", "CA"):
             rows.append(([atom, near, next_, last], residue, 1, PSI))
+        elif not graph.has_edge(near, next_):
+            # The pucker of a ring, on either side of its plane.
+            rows.append(([atom, near, next_, last], residue, FIRST_OF_SIDE_CHAIN, RING))
         elif names[1] not in _BACKBONE:
             tetrahedral = all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_))
             slot = taken.get(residue, FIRST_OF_SIDE_CHAIN)
@@ -208,23 +238,30 @@ def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
     return StatedTorsions.of(rows, len(layout.types))
 
 
-def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -> ChainScale:
+def chain_scale(
+    frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]], known: ChainScale | None = None
+) -> ChainScale:
     """Measure stiff coordinates over frames `(n, n_atoms, 3)` nm of several peptides, each frame as much as any other.
 
-    Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots.
+    Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots. What is
+    `known` stays as it is, with as many slots; only what it lacks is added. Raises InputError where it has no room.
     """
     found: dict[str, list[npt.NDArray[np.float64]]] = {}
-    slots: dict[str, int] = {}
     turning: dict[str, None] = {}
+    mean, deviation, slots = (
+        ({}, {}, {}) if known is None else (dict(known.mean), dict(known.deviation), dict(known.slots))
+    )
+    old = mean.keys() | slots.keys()
     for layout, x in frames:
-        rows, primary = torch.tensor(layout.placed), torch.tensor(layout.primary)
-        values = internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, primary).numpy()
+        rows, closing, primary = torch.tensor(layout.placed), torch.tensor(layout.closing), torch.tensor(layout.primary)
+        values = internal_coordinates(torch.from_numpy(x).double(), layout.root, rows, closing, primary).numpy()
         for k, (key, kind) in enumerate(zip(layout.keys, layout.kinds, strict=True)):
+            if key in old:
+                continue
             if kind == TURNING:
                 turning[key] = None
             else:
                 found.setdefault(key, []).append(values[:, k])
-    mean, deviation = {}, {}
     for key, parts in found.items():
         values = np.concatenate(parts)
         middle = float(values.mean())
@@ -234,13 +271,21 @@ def chain_scale(frames: Iterable[tuple[ChainLayout, npt.NDArray[np.float32]]]) -
         mean[key], deviation[key] = middle, float(values.std())
         if key.split()[1] == _LENGTH and deviation[key] < RIGID_NM:
             deviation[key] = 0.0
-    taken: dict[str, int] = {}
+    taken: dict[str, set[int]] = {}
+    for key, slot in slots.items():
+        taken.setdefault(key.split()[0], set()).update((slot,) if key in mean else (slot, slot + 1))
     # Torsions first, so that the backbone's stand in the same places for all residues.
     for key in (*sorted(turning, key=_backbone_first), *sorted(k for k in found if deviation[k] > 0.0)):
-        residue = key.split()[0]
-        slots[key] = taken.get(residue, 0)
-        taken[residue] = slots[key] + (2 if key in turning else 1)
-    return ChainScale(mean, deviation, slots, max(taken.values(), default=0))
+        of_residue = taken.setdefault(key.split()[0], set())
+        wanted = 2 if key in turning else 1
+        slots[key] = next(k for k in itertools.count() if of_residue.isdisjoint(range(k, k + wanted)))
+        of_residue.update(range(slots[key], slots[key] + wanted))
+    n_slots = 1 + max((slot for some in taken.values() for slot in some), default=-1)
+    if known is not None and n_slots > known.n_slots:
+        raise InputError(
+            f"a residue has {n_slots} numbers, more than the {known.n_slots} that these weights hold; train anew."
+        )
+    return ChainScale(mean, deviation, slots, n_slots if known is None else known.n_slots)
 
 
 def _backbone_first(key: str) -> tuple[int, str]:
@@ -249,14 +294,18 @@ def _backbone_first(key: str) -> tuple[int, str]:
     return {"CA": 0, "C": 1, "N+1": 2, "O": 2}.get(atom, 3), key
 
 
-def settled(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
-    """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data tell of."""
-    unknown = [
+def unknown_coordinates(layout: ChainLayout, scale: ChainScale) -> list[str]:
+    """Return the coordinates of a layout of which no data told."""
+    return [
         key
         for key, kind in zip(layout.keys, layout.kinds, strict=True)
         if (key not in scale.slots if kind == TURNING else key not in scale.mean)
     ]
-    if unknown:
+
+
+def settled(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
+    """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data tell of."""
+    if unknown := unknown_coordinates(layout, scale):
         raise InputError(
             f"{len(unknown)} internal coordinates occur in no training molecule, the first is {unknown[0]!r}; train on "
             "a peptide that has this residue at such a place."

@@ -4,8 +4,10 @@ Every atom is placed by a bond length, a bond angle and a dihedral on three atom
 Chem. 26, 1063 (2005)), from a root in the first residue onwards. One dihedral about each bond that can turn is the
 torsion, told by cosine and sine; the others about that bond are told by how far they are from it. These, lengths and
 angles hardly vary: they are told in standard deviations from their mean, which the data of all peptides give for each
-residue type, and those that references hold rigid are constants. Whatever numbers a network returns, every frame is
-one of the right molecule with bonds, angles and handedness as MD has them, and no error grows with chain length.
+residue type, and those that references hold rigid are constants. An atom that closes a ring is placed by the lengths of
+both its bonds in the ring instead of by an angle, so that every bond is one of the numbers. Whatever numbers a network
+returns, every frame is one of the right molecule with bonds, angles and handedness as MD has them, and no error grows
+with chain length.
 
 Each number belongs to one residue and has a place (slot) in that residue's token, the same for every residue of a type.
 """
@@ -32,16 +34,18 @@ _TINY = 1e-12
 class ChainLayout:
     """How the `n_atoms` atoms of a peptide follow from internal coordinates.
 
-    `root`: three bonded atoms. `placed`: rows (atom, b, c, d), each after those that it is placed by. `primary`: for
-    each of them the row whose dihedral its own is counted from (itself where it stands alone). `residue_of`: of the
-    coordinates, three for the root (two lengths, an angle) and three for each row (length, angle, dihedral), the
-    residue they belong to; `keys`: their names, equal for residues of one type; `kinds`: STIFF, TURNING or RIGID.
-    `types`: of the residues, by name.
+    `root`: three bonded atoms. `placed`: rows (atom, b, c, d), each after those that it is placed by. `closing`: rows
+    whose atom is bonded to c as well as to b, and which is placed by that length instead of an angle. `primary`: for
+    each row the row whose dihedral its own is counted from (itself where it stands alone). `residue_of`: of the
+    coordinates, three for the root (two lengths, an angle) and three for each row (length, angle or other length,
+    dihedral), the residue they belong to; `keys`: their names, equal for residues of one type; `kinds`: STIFF, TURNING
+    or RIGID. `types`: of the residues, by name.
     """
 
     n_atoms: int
     root: tuple[int, int, int]
     placed: tuple[tuple[int, int, int, int], ...]
+    closing: tuple[bool, ...]
     primary: tuple[int, ...]
     residue_of: tuple[int, ...]
     keys: tuple[str, ...]
@@ -75,6 +79,7 @@ class ChainCode(nn.Module):
     """Frames of one peptide into tokens of its residues and back, exactly but for what is rigid."""
 
     rows: Tensor
+    closing: Tensor
     primary: Tensor
     mean: Tensor
     deviation: Tensor
@@ -93,6 +98,7 @@ class ChainCode(nn.Module):
         stiff, turning = kinds == STIFF, kinds == TURNING
         fixed = {
             "rows": torch.tensor(layout.placed, dtype=torch.long).reshape(-1, 4),
+            "closing": torch.tensor(layout.closing, dtype=torch.bool),
             "primary": torch.tensor(layout.primary, dtype=torch.long),
             "mean": torch.tensor([scale.mean.get(key, 0.0) for key in layout.keys], dtype=torch.float64),
             "deviation": torch.tensor([scale.deviation.get(key, 1.0) for key in layout.keys], dtype=torch.float64),
@@ -112,7 +118,7 @@ class ChainCode(nn.Module):
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames `(..., n_atoms, 3)` nm -> tokens `(..., n_residues, n_slots)`, zero in empty places; float32."""
-        values = internal_coordinates(frames.double(), self.layout.root, self.rows, self.primary)
+        values = internal_coordinates(frames.double(), self.layout.root, self.rows, self.closing, self.primary)
         tokens = frames.new_zeros(*frames.shape[:-2], self.n_residues * self.n_slots, dtype=torch.float64)
         stiff = values[..., self.stiff] - self.mean[self.stiff]
         # Dihedrals are angles: the nearest way round. Lengths and bond angles never differ by half a turn.
@@ -144,10 +150,11 @@ class ChainCode(nn.Module):
         for level in self.levels:
             which = torch.tensor(level, device=values.device)
             atom, b_, c_, d_ = self.rows[which].T
-            x[..., atom, :] = extend(
-                x[..., d_, :], x[..., c_, :], x[..., b_, :],
-                lengths[..., which], angles[..., which], dihedrals[..., which],
-            )  # fmt: skip
+            length, angle = lengths[..., which], angles[..., which]
+            if self.closing[which].any():
+                met = _angle_between(length, (x[..., b_, :] - x[..., c_, :]).norm(dim=-1), opposite=angle)
+                angle = torch.where(self.closing[which], met, angle)
+            x[..., atom, :] = extend(x[..., d_, :], x[..., c_, :], x[..., b_, :], length, angle, dihedrals[..., which])
         return x
 
 
@@ -188,9 +195,12 @@ class ChainFeatures:
         return self.stated.states(dihedral(*(frames_nm[..., quads[:, k], :].float() for k in range(4))))
 
 
-def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, primary: Tensor) -> Tensor:
+def internal_coordinates(
+    x: Tensor, root: tuple[int, int, int], rows: Tensor, closing: Tensor, primary: Tensor
+) -> Tensor:
     """Return lengths, angles and dihedrals `(..., 3 + 3 n_placed)` of frames `(..., n_atoms, 3)`; dihedrals that are
-    counted from another one as the difference, all in (-π, π] or a full turn beside."""
+    counted from another one as the difference, all in (-π, π] or a full turn beside. Of rows `closing` a ring the other
+    bond's length stands in the place of the angle."""
     a, b, c = root
     head = torch.stack(
         [(x[..., a, :] - x[..., b, :]).norm(dim=-1), (x[..., c, :] - x[..., b, :]).norm(dim=-1),
@@ -200,7 +210,8 @@ def internal_coordinates(x: Tensor, root: tuple[int, int, int], rows: Tensor, pr
     dihedrals = dihedral(atom, near, next_, last)
     own = torch.arange(len(primary), device=x.device) == primary
     dihedrals = torch.where(own, dihedrals, dihedrals - dihedrals[..., primary])
-    body = torch.stack([(atom - near).norm(dim=-1), _angle(atom, near, next_), dihedrals], dim=-1)
+    second = torch.where(closing, (atom - next_).norm(dim=-1), _angle(atom, near, next_))
+    body = torch.stack([(atom - near).norm(dim=-1), second, dihedrals], dim=-1)
     return torch.cat([head, body.flatten(-2)], dim=-1)
 
 
@@ -224,6 +235,12 @@ def extend(a: Tensor, b: Tensor, c: Tensor, length: Tensor, angle: Tensor, torsi
 def _angle(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     u, v = a - b, c - b
     return torch.atan2(torch.linalg.cross(u, v).norm(dim=-1), (u * v).sum(-1))
+
+
+def _angle_between(one: Tensor, other: Tensor, *, opposite: Tensor) -> Tensor:
+    """Return the angle of a triangle between two sides, as near to it as sides can be that do not meet."""
+    cosine = (one.square() + other.square() - opposite.square()) / (2.0 * one * other)
+    return cosine.clamp(-1.0, 1.0).acos()
 
 
 def _unit(x: Tensor) -> Tensor:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
+from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale, unknown_coordinates
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.molecules import FrameSets
 from surrogate.data.weights import Weights, save_weights
@@ -20,7 +20,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.model import ENDS, PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.torsion_states import MOST_STATES, times_apart, told_states
 from surrogate.training.devices import is_first_process, wait_for_all
@@ -91,10 +91,9 @@ def train_peptides(
     subjects, held_out = (
         [PeptideSubject(f, chain_features(f.scene, config).to(device)) for f in some] for some in (sets, unseen)
     )
-    if start is None:
-        normalise(model, subjects, training.seed)
-    else:
-        model.load_state_dict(start.model.state_dict())
+    normalise(model, subjects, training.seed)
+    if start is not None:
+        _go_on_from(cast(PeptideSlide, start.model), model)
     if training.time_reversal:
         subjects = [subject.in_equilibrium(training.positive_phi_kt) for subject in subjects]
     flow_s, jumps_s = (
@@ -179,13 +178,36 @@ def _strides(config: PeptideConfig, frames: TrainingFrames) -> tuple[int, ...]:
 
 
 def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> PeptideConfig:
-    """Return the configuration with the types and scales of residues that frames show, where it has none."""
-    if config.scale is not None:
-        return config
+    """Return the configuration with the types and scales of residues that frames show, where it lacks any.
+
+    Raises InputError for a residue type that is none of those it has.
+    """
     layouts = [chain_layout(frames.scene) for frames in sets]
+    if config.scale is not None:
+        for layout in layouts:
+            config.places(layout.types)
+        lacking = [k for k, one in enumerate(layouts) if unknown_coordinates(one, config.scale)]
+        sets, layouts = [sets[k] for k in lacking], [layouts[k] for k in lacking]
+        if not sets:
+            return config
     share = max(200, _MEASURED_FRAMES // len(sets))
-    scale = chain_scale((layout, frames.some_nm(share)) for layout, frames in zip(layouts, sets, strict=True))
-    return replace(config, scale=scale, types=tuple(sorted({name for layout in layouts for name in layout.types})))
+    shown = ((layout, frames.some_nm(share)) for layout, frames in zip(layouts, sets, strict=True))
+    types = config.types or tuple(sorted({name for layout in layouts for name in layout.types}))
+    return replace(config, scale=chain_scale(shown, config.scale), types=types)
+
+
+def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
+    """Give `model` the weights of `start`, and for the numbers that this knows its means, scales and correlations."""
+    own = {name: tensor.clone() for name, tensor in model.named_buffers()}
+    model.load_state_dict(start.state_dict())
+    assert start.config.scale is not None and model.config.scale is not None
+    new = model.config.scale.slots.keys() - start.config.scale.slots.keys()
+    kinds = {name: k for k, name in enumerate((*ENDS, *model.config.types))}
+    for key in new:
+        kind, slot = kinds[key.split()[0]], model.config.scale.slots[key]
+        width = 1 if key in model.config.scale.mean else 2
+        for name in ("token_mean", "token_scale", "correlation"):
+            getattr(model, name)[kind, ..., slot : slot + width] = own[name][kind, ..., slot : slot + width]
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
 from surrogate.data.weights import load_weights
 from surrogate.models.peptides import peptide_subjects
+from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.choices import PeptideTrainer
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
@@ -221,6 +222,41 @@ def test_a_training_goes_on_from_weights_with_their_scales(tmp_path: Path, frame
         torch.testing.assert_close(found.model.state_dict()[name], value, rtol=0, atol=2e-3)
     assert not torch.equal(anew.model.correlation, start.model.correlation)
     assert found.model.config == start.model.config
+
+
+def test_a_training_goes_on_with_peptides_that_have_coordinates_of_which_its_start_knew_nothing(
+    tmp_path: Path, frames: TrainingFrames, config: PeptideConfig
+) -> None:
+    """Both ends of a free chain: what is known keeps its place and its scale, what is new gets those of its frames."""
+    scene = build_peptide("ALA-ALA")
+    x = scene.positions_nm + 0.004 * np.random.default_rng(1).normal(size=(800, scene.n_atoms, 3))
+    free = replace(frames, scene=scene, coordinates=quantise(canonicalise(x, scene)))
+    assert config.scale is not None
+    roomy = replace(config, scale=replace(config.scale, n_slots=config.scale.n_slots + 20))
+    still = PeptideTraining(steps=1, batch=4, learning_rate=1e-12, validate_every_s=1e9)
+    start = load_weights(train_peptides([frames], tmp_path / "a.safetensors", roomy, still))
+    found = load_weights(train_peptides([free], tmp_path / "b.safetensors", roomy, still, start=start))
+    known, more = start.model.config.scale, found.model.config.scale
+    assert known.slots.items() < more.slots.items() and known.mean.items() < more.mean.items()
+    chain = chain_features(scene, found.model.config)
+    numbers, _ = found.model.normalised(torch.from_numpy(x.astype(np.float32)), chain)
+    new = numbers[..., chain.code.filled][:, [key not in known.slots for key in _numbered(chain)]]
+    assert 0.5 < float(new.square().mean()) < 2.0
+    for name in ("token_mean", "token_scale", "correlation"):
+        before, after = (weights.model.state_dict()[name] for weights in (start, found))
+        kept = [slot for key, slot in known.slots.items() if key.startswith("ALA ")]
+        torch.testing.assert_close(after[..., kept], before[..., kept], rtol=0, atol=2e-3)
+    with pytest.raises(InputError, match="more than the"):
+        train_peptides([free], tmp_path / "c.safetensors", config, still)
+
+
+def _numbered(chain: ChainFeatures) -> list[str]:
+    """Return the keys of a chain's numbers, in the order of its residues and slots."""
+    layout, code = chain.code.layout, chain.code
+    keys = dict(zip(code.stiff_at.tolist(), [layout.keys[k] for k in code.stiff.tolist()], strict=True))
+    for at, k in zip(code.turning_at.tolist(), code.turning.tolist(), strict=True):
+        keys[at] = keys[at + 1] = layout.keys[k]
+    return [keys[at] for at in sorted(keys)]
 
 
 def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, frames: TrainingFrames) -> None:
