@@ -19,16 +19,12 @@ from systems.units import format_time_ps
 
 # Bonds to hydrogen of natural mass swing in 9 fs; a longer step than this needs them rigid.
 LONGEST_FLEXIBLE_STEP_PS = 0.001
-# A quantum-mechanical force takes a thousand times as long as a classical one.
-QUANTUM_DEFAULTS = {
-    "timestep_ps": 0.0005,
-    "equilibrate_ps": 1.0,
-    "hydrogen_mass_da": None,
-    "constrain_hydrogens": False,
-}
-# With rigid bonds to hydrogen, and hydrogens as heavy as this.
+# A quantum-mechanical force takes a thousand times as long as a classical one: steps are as long as they may be, with
+# hydrogens so heavy and their bonds rigid, and flexible bonds of natural hydrogens, where asked for, get short ones.
 LONGEST_QUANTUM_STEP_PS = 0.004
-_RIGID_HYDROGEN_MASS_DA = 3.0
+_HYDROGEN_MASS_DA = 3.0
+_FLEXIBLE_QUANTUM_STEP_PS = 0.0005
+_QUANTUM_EQUILIBRATION_PS = 1.0
 _WORDS = {
     "force_field": "force field",
     "temperature_k": "temperature",
@@ -52,7 +48,8 @@ def settle(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) 
 
     `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names one of
     `systems.library.protocols`. Its solvent goes with its force field and is left out when the user names another one;
-    its flexible bonds are left out above a time step of 1 fs; quantum forces then get hydrogens of 3 Da, too.
+    its flexible bonds are left out above a time step of 1 fs. Quantum forces have flexible bonds and natural hydrogens
+    up to that step (at 0.5 fs if only these are asked for).
     Raises UnknownNameError, and InputError for a model system, whose settings are its own.
     """
     name = scene.provenance.get("library_name")
@@ -66,12 +63,7 @@ def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = N
         decisive.pop("solvent", None)
     own = defaults()
     if given.get("force_field") == QUANTUM:
-        step_ps = given.get("timestep_ps", 0.0)
-        if step_ps > LONGEST_QUANTUM_STEP_PS:
-            raise InputError(f"{format_time_ps(step_ps)} is too long for {QUANTUM}; use `timestep_ps='4fs'` or less.")
-        own |= QUANTUM_DEFAULTS
-        if step_ps > LONGEST_FLEXIBLE_STEP_PS:
-            own["hydrogen_mass_da"] = _RIGID_HYDROGEN_MASS_DA
+        own |= _of_quantum(decisive | dict(given))
         decisive.pop("equilibrate_ps", None)
     settings = own | decisive | dict(given)
     if settings["timestep_ps"] > LONGEST_FLEXIBLE_STEP_PS and "constrain_hydrogens" not in given:
@@ -81,6 +73,21 @@ def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = N
         return settings, ""
     what, source = said_as
     return settings, f"{what}: {', '.join(_say(key, value) for key, value in decided.items())} ({source})"
+
+
+def _of_quantum(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the defaults at quantum level beside what is asked for. Raises InputError for too long a step."""
+    is_flexible = asked.get("constrain_hydrogens") is False or asked.get("hydrogen_mass_da", _HYDROGEN_MASS_DA) is None
+    step_ps = asked.get("timestep_ps", _FLEXIBLE_QUANTUM_STEP_PS if is_flexible else LONGEST_QUANTUM_STEP_PS)
+    if step_ps > LONGEST_QUANTUM_STEP_PS:
+        raise InputError(f"{format_time_ps(step_ps)} is too long for {QUANTUM}; use `timestep_ps='4fs'` or less.")
+    is_long = step_ps > LONGEST_FLEXIBLE_STEP_PS
+    return {
+        "timestep_ps": step_ps,
+        "equilibrate_ps": _QUANTUM_EQUILIBRATION_PS,
+        "hydrogen_mass_da": _HYDROGEN_MASS_DA if is_long else None,
+        "constrain_hydrogens": is_long,
+    }
 
 
 def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[str, str]]:

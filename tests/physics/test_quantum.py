@@ -95,8 +95,6 @@ def test_masses_and_constraints_are_what_was_asked_for() -> None:
 
 def test_rigid_bonds_to_hydrogen_stay_as_they_are_at_four_fs() -> None:
     scene = scene_from_smiles("CO")
-    settings, _ = settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.004})
-    assert (settings["hydrogen_mass_da"], settings["constrain_hydrogens"]) == (3.0, True)
     spec = ForceFieldSpec("gfn2-xtb", "vacuum", 3.0, constrain_hydrogens=True)
     with Engine(scene, Conditions(force=spec, platform="Reference", timestep_ps=0.004)) as engine:
         engine.thermalise()
@@ -140,9 +138,19 @@ def test_level_and_settings_go_together() -> None:
     with pytest.raises(UnknownNameError, match="gfn2-xtb"):
         at_level("gfn2", None)
     scene = scene_from_smiles("CO")
-    settings, _ = settle(scene, {"force_field": "gfn2-xtb"})
-    assert settings["timestep_ps"] == 0.0005
-    assert (settings["hydrogen_mass_da"], settings["constrain_hydrogens"]) == (None, False)
+    names = ("timestep_ps", "hydrogen_mass_da", "constrain_hydrogens")
+    for given, expected in (
+        ({}, (0.004, 3.0, True)),
+        ({"timestep_ps": 0.002}, (0.002, 3.0, True)),
+        ({"timestep_ps": 0.001}, (0.001, None, False)),
+        ({"hydrogen_mass_da": None}, (0.0005, None, False)),
+        ({"constrain_hydrogens": False}, (0.0005, None, False)),
+        ({"timestep_ps": 0.002, "constrain_hydrogens": False}, (0.002, 3.0, False)),
+    ):
+        settings, _ = settle(scene, {"force_field": "gfn2-xtb", **given})
+        assert tuple(settings[name] for name in names) == expected, given
+    by_protocol, _ = settle(scene, {"force_field": "gfn2-xtb"}, "md17")
+    assert tuple(by_protocol[name] for name in names) == (0.0005, None, False), "of the paper"
     with pytest.raises(InputError, match="4fs"):
         settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.005})
 
