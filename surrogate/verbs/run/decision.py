@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from surrogate.verbs.run.rates import REPLICAS, Rates
+from surrogate.verbs.run.rates import Rates
 from surrogate.verbs.run.stage_clock import Pace
 from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
@@ -119,6 +119,11 @@ def least_budget_s(rates: Rates, way: Way) -> float:
     # A machine may be less busy in a while: where it is not, stages come to nothing, and say so.
     seconds = _JUDGE_LOADING_S + _judge_s(rates, 0) + 2.0 * n_md * _START_S
     return max(LEAST_BUDGET_S, seconds * min(rates.stretch, _MOST_STRETCH_FORESEEN))
+
+
+def rolled_s(budget_s: float) -> float:
+    """Return the wall seconds of a budget that weights which cover a scene are rolled for, about."""
+    return dict(_SHARES["rollout"])["rollout"] * budget_s
 
 
 def least_md_s(rates: Rates) -> float:
@@ -243,7 +248,7 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
     elif rates.without_lanes:
         lines.append(("in lanes", rates.without_lanes))
     if rates.rolls is not None:
-        lines.append(("by rollout", f"{per_day(rates.rolls.ps_per_s)}, {REPLICAS} replicas of {rates.rolls.weights}"))
+        lines.append(("by rollout", f"{per_day(rates.rolls.ps_per_s)}, {rates.rolls.how}"))
     lines.append(("way", WAYS[decision.way]))
     lines += [("because", reason) for reason in decision.why]
     lines += [(stage.name, f"{format_wall(stage.seconds)}{_to_come(stage.name, decision, rates)}")

@@ -20,7 +20,7 @@ from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
-from surrogate.verbs.run.rates import REPLICAS, Rates, rollout_rate
+from surrogate.verbs.run.rates import Rates, Rolls, compiling_s, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
@@ -150,15 +150,17 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
-    _, decision = _rates_and_decision(record)
+    rates, decision = _rates_and_decision(record)
     dear, seconds = decision.way == "potential", decision.seconds("train")
     files, beside_s = _to_train_on(site, record, seconds)
+    # Weights are tried out when they are written, compiled if they will be.
+    trying_s = compiling_s(dear, rates.stretch, decision.seconds("rollout"))
     if not dear and beside_s > (1.0 - _LEAST_OPTIMISING) * seconds:
         raise InputError(f"it takes {beside_s:.0f} s beside its steps, and has {seconds:.0f} s.")
     options = TrainOptions(
         level=site.options.level if dear else None,
-        # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
-        budget_s=seconds if dear else min(seconds - beside_s, _OPTIMISING * seconds),
+        # A potential's budget covers all it does, that of others their steps.
+        budget_s=seconds - trying_s if dear else min(seconds - beside_s, _OPTIMISING * seconds),
         seed=site.options.seed,
         resume=True,
         quiet=True,
@@ -197,25 +199,26 @@ def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
     out = site.folder / WEIGHTS_NAME
     if not out.exists():
         return None
-    rates, _ = _rates_and_decision(record)
+    rates, decision = _rates_and_decision(record)
+    roll_s = decision.seconds("rollout")
     try:
-        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
+        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch, roll_s)
     except SimulationError as error:
         raise SimulationError(f"its weights roll nothing: {str(error).partition(';')[0]}.") from error
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
 
 
-def _rolled_paths(site: Site) -> list[Path]:
+def _rolled_paths(site: Site, rolls: Rolls) -> list[Path]:
     from systems.trajectory.claim import replica_paths
 
-    return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", REPLICAS)
+    return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", rolls.replicas)
 
 
 def _roll(site: Site, record: RunRecord) -> RunRecord:
     rates, decision = _rates_and_decision(record)
     assert rates.rolls is not None
     every_ps = rates.rolls.lag_ps * math.ceil(decision.save_every_ps / rates.rolls.lag_ps - 1e-6)
-    expected_ps = decision.seconds("rollout") * rates.rolls.ps_per_s / REPLICAS
+    expected_ps = decision.seconds("rollout") * rates.rolls.ps_per_s / rates.rolls.replicas
     own = site.folder / WEIGHTS_NAME
     out = site.folder / f"trajectory/surrogate.{site.options.format}"
     out.parent.mkdir(exist_ok=True)
@@ -228,7 +231,8 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             save_every_ps=every_ps,
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
-            replicas=REPLICAS,
+            replicas=rates.rolls.replicas,
+            compile=rates.rolls.compiled,
             # Frames of a potential are what its level says, as far as it has learned it: nothing is to mend them by.
             guard="flag" if rates.dear else "repair",
             resume=True,
@@ -239,7 +243,10 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
 
 
 def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
-    files = _with_frames(site.folder, _rolled_paths(site))
+    rates, _ = _rates_and_decision(record)
+    if rates.rolls is None:
+        return None
+    files = _with_frames(site.folder, _rolled_paths(site, rates.rolls))
     return replace(record, trajectory=files) if files else None
 
 

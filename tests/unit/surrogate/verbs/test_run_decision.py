@@ -53,7 +53,7 @@ def test_md_in_lanes_is_a_rival_of_the_surrogate() -> None:
     assert found.way == "md" and "0.5 times as fast as MD runs here in lanes: no surrogate pays" in found.why[0]
     lines = dict(table(lanes, found, 600.0))
     assert lines["by OpenMM"].startswith("27.6 us a day on 2 cores") and lines["in lanes"].startswith("276 us a day")
-    assert lines["by rollout"].startswith("138 us a day")
+    assert lines["by rollout"] == "138 us a day, 8 replicas of alanine-dipeptide"
     assert lanes.replicas == 32 and found.equilibrate_ps == pytest.approx(0.1 * found.expected_md_ps / 32)
     one_core = decide(replace(lanes, cores=1), 600.0)
     assert named(one_core) == ["md", "report"], "sixteen replicas of one core judge each other"
