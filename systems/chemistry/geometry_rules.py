@@ -19,9 +19,9 @@ RING_BENT_COSINE = 0.5
 MAX_PAIRS = 40_000
 _RING_PLANAR_COSINE = float(np.cos(np.deg2rad(20.0)))
 _TOLERATED_SHARE = 1e-3
-# Between hydrogens, hydrogen and heavy atom, heavy atoms; nm.
+# Between hydrogens, hydrogen and heavy atom, heavy atoms; nm. At most: the lengths of the shortest hydrogen bonds.
 _CLASH_WITHOUT_FRAMES_NM = (0.1, 0.1, 0.2)
-_CLASH_AT_MOST_NM = (0.14, 0.14, 0.24)
+CLASH_AT_MOST_NM = (0.14, 0.14, 0.24)
 _CLASH_SHARE_OF_LEAST = 0.8
 # Of unit vectors to three neighbours: 0.77 where a fourth is missing, 0 where there is none.
 _PYRAMID = 0.4
@@ -100,7 +100,7 @@ def measured_rules(scene: Scene, positions_nm: FloatArray) -> dict[str, Any]:
     }  # fmt: skip
     if pairs and scene.interactions is None:
         seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
-        rules["clash_min_nm"] = np.minimum(_CLASH_SHARE_OF_LEAST * seen, _CLASH_AT_MOST_NM)
+        rules["clash_min_nm"] = np.minimum(_CLASH_SHARE_OF_LEAST * seen, CLASH_AT_MOST_NM)
     return rules
 
 

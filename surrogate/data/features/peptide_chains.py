@@ -34,7 +34,8 @@ from surrogate.models.peptides.torsion_states import (
     StatedTorsions,
 )
 from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions, bonded_graph, ring_bonds
+from systems.chemistry.geometry_rules import CLASH_AT_MOST_NM
+from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, ring_bonds
 from systems.errors import InputError
 from systems.scene import Scene
 
@@ -207,8 +208,19 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
     return ChainFeatures(
         ChainCode(layout, config.scale), config.places(layout.types), template_nm, fitted,
-        stated_torsions(scene, layout),
+        stated_torsions(scene, layout), _least_distances(scene),
     )  # fmt: skip
+
+
+def _least_distances(scene: Scene) -> torch.Tensor:
+    """Return how near atoms come that are more than three bonds apart, nm `(n_atoms, n_atoms)`: the lengths of the
+    shortest hydrogen bonds, as for the checks of frames (`systems.chemistry.validity`); 0 for all others."""
+    heavy = np.array([element != "H" for element in scene.elements], dtype=np.int64)
+    least = np.array(CLASH_AT_MOST_NM)[heavy[:, None] + heavy]
+    near = exclusions(scene, depth=3)
+    least[near[:, 0], near[:, 1]] = least[near[:, 1], near[:, 0]] = 0.0
+    np.fill_diagonal(least, 0.0)
+    return torch.from_numpy(least).float()
 
 
 def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:

@@ -28,6 +28,8 @@ from surrogate.models.peptides.torsion_states import StatedTorsions
 # A number told in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
 _TINY = 1e-12
+# Held in memory at once.
+_MOST_DISTANCES = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -161,18 +163,21 @@ class ChainCode(nn.Module):
 @dataclass(frozen=True, eq=False)
 class ChainFeatures:
     """What a model of peptides is told of one: its `code`, the types of its residues and their neighbours as numbers
-    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, and the
-    torsions that have states, `stated`."""
+    `places` (n_residues, 3), the `template_nm` (n_atoms, 3), which frames are laid on by the atoms `fitted`, the
+    torsions that have states, `stated`, and how near two atoms may come, `least_nm` (n_atoms, n_atoms), 0 where they
+    are bonded or nearly."""
 
     code: ChainCode
     places: Tensor
     template_nm: npt.NDArray[np.float64]
     fitted: npt.NDArray[np.int64]
     stated: StatedTorsions
+    least_nm: Tensor
 
     def to(self, device: torch.device) -> ChainFeatures:
         code = copy.deepcopy(self.code).to(device)
-        return replace(self, code=code, places=self.places.to(device), stated=self.stated.to(device))
+        places, least_nm = self.places.to(device), self.least_nm.to(device)
+        return replace(self, code=code, places=places, stated=self.stated.to(device), least_nm=least_nm)
 
     @cached_property
     def signed(self) -> Tensor:
@@ -193,6 +198,16 @@ class ChainFeatures:
         """Return the states of torsions `(..., n_residues, MOST_TORSIONS)` in frames `(..., n_atoms, 3)`."""
         quads = self.stated.quads
         return self.stated.states(dihedral(*(frames_nm[..., quads[:, k], :].float() for k in range(4))))
+
+    def overlap(self, frames_nm: Tensor) -> Tensor:
+        """Return in which frames `(..., n_atoms, 3)` atoms come nearer than they may, `(...)`."""
+        flat = frames_nm.reshape(-1, *frames_nm.shape[-2:]).float()
+        block = max(1, _MOST_DISTANCES // self.least_nm.numel())
+        found = [
+            (torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist") < self.least_nm).flatten(1).any(-1)
+            for x in flat.split(block)
+        ]
+        return torch.cat(found).reshape(frames_nm.shape[:-2])
 
 
 def internal_coordinates(

@@ -5,7 +5,8 @@ internal coordinates of `models.peptides.chains`, so that no first stage is trai
 is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
 chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
-(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state.
+(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Chunks that
+leave these states, or in which atoms overlap as they never do in MD, are drawn again, in the same states.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _FAR = 6
 _LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
-# Chunks that disobey the states that were drawn for them are drawn again so often.
+# Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
 MAX_REDRAWS = 4
 
 
@@ -341,10 +342,14 @@ class PeptideSlide(Surrogate):
         states = self.jumps.draw(known, now, chain.places, counts, times, apart, uniform)
         of_states = told_states(torch.cat([now[:, None], states], dim=1), counts)
 
+        evaluations = 0.0
+
         def solve(rows: Tensor, drawn: Tensor) -> Tensor:
             told = self.flow.told(known[rows], times[rows], chain.places, of_states[rows])
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
+                nonlocal evaluations
+                evaluations += len(rows) / len(known)
                 return torch.where(filled, self.flow(o, tau, told), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
@@ -353,7 +358,8 @@ class PeptideSlide(Surrogate):
         rows = torch.arange(len(known), device=known.device)
         frames = solve(rows, drawn)
         for attempt in range(MAX_REDRAWS):
-            rows = rows[(chain.states(frames[rows]) != states[rows]).flatten(1).any(-1)]
+            disobeyed = (chain.states(frames[rows]) != states[rows]).flatten(1).any(-1)
+            rows = rows[disobeyed | chain.overlap(frames[rows]).any(-1)]
             if not len(rows):
                 break
             again = drawn.new_zeros(len(rows), *drawn.shape[1:])
@@ -361,4 +367,4 @@ class PeptideSlide(Surrogate):
             fresh = (*drawn.shape[1:2], int(filled.sum()))
             again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
             frames[rows] = solve(rows, again)
-        return Chunk(frames)
+        return Chunk(frames, evaluations=evaluations)

@@ -240,3 +240,41 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
     alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
+
+
+def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_apart() -> None:
+    scene = build_peptide("ACE-ALA-NME")
+    chain = chain_features(scene, _config(scene))
+    at = {(int(r), name): i for i, (r, name) in enumerate(zip(scene.residue_of_atom, scene.atom_names, strict=True))}
+    x = torch.tensor(scene.positions_nm).float().repeat(2, 3, 1, 1)
+    oxygen, far = at[0, "O"], at[2, "C"]
+    x[1, 2, far] = x[1, 2, oxygen] + torch.tensor([0.0, 0.0, 0.23])
+    x[0, 1, far] = x[0, 1, oxygen] + torch.tensor([0.0, 0.0, 0.25])
+    x[0, 0, at[0, "C"]] = x[0, 0, oxygen]  # bonded: for other checks
+    assert chain.overlap(x).tolist() == [[False, False, False], [False, False, True]]
+
+
+def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what is drawn the first of three rows is called overlapping twice: it alone is drawn three times."""
+    scene = build_peptide("ACE-ALA-NME")
+    model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
+    model.lag_ps = 1.0
+    model.token_scale.fill_(1e-3)
+    molecule = describe(model, scene)
+    chain = molecule.chain
+    assert chain is not None
+    model.token_mean.copy_(_middles(model, chain))
+    seen: list[int] = []
+
+    def overlap(self: ChainFeatures, frames_nm: torch.Tensor) -> torch.Tensor:
+        seen.append(len(frames_nm))
+        found = torch.zeros(frames_nm.shape[:2], dtype=torch.bool)
+        found[0] = len(seen) < 3
+        return found
+
+    monkeypatch.setattr(ChainFeatures, "overlap", overlap)
+    last = torch.tensor(scene.positions_nm).float().expand(3, 1, -1, -1)
+    noise = torch.randn(3, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
+    chunk = model.next_chunk(last, molecule, noise, solver_steps=2)
+    assert seen == [3, 1, 1]
+    assert chunk.evaluations == pytest.approx(2 * (3 + 1 + 1) / 3)
