@@ -18,6 +18,11 @@ TEST_CHAINS = (
     ("VAL", "GLY", "ASP", "ALA", "PHE"), ("ALA", "LYS", "LEU", "GLU", "THR", "ILE"),
 )  # fmt: skip
 TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"),)
+# Beside the rounds of pairs: what these hold little of, residues before proline and opposite charges side by side.
+FURTHER_PAIRS = (
+    ("GLY", "PRO"), ("VAL", "PRO"), ("SER", "PRO"), ("LEU", "PRO"), ("LYS", "PRO"), ("GLU", "PRO"), ("ASN", "PRO"),
+    ("PHE", "PRO"), ("LYS", "ASP"), ("ASP", "LYS"), ("ARG", "GLU"), ("GLU", "ARG"), ("GLU", "LYS"), ("ARG", "ASP"),
+)  # fmt: skip
 _TEST_STARTS = 16
 _PAIR_ROUNDS = 3
 _CHAINS = 12
@@ -48,7 +53,8 @@ def training_peptides() -> tuple[Peptide, ...]:
     """Return every training molecule in the order in which they are simulated.
 
     Monomers first; then capped pairs in three rounds, each of which has every residue once at either position, so that
-    the first n pairs are a fair set for any n; then tri- and tetrapeptides and pairs with free termini by turns.
+    the first n pairs are a fair set for any n; then FURTHER_PAIRS; then tri- and tetrapeptides and pairs with free
+    termini by turns.
     """
     monomers = [Peptide((residue,), True, 48, 2000.0) for residue in RESIDUES]
     rng = random.Random(_SEED)
@@ -58,6 +64,7 @@ def training_peptides() -> tuple[Peptide, ...]:
         drawn = _matching(rng, taken)
         taken.update(drawn)
         pairs += [Peptide(pair, True, 16, 1600.0) for pair in drawn]
+    pairs += [Peptide(pair, True, 16, 1600.0) for pair in FURTHER_PAIRS if pair not in taken]
     chains = [
         Peptide(residues, True, 16, 1600.0)
         for residues in _chains(rng, {*TEST_CHAINS, *TEST_FREE_CHAINS}, lengths=(3, 4), n=_CHAINS)

@@ -64,12 +64,14 @@ class PeptideSubject:
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
         """Return the pattern of phi's signs of each frame `kept` (n,), as a number, and the population of each pattern.
 
-        Residues are taken to be independent; those whose free energy is not given play no part.
+        Residues are taken to be independent; those whose free energy is not given play no part, nor do those before a
+        proline, whose ring leaves them no room at phi > 0: how likely they are there is left to their own runs.
         """
+        types = (*self.chain.code.layout.types, "")
         states, shares = np.zeros(len(kept), dtype=np.int64), np.ones(1)
         for residue in self.chain.signed.tolist():
             name = self.frames.scene.residue_names[residue]
-            if name in positive_phi_kt:
+            if name in positive_phi_kt and types[residue + 1] != "PRO":
                 states = states + len(shares) * self._states[kept, residue, 0]
                 odds = float(np.exp(-positive_phi_kt[name]))
                 shares = np.concatenate([shares, shares * odds])

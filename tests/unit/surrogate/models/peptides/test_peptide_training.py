@@ -137,6 +137,15 @@ def test_positive_phi_weighs_what_metadynamics_says() -> None:
     assert np.log(ratio) == pytest.approx(-3.0, abs=1e-6)
 
 
+def test_positive_phi_before_a_proline_is_left_to_the_runs() -> None:
+    for sequence, patterns in (("ACE-ALA-VAL-NME", 4), ("ACE-ALA-PRO-NME", 1)):
+        scene = build_peptide(sequence)
+        x = scene.positions_nm + 0.002 * np.random.default_rng(0).normal(size=(60, scene.n_atoms, 3))
+        frames = TrainingFrames(scene, quantise(canonicalise(x, scene)), np.array([0, 60]), 1.0, True, CONDITIONS, ())
+        subject = PeptideSubject(frames, chain_features(scene, with_scale(SMALL, [frames])))
+        assert len(subject._signs_of_phi(np.arange(60), {"ALA": 1.0, "VAL": 2.0})[1]) == patterns
+
+
 def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: PeptideConfig) -> None:
     model = PeptideSlide(config)
     normalise(model, [PeptideSubject(frames, chain_features(frames.scene, config))], 0)
