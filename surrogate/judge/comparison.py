@@ -214,7 +214,7 @@ def compare(
     accounts = [account_of(e) for e in everyone]
     beside = None if floor is None else find_pairs(thinned[0], floor)
     setting = _Setting(
-        stage, yardstick.torsions, yardstick.geometry, truth, other, chosen, float(temperature), accounts[0]
+        stage, yardstick.torsions, yardstick.geometry, truth, other, chosen, float(temperature), accounts[0], {}
     )
     judgements = tuple(
         _with_forecast(
@@ -254,6 +254,7 @@ class _Setting(NamedTuple):
     options: Options
     temperature_k: float
     account: Account
+    recipes: dict[int, Any]
 
 
 def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgement:
@@ -352,7 +353,7 @@ def _equal_terms(setting: _Setting, candidate: Features) -> tuple[Trio, float, f
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
     )
     trio = Trio(
-        setting.scene, torsions, setting.geometry, truth, rolled, other, options, temperature_k=setting.temperature_k
+        setting.scene, torsions, setting.geometry, truth, rolled, other, options, setting.temperature_k, setting.recipes
     )
     return trio, slowest, own
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -141,7 +141,11 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Trio:
-    """Reference, candidate and replicate at equal lag and equal frame count, and what they are measured with."""
+    """Reference, candidate and replicate at equal lag and equal frame count, and what they are measured with.
+
+    `recipes`: what the published recipe fitted on the reference, by the number of its frames; the candidates of one
+    comparison share it.
+    """
 
     scene: Scene
     torsions: Backbone
@@ -151,6 +155,7 @@ class Trio:
     replicate: Sample
     options: Options
     temperature_k: float = 300.0
+    recipes: dict[int, Any] = field(default_factory=dict)
 
     @property
     def compared_ps(self) -> float:

@@ -165,7 +165,9 @@ def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, 
         return [], [], [(name, short)]
     if not all(np.isfinite(x).any() for f in (candidate, replicate) for x in (*f.phi, *f.psi)):
         return [], [], [(name, "a segment holds no finite frame")]
-    fit = fit_recipe(reference)
+    if n not in trio.recipes:
+        trio.recipes[n] = fit_recipe(reference)
+    fit: Fit | None = trio.recipes[n]
     if fit is None:
         return [], [], [(name, kinetics.WITHOUT_TICA)]
     tables = [peptide_table(fit, reference, other).values() for other in (candidate, replicate)]

@@ -21,6 +21,7 @@ import pytest
 from surrogate.judge.comparison import compare
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
 from surrogate.judge.report.report import write_report
+from surrogate.judge.rows.rows import Options
 
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -165,8 +166,8 @@ def page(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames[::40] = np.nan
     frames[5:50] *= 1.3
     bad = replace(good, label="bad </script><b>", segments=[frames], chunk_idx=[np.repeat(np.arange(25), 40)])
-    written = write_report(compare(reference, [good, bad], replicate), tmp_path_factory.mktemp("page") / "report.html")
-    return written.html
+    found = compare(reference, [good, bad], replicate, options=Options(peptide_recipe=False))
+    return write_report(found, tmp_path_factory.mktemp("page") / "report.html").html
 
 
 PICTURE = """(() => {

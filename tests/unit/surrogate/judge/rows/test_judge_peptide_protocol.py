@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,12 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.distance import jensenshannon
 
+from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.measure import structure
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
 from surrogate.judge.rows.motion import peptide_protocol
+from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
 
 
@@ -75,6 +79,30 @@ def test_a_trajectory_has_no_distance_to_itself(real: tuple[Features, Features])
     wrong = peptide_protocol.peptide_table(fit, reference, shifted)
     right = peptide_protocol.peptide_table(fit, reference, other)
     assert (wrong.values()[[0, 2, 3, 4]] > 1.5 * right.values()[[0, 2, 3, 4]]).all(), "negative control"
+
+
+def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
+    simulate: Callable[..., Ensemble], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    fit_recipe = peptide_protocol.fit_recipe
+
+    def counted(reference: Features) -> peptide_protocol.Fit | None:
+        made.append(reference.n_frames)
+        return fit_recipe(reference, n_clusters=12, n_states=3)
+
+    def distances(judgement: Judgement) -> list[float]:
+        (bars,) = (c for c in judgement.curves.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
+        return list(bars.to_dict()["candidate"])
+
+    monkeypatch.setattr(peptide_protocol, "fit_recipe", counted)
+    quick = Options(n_bootstrap=30, n_permutations=20)
+    reference, one, other, replicate = (simulate(80 + k, 1200) for k in range(4))
+    shorter = replace(other, segments=[other.segments[0][:1100]])
+    _, found, short = compare(reference, [one, other, shorter], replicate, options=quick).judgements
+    assert made == [1200, 1100]
+    assert distances(found) == distances(compare(reference, [other], replicate, options=quick).judgements[0])
+    assert distances(found) != distances(short)
 
 
 def test_decorrelation_of_a_torsion_that_diffuses_about_a_mean() -> None:
