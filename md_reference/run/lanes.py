@@ -9,13 +9,8 @@ and forces with OpenMM's. Integrator: Langevin middle, with constraints, as Open
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import itertools
 import math
-import os
-import shutil
-import subprocess
-import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import lru_cache
@@ -25,15 +20,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.forces.small_molecules.parameter_cache import cache_folder
 from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, hottest_k
 from md_reference.run.platforms import LANES, PlatformChoice
 from systems.errors import InputError, SimulationError
+from systems.files.native import CompilerError, compiled_program
 from systems.scene import FloatArray
 
 _SOURCE = Path(__file__).with_name("lanes.cpp")
-# Linked apart: told of fast mathematics, GCC before 13 links what has the whole process round small numbers to zero.
-_FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-fPIC", "-c")
 _COULOMB = 138.93545764438198
 _OFFSET_NM = 0.009
 _PERIODS = 6
@@ -67,29 +60,11 @@ class _System(ctypes.Structure):
 
 @lru_cache(maxsize=1)
 def _program() -> ctypes.CDLL:
-    """Compile `lanes.cpp` for this processor, once for each version of it, and load it."""
-    compiler = next((c for c in ("g++", "c++") if shutil.which(c)), None)
-    if compiler is None:
-        raise LanesUnavailableError(
-            "no C++ compiler (g++) was found, which platform lanes needs; take another platform."
-        )
-    # What the compiler says that it is and calls this processor.
-    asked = [compiler, "-march=native", "-v", "-E", "-x", "c++", os.devnull]
-    said = subprocess.run(asked, capture_output=True, check=False).stderr
-    key = hashlib.sha256(b"\0".join([_SOURCE.read_bytes(), said, repr(_FLAGS).encode()])).hexdigest()[:16]
-    path = cache_folder() / f"lanes-{key}.so"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            part = Path(folder) / path.name
-            compiled = f"{part}.o"
-            for step in ([*_FLAGS, "-o", compiled, str(_SOURCE)], ["-shared", "-o", str(part), compiled]):
-                done = subprocess.run([compiler, *step], capture_output=True, text=True, check=False)
-                if done.returncode:
-                    lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-                    raise LanesUnavailableError(f"{compiler} could not compile {_SOURCE.name}: {lines[0]}")
-            os.replace(part, path)
-    program = ctypes.CDLL(str(path))
+    """Return `lanes.cpp` compiled for this processor."""
+    try:
+        program = compiled_program(_SOURCE)
+    except CompilerError as error:
+        raise LanesUnavailableError(f"{error}, which platform lanes needs; take another platform.") from error
     pointer = ctypes.c_void_p
     program.work_floats.restype, program.work_floats.argtypes = ctypes.c_int64, [ctypes.c_int64]
     program.forces.restype, program.forces.argtypes = None, [pointer, pointer, pointer, pointer]

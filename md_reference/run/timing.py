@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from md_reference.forces.small_molecules.parameter_cache import cache_folder
 from md_reference.run.machine import machine_name, platform_properties
 from systems.errors import SurromdError
+from systems.files.native import cache_folder
 from systems.files.outside import content
 from systems.files.schema import parsed
 from systems.files.whole_file import create_whole

@@ -31,8 +31,7 @@ def with_compiled_parts(model: _Model) -> _Model:
     # A model that wraps another one (such as heavy atoms with hydrogens placed): the inner one's networks.
     within = next((child for child in copied.children() if isinstance(child, Surrogate)), copied)
     if isinstance(within, Surrogate) and within.integrates:
-        within.compile_forces()
-        return copied
+        return copied  # what it integrates is compiled as it is
     lists = [child for child in within.children() if isinstance(child, nn.ModuleList)]
     parents: list[nn.Module] = [within, *lists]
     for parent in parents:

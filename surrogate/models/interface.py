@@ -152,11 +152,6 @@ class Surrogate(nn.Module, ABC):
             f"{self.arch} learned its bath with its frames; leave {', '.join(f'`{k}`' for k in changes)} out."
         )
 
-    def compile_forces(self) -> None:
-        """Have torch compile the forces when they are first asked for, for as many frames; of a model that
-        `integrates`."""
-        raise NotImplementedError(f"{self.arch} has no forces")
-
     @abstractmethod
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         """Shape of one replica's noise; (0,) of a model without any."""

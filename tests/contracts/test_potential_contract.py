@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import shutil
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.conformance import SurrogateContract, branched_chain, orthogonal
 from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.painet.attention import pair_energy
 from surrogate.models.painet.potential import energy as room
+from surrogate.models.painet.potential import lanes
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import bonded_shells, find_edges
 from surrogate.models.painet.potential.energy import latent_energy
+from surrogate.models.painet.potential.lanes import lanes_of
 from surrogate.models.painet.potential.model import PainetPotential
 from systems.errors import InputError
 
@@ -85,30 +87,70 @@ def test_forces_are_the_exact_gradient_of_the_energy() -> None:
     assert forces.abs().mean() > 10.0
 
 
-def test_compiled_forces_are_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled = []
-
-    def count(graph: Any, **settings: Any) -> Any:
-        compiled.append(graph)
-        return graph
-
-    monkeypatch.setattr(torch, "compile", count)
-    molecule, plain = branched_chain(9), lively()
-    fast = with_compiled_parts(plain)
-    for rows in (2, 2, 3):
-        x = walks(9, rows)
-        torch.testing.assert_close(fast.forces(x, molecule), plain.forces(x, molecule), rtol=1e-5, atol=1e-4)
-    assert len(compiled) == 1, "for two rows; others go the plain way"
-    moved = walks(9, 2) * 1.01
-    assert (fast.forces(moved, molecule) - plain.forces(walks(9, 2), molecule)).abs().max() > 1.0, "nothing is baked in"
-    torch.testing.assert_close(fast.forces(moved, molecule), plain.forces(moved, molecule), rtol=1e-5, atol=1e-4)
+SIZES = [
+    pytest.param(SMALL, id="small"),
+    pytest.param(replace(SMALL, n_steps=1, n_members=1, n_vectors=1, n_tensors=1), id="one step"),
+    pytest.param(replace(SMALL, n_steps=3, n_heads=3, n_radial=5, width=10), id="three steps"),
+    pytest.param(PotentialConfig(), id="as trained"),
+]
+needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 
 
-@pytest.mark.slow
-def test_forces_compiled_in_earnest_are_the_plain_ones_to_rounding() -> None:
-    molecule, plain, x = branched_chain(9), lively(), walks(9)
-    fast = with_compiled_parts(plain)
-    torch.testing.assert_close(fast.forces(x, molecule), plain.forces(x, molecule), rtol=1e-4, atol=1e-2)
+@needs_compiler
+@pytest.mark.parametrize("config", SIZES)
+@pytest.mark.parametrize("rows", [1, 5, 33])
+def test_forces_in_lanes_are_those_of_torch(config: PotentialConfig, rows: int) -> None:
+    molecule, model, x = branched_chain(9), lively(config), walks(9, rows)
+    # Walls that some pairs stand in.
+    model.network.nearest_nm.fill_(0.12)
+    model.network.farthest_nm.fill_(0.4)
+    in_lanes = model.gradient(x, molecule)
+    members, gradient = in_lanes(x)
+    exact = lively(config)
+    exact.load_state_dict(model.state_dict())
+    exact = exact.double()
+    expected = exact.evaluate(x, exact.fabric(molecule))
+    scale = expected.forces_kj_mol_nm.abs().mean()
+    assert scale > 100.0
+    torch.testing.assert_close(members, expected.members_kj_mol, rtol=1e-5, atol=1e-2)
+    assert (gradient + expected.forces_kj_mol_nm).abs().max() < 1e-4 * scale
+    # A frame does not depend on those beside it.
+    torch.testing.assert_close(in_lanes(x[:1].repeat(rows, 1, 1))[1][-1], gradient[0], rtol=0, atol=0)
+    # Negative control: torch's own single precision is no nearer.
+    plain = model.evaluate(x, model.fabric(molecule)).forces_kj_mol_nm
+    assert 0.0 < (plain - expected.forces_kj_mol_nm).abs().max() < 1e-4 * scale
+
+
+@needs_compiler
+def test_lanes_are_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def in_lanes(model: PainetPotential, n_atoms: int) -> bool:
+        x, molecule = walks(n_atoms), branched_chain(n_atoms)
+        made = model.network.prepare(fabric := model.fabric(molecule), x)
+        found = lanes_of(model.network, fabric, made, len(x)) is not None
+        torch.testing.assert_close(
+            model.forces(x, molecule).float(), evaluated(model, x, molecule)[1].float(), rtol=1e-4, atol=0.05
+        )
+        return found
+
+    assert in_lanes(lively(), 9)
+    assert not in_lanes(lively().double(), 9) and not in_lanes(lively(), 80)
+    monkeypatch.setenv("PATH", "")
+    lanes._program.cache_clear()
+    assert not in_lanes(lively(), 9), "without a compiler"
+
+
+@needs_compiler
+def test_weights_that_changed_and_copies_are_not_rolled_by_what_was_made_before() -> None:
+    molecule, model, x = branched_chain(9), lively(), walks(9)
+    before, copied = model.forces(x, molecule), copy.deepcopy(model)
+    for changed in (model, copied):
+        with torch.no_grad():
+            changed.network.table.weight.mul_(0.5)
+        changed.train().eval()
+        assert (changed.forces(x, molecule) - before).abs().max() > 1.0
+        torch.testing.assert_close(
+            changed.forces(x, molecule), evaluated(changed, x, molecule)[1], rtol=1e-4, atol=0.01
+        )
 
 
 def test_energy_is_a_scalar_and_momentum_and_angular_momentum_are_kept() -> None:

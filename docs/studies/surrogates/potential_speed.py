@@ -1,7 +1,7 @@
-"""What a force of PAINET as a potential costs, plain and compiled, alone and in batches, beside GFN2-xTB's, in
+"""What a force of PAINET as a potential costs, by torch and in lanes, alone and in batches, beside GFN2-xTB's, in
 processor time of one core (the least of several).
 
-    python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [--plain] [SMILES...]
+    python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [SMILES...]
 
 The weights are those that training begins with: the cost does not depend on them.
 """
@@ -17,9 +17,9 @@ from functools import partial
 import torch
 
 from md_reference.forces.quantum import Potential
-from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.gradient import gradient_of
 from surrogate.models.painet.potential.model import PainetPotential
 from systems.prepare.molecule import scene_from_smiles
 
@@ -47,22 +47,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("molecules", nargs="*", default=MOLECULES)
     parser.add_argument("--batches", default="1,32,256")
-    parser.add_argument("--plain", action="store_true", help="compile nothing")
     given = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    plain = PainetPotential(PotentialConfig()).eval().requires_grad_(False)
+    model = PainetPotential(PotentialConfig()).eval().requires_grad_(False)
     for smiles in given.molecules:
         scene = scene_from_smiles(smiles)
         molecule, truth = Molecule.of(scene), Potential(scene)
         at = torch.tensor(scene.positions_nm)[None]
+        fabric = model.fabric(molecule)
+        made = model.network.prepare(fabric, at)
         moved = iter(at + 0.003 * torch.randn(2 + ROUNDS, *at.shape[1:], dtype=at.dtype))
         line = [f"{smiles}, {scene.n_atoms} atoms: GFN2-xTB {least_ms(partial(ask, truth, moved)):.3g} ms"]
         for rows in map(int, given.batches.split(",")):
             x = at + 0.003 * torch.randn(rows, *at.shape[1:], dtype=at.dtype)
-            found = [plain] if given.plain else [plain, with_compiled_parts(plain)]
-            costs = [least_ms(partial(model.forces, x, molecule)) / rows for model in found]
-            line.append(f"batch {rows}: " + ", compiled ".join(f"{cost:.3g}" for cost in costs))
+            by_torch = gradient_of(partial(model.members, fabric=fabric, made=made))
+            costs = [least_ms(partial(force, x)) / rows for force in (by_torch, model.gradient(x, molecule))]
+            line.append(f"batch {rows}: " + ", in lanes ".join(f"{cost:.3g}" for cost in costs))
         sys.stdout.write("; ".join(line) + "\n")
         sys.stdout.flush()
 

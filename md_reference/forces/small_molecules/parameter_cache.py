@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +13,7 @@ from md_reference.forces.small_molecules.prmtop import Prmtop
 from systems.chemistry.graph import match_atoms, molecule_key
 from systems.errors import InputError, OutOfDomainError
 from systems.files.checksums import sealed, unsealed
+from systems.files.native import cache_folder
 from systems.files.outside import content
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole, storage_error
@@ -42,15 +42,6 @@ class _Record:
     scene: Scene
     prmtop: str
     source: dict[str, Any]
-
-
-def cache_folder() -> Path:
-    """Where this user's files that can be made again lie: $SURROMD_CACHE, else surromd under $XDG_CACHE_HOME."""
-    own = os.environ.get("SURROMD_CACHE")
-    if own:
-        return Path(own).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "surromd"
 
 
 def shipped_folder() -> Path:

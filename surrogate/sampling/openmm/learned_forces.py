@@ -11,7 +11,6 @@ import torch
 
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
-from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.sampling.domain import match_scene
@@ -30,20 +29,18 @@ KJ_MOL_PER_EV = 96.48533212331
 class LearnedForces:
     """Energies and forces of a scene by a learned potential, atoms in the scene's order.
 
-    `weights`: a file, or loaded ones. `compile`: the network is compiled for as many frames as are asked about first,
-    which takes a minute. Raises InputError for weights that are no potential and where there is nothing to compile
-    with, OutOfDomainError for a molecule that they do not cover.
+    `weights`: a file, or loaded ones. Raises InputError for weights that are no potential, OutOfDomainError for a
+    molecule that they do not cover.
     """
 
-    def __init__(self, scene: Scene, weights: str | Path | Weights, *, compile: bool = False) -> None:
+    def __init__(self, scene: Scene, weights: str | Path | Weights) -> None:
         loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
         if not isinstance(loaded.model, PainetPotential):
             raise InputError(
                 f"{loaded.path.name} makes frames, not forces ({loaded.model.arch}); train a potential with "
                 "`level='gfn2-xtb'`."
             )
-        model = loaded.model.eval()
-        self.scene, self.weights, self._model = scene, loaded, with_compiled_parts(model) if compile else model
+        self.scene, self.weights, self._model = scene, loaded, loaded.model.eval()
         self._order = match_scene(scene, loaded)
         self._back = np.argsort(self._order)
         self._molecule = Molecule.of(loaded.domain.scene)

@@ -121,11 +121,6 @@ def least_budget_s(rates: Rates, way: Way) -> float:
     return max(LEAST_BUDGET_S, seconds * min(rates.stretch, _MOST_STRETCH_FORESEEN))
 
 
-def rolled_s(budget_s: float) -> float:
-    """Return the wall seconds of a budget that weights which cover a scene are rolled for, about."""
-    return dict(_SHARES["rollout"])["rollout"] * budget_s
-
-
 def least_md_s(rates: Rates) -> float:
     """Return the wall seconds in which a stage of MD comes to something, as busy as the machine is."""
     return _START_S * max(2.0, rates.stretch)
@@ -247,8 +242,8 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
         lines.append(("in lanes", f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"))
     elif rates.without_lanes:
         lines.append(("in lanes", rates.without_lanes))
-    if rates.rolls is not None:
-        lines.append(("by rollout", f"{per_day(rates.rolls.ps_per_s)}, {rates.rolls.how}"))
+    if (rolls := rates.rolls) is not None:
+        lines.append(("by rollout", f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"))
     lines.append(("way", WAYS[decision.way]))
     lines += [("because", reason) for reason in decision.why]
     lines += [(stage.name, f"{format_wall(stage.seconds)}{_to_come(stage.name, decision, rates)}")

@@ -25,7 +25,6 @@ from surrogate.verbs.run.decision import (
     decide,
     least_budget_s,
     least_md_s,
-    rolled_s,
     seconds_of_first,
 )
 from surrogate.verbs.run.rates import by_openmm, measure
@@ -60,7 +59,7 @@ def plan_scene(scene: str | Path | Scene, options: RunOptions) -> RunRecord:
     """Return what a run of a scene would be: rates, measured now, and the decision. Nothing is written."""
     molecule, config = _prepared(scene, options)
     record = _new_record(scene, molecule, options)
-    return _decide(record, molecule, config, options, lambda: 0.0, compiles=False)
+    return _decide(record, molecule, config, options, lambda: 0.0)
 
 
 def run_scene(
@@ -180,8 +179,7 @@ class _Run:
         if there is not None and enough and may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:
             self._ended(there, StageEntry(name, "out of time", 0.0))  # processes would hardly have begun
             return
-        how = f", {rates.rolls.how}" if name == "rollout" and rates.rolls else ""
-        self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s{how}" if name != "report" else name)
+        self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES:
             load_beside(self._pending[1].name)
@@ -276,12 +274,10 @@ def _before_stages(clock: Clock, doing: str, work: Callable[[], T]) -> T:
 
 
 def _decide(
-    record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, spent_s: Callable[[], float], *,
-    compiles: bool = True,
-) -> RunRecord:  # fmt: skip
-    """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known; `compiles`: a
-    potential is, which takes minutes, if that pays."""
-    rates = measure(scene, config, options.weights, options.cores, rolled_s(options.budget_s) if compiles else 0.0)
+    record: RunRecord, scene: Scene, config: MDConfig, options: RunOptions, spent_s: Callable[[], float]
+) -> RunRecord:
+    """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known."""
+    rates = measure(scene, config, options.weights, options.cores)
     # On a machine so busy that measuring took what the stages need, they get it all the same.
     least_s = min(options.budget_s, least_budget_s(rates, "md"))
     left_s = max(options.budget_s - spent_s(), least_s)

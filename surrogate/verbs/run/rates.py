@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import OutOfDomainError, SimulationError, first_line
+from systems.errors import OutOfDomainError, SimulationError
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -21,13 +21,9 @@ if TYPE_CHECKING:
 # Rollouts side by side: one batch, which costs little more than one of them. A potential's step is cheaper by 1.7 times
 # for each of 32 than of 8, and by another tenth at most for each of more.
 REPLICAS, POTENTIAL_REPLICAS = 8, 32
-# Processor seconds in which a potential is compiled, to roll 1.6 times as fast; it pays in rollouts so many times as
-# long. What is compiled stays on disk, where the rollout finds it.
-_COMPILING_S, _COMPILING_PAYS = 90.0, 2.0
 # Weights for several lags step so far, or as near to it as they can.
 LONG_LAG_PS = 10.0
-# Chunks that tell a rate, and fewer of a potential, whose steps are many; the first and the last do not count.
-_CHUNKS, _POTENTIAL_CHUNKS = 6, 4
+_CHUNKS = 6
 _LONGEST_STRETCH = 30.0
 _SAME = ("force_field", "solvent", "temperature_k")
 # Beyond this, lanes are not tried: they relax the scene on OpenMM's Reference platform, which takes minutes there.
@@ -36,21 +32,12 @@ _MOST_ATOMS_IN_LANES = 500
 
 @dataclass(frozen=True)
 class Rolls:
-    """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together.
-    `compiled`: their networks are; `uncompiled`: why they are not, where that was tried."""
+    """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together."""
 
     weights: str
     lag_ps: float
     ps_per_s: float
     replicas: int = REPLICAS
-    compiled: bool = False
-    uncompiled: str = ""
-
-    @property
-    def how(self) -> str:
-        """In words."""
-        compiled = ", compiled" if self.compiled else f", not compiled ({self.uncompiled})" if self.uncompiled else ""
-        return f"{self.replicas} replicas of {self.weights}{compiled}"
 
 
 @dataclass(frozen=True)
@@ -89,11 +76,9 @@ class Rates:
         return self.cores * self.timestep_ps / self.step_s / self.stretch
 
 
-def measure(
-    scene: Scene, config: MDConfig, named: str | Path | None, cores: int | None = None, roll_s: float = 0.0
-) -> Rates:
+def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int | None = None) -> Rates:
     """Return the rates of a scene: of MD with these settings, and of the weights `named`, or of shipped ones;
-    `cores`: how many may be used, all by default; `roll_s`: see `rollout_rate`.
+    `cores`: how many may be used, all by default.
 
     Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
     """
@@ -118,7 +103,7 @@ def measure(
         timestep_ps=config.timestep_ps,
         md_ps_per_s=0.0,
         coverage=coverage,
-        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, roll_s),
+        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch),
         platform=by_openmm.platform,
         alone=1.0 if cores == 1 else min(1.0, measured_stretch(1) / stretch),
     )
@@ -164,62 +149,34 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
     return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_lanes=why)
 
 
-def compiling_s(weights_integrate: bool, stretch: float, roll_s: float) -> float:
-    """Return the wall seconds that go into compiling weights that will roll for `roll_s`: 0 where it does not pay."""
-    seconds = _COMPILING_S * stretch
-    return seconds if weights_integrate and roll_s >= _COMPILING_PAYS * seconds else 0.0
-
-
-def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, roll_s: float = 0.0) -> Rolls:
-    """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`: see `Rates`; `roll_s`: the
-    wall seconds that they will roll for. A potential is compiled where that pays, and rolls plain where it fails."""
+def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float) -> Rolls:
+    """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`: see `Rates`."""
     from surrogate.data.shipped import shipped_weights
     from surrogate.sampling.domain import in_bath
+    from surrogate.sampling.runner import RolloutConfig, rollout
 
     lag_ps = weights.domain.lag_ps
     if weights.domain.jumps:
         lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
-    name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
-    integrates = weights.model.integrates
-    if integrates:  # so many steps a frame that one frame tells
-        weights = in_bath(weights, {"n_new": 1})
-    found = Rolls(name, lag_ps, 0.0, POTENTIAL_REPLICAS if integrates else REPLICAS)
-    found = replace(found, ps_per_s=_measured_rate(scene, weights, found, temperature_k) / stretch)
-    if not compiling_s(integrates, stretch, roll_s):
-        return found
-    fast = replace(found, compiled=True)
-    try:
-        fast = replace(fast, ps_per_s=_measured_rate(scene, weights, fast, temperature_k) / stretch)
-    except Exception as error:  # a compiler that is not there, or any of torch's own
-        return replace(found, uncompiled=first_line(error).partition(";")[0])
-    return fast if fast.ps_per_s > found.ps_per_s else replace(found, uncompiled="no faster here")
-
-
-def _measured_rate(scene: Scene, weights: Weights, rolls: Rolls, temperature_k: float) -> float:
-    """Return how many ps such a rollout makes in a second, replicas together."""
-    from surrogate.sampling.runner import RolloutConfig, rollout
-
-    chunk_ps = weights.model.n_new * rolls.lag_ps
-    n_chunks = _POTENTIAL_CHUNKS if weights.model.integrates else _CHUNKS
+    replicas = REPLICAS
+    if weights.model.integrates:  # so many steps a frame that one frame tells
+        weights, replicas = in_bath(weights, {"n_new": 1}), POTENTIAL_REPLICAS
+    chunk_ps = weights.model.n_new * lag_ps
     seen: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory(prefix="surromd-rate-") as folder:
         rollout(
             scene,
             weights,
-            [Path(folder) / f"r{k}.h5" for k in range(rolls.replicas)],
-            RolloutConfig(
-                time_ps=n_chunks * chunk_ps,
-                save_every_ps=rolls.lag_ps,
-                temperature_k=temperature_k,
-                compile=rolls.compiled,
-            ),
+            [Path(folder) / f"r{k}.h5" for k in range(replicas)],
+            RolloutConfig(time_ps=_CHUNKS * chunk_ps, save_every_ps=lag_ps, temperature_k=temperature_k),
             progress=lambda done, total, note: seen.append((time.monotonic(), done)),
             flush_every_s=3600.0,
         )
     # As of MD the fastest batch counts: the first chunk makes what all others use again, the last one is flushed.
     times = [time for time, _ in seen[:-1]]
     fastest_s = max(min(after - before for before, after in pairwise(times)), 1e-6)
-    return rolls.replicas * chunk_ps / fastest_s
+    name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
+    return Rolls(name, lag_ps, replicas * chunk_ps / fastest_s / stretch, replicas)
 
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:

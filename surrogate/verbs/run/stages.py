@@ -20,7 +20,7 @@ from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
-from surrogate.verbs.run.rates import Rates, Rolls, compiling_s, rollout_rate
+from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
@@ -150,17 +150,15 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
     out = site.folder / WEIGHTS_NAME
-    rates, decision = _rates_and_decision(record)
+    _, decision = _rates_and_decision(record)
     dear, seconds = decision.way == "potential", decision.seconds("train")
     files, beside_s = _to_train_on(site, record, seconds)
-    # Weights are tried out when they are written, compiled if they will be.
-    trying_s = compiling_s(dear, rates.stretch, decision.seconds("rollout"))
     if not dear and beside_s > (1.0 - _LEAST_OPTIMISING) * seconds:
         raise InputError(f"it takes {beside_s:.0f} s beside its steps, and has {seconds:.0f} s.")
     options = TrainOptions(
         level=site.options.level if dear else None,
-        # A potential's budget covers all it does, that of others their steps.
-        budget_s=seconds - trying_s if dear else min(seconds - beside_s, _OPTIMISING * seconds),
+        # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
+        budget_s=seconds if dear else min(seconds - beside_s, _OPTIMISING * seconds),
         seed=site.options.seed,
         resume=True,
         quiet=True,
@@ -199,10 +197,9 @@ def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
     out = site.folder / WEIGHTS_NAME
     if not out.exists():
         return None
-    rates, decision = _rates_and_decision(record)
-    roll_s = decision.seconds("rollout")
+    rates, _ = _rates_and_decision(record)
     try:
-        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch, roll_s)
+        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
     except SimulationError as error:
         raise SimulationError(f"its weights roll nothing: {str(error).partition(';')[0]}.") from error
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))
@@ -232,7 +229,6 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
-            compile=rates.rolls.compiled,
             # Frames of a potential are what its level says, as far as it has learned it: nothing is to mend them by.
             guard="flag" if rates.dear else "repair",
             resume=True,

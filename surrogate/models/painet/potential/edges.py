@@ -122,9 +122,8 @@ def measure_edges(
     # An atom is to itself as one far beyond the cutoff.
     alone = torch.where(edges.receiver == edges.sender, _FAR_NM2, _SOFTENING_NM2).to(dtype)
     distance = (apart.square().sum(-1) + alone[:, None]).sqrt()
-    ranges = torch.tensor([*SHELL_RANGES_NM, (LAST_SHELL_FROM_NM, cutoff_nm)], dtype=dtype, device=apart.device).log()
-    spacing = ((ranges[:, 1] - ranges[:, 0]) / (n_radial - 1))[edges.shell, None]
-    u = ((distance.log() - ranges[edges.shell, :1]) / spacing)[..., None]
+    begin, spacing = radial_grid(n_radial, cutoff_nm, apart)
+    u = ((distance.log() - begin[edges.shell, None]) / spacing[edges.shell, None])[..., None]
     u = (u - torch.arange(n_radial, dtype=dtype, device=apart.device)) / HALF_WIDTH
     bump = torch.relu(1.0 - u * u)
     far = (edges.shell == N_SHELLS - 1)[:, None]
@@ -132,6 +131,12 @@ def measure_edges(
     direction = apart / distance[..., None]
     shapes = edges.by_atom(torch.cat([direction, products(direction)], dim=-1))
     return EdgeGeometry(distance, bump * bump * bump * (inside * inside * inside)[..., None], shapes)
+
+
+def radial_grid(n_radial: int, cutoff_nm: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return, by shell, the logarithm of the distance at which radial functions begin, and their spacing."""
+    ranges = like.new_tensor([*SHELL_RANGES_NM, (LAST_SHELL_FROM_NM, cutoff_nm)]).log()
+    return ranges[:, 0], (ranges[:, 1] - ranges[:, 0]) / (n_radial - 1)
 
 
 def products(v: Tensor) -> Tensor:

@@ -14,7 +14,8 @@ from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.painet.potential.config import LONGEST_FLEXIBLE_PS, PotentialConfig
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
-from surrogate.models.painet.potential.gradient import CompiledGradient, GradientFn, gradient_of
+from surrogate.models.painet.potential.gradient import GradientFn, gradient_of
+from surrogate.models.painet.potential.lanes import lanes_of
 from surrogate.models.painet.potential.rigid import RigidBonds
 from systems.errors import InputError
 from systems.scene import Scene
@@ -59,7 +60,6 @@ class PainetPotential(Surrogate):
         self.network = EnergyNetwork(config)
         self.register_buffer("energy_offset_kj_mol", torch.zeros(()))
         self.register_buffer("energy_scale_kj_mol", torch.full((), 100.0))
-        self._compiles = False
         self._known: tuple[Molecule, GradientFn] | None = None
 
     @property
@@ -97,10 +97,6 @@ class PainetPotential(Surrogate):
 
             descent.step(energy)
             return x.detach()
-
-    def compile_forces(self) -> None:
-        """See `Surrogate.compile_forces`."""
-        self._compiles, self._known = True, None
 
     @property
     def steps_per_frame(self) -> int:
@@ -180,18 +176,29 @@ class PainetPotential(Surrogate):
         return -self.gradient(positions_nm, molecule)(positions_nm)[1]
 
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
-        """Return what computes the members' energies and their mean's gradient at frames like these, compiled where
-        that is asked for."""
+        """Return what computes the members' energies and their mean's gradient at frames like these: in lanes where
+        they run, else by torch."""
         known = self._known
+        # Above so many atoms pairs change from frame to frame.
         if known is None or known[0] is not molecule or molecule.n_atoms > FEW_ATOMS or self.training:
             fabric = self.fabric(molecule)
             with torch.inference_mode(False), torch.no_grad():
                 made = self.network.prepare(fabric, positions_nm)
-            # Above so many atoms pairs change from frame to frame.
-            kind = CompiledGradient if self._compiles and molecule.n_atoms <= FEW_ATOMS else gradient_of
-            known = molecule, kind(lambda x: self.members(x, fabric, made))
+            lanes = self._in_lanes(fabric, made, len(positions_nm))
+            known = molecule, lanes or gradient_of(lambda x: self.members(x, fabric, made))
             self._known = known
         return known[1]
+
+    def _in_lanes(self, fabric: Fabric, made: Prepared, rows: int) -> GradientFn | None:
+        if self.training or (lanes := lanes_of(self.network, fabric, made, rows)) is None:
+            return None
+        offset, scale = self.energy_offset_kj_mol.double(), self.energy_scale_kj_mol.double()
+
+        def compute(positions_nm: Tensor) -> tuple[Tensor, Tensor]:
+            members, gradient = lanes(positions_nm)
+            return offset + scale * members.double(), scale * gradient.double()
+
+        return compute
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip

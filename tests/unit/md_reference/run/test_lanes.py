@@ -147,7 +147,7 @@ def test_what_it_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     next(f for f in watery.getForces() if isinstance(f, openmm.NonbondedForce)).setNonbondedMethod(1)
     with pytest.raises(LanesUnavailableError, match="NonbondedForce with a cutoff; take another"):
         _lanes(watery)
-    monkeypatch.setattr(lanes.shutil, "which", lambda _: None)
+    monkeypatch.setattr("systems.files.native.shutil.which", lambda _: None)
     with pytest.raises(LanesUnavailableError, match="which platform lanes needs"):
         lanes._program.__wrapped__()
 

@@ -18,8 +18,8 @@ from md_reference.run.lanes import LanesUnavailableError
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.verbs.run import rates as measuring
-from surrogate.verbs.run.rates import Rates, Rolls, compiling_s, measure, rollout_rate
-from systems.errors import InputError, SimulationError
+from surrogate.verbs.run.rates import Rates, measure, rollout_rate
+from systems.errors import SimulationError
 from systems.prepare.peptide import build_peptide
 
 SCENE = build_peptide("ACE-GLY-NME")
@@ -99,66 +99,23 @@ def test_without_a_compiler_the_line_is_plain(
     assert found().without_lanes == NO_COMPILER
 
 
-LONG_S = 1000.0
-
-
-def rolls(name: str, roll_s: float, stretch: float = 1.0) -> Rolls:
-    weights = load_weights(weights_path(name))
-    return rollout_rate(weights.domain.scene, weights, 300.0, stretch, roll_s)
-
-
-def test_a_potential_is_compiled_where_it_rolls_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = []
-
-    def rate(scene: Any, weights: Any, how: Rolls, temperature_k: float) -> float:
-        tried.append((how.compiled, weights.model.n_new))
-        return 16.0 if how.compiled else 10.0
-
-    monkeypatch.setattr(measuring, "_measured_rate", rate)
-    long = rolls("paracetamol-gfn2-xtb", LONG_S, 2.0)
-    assert (long.replicas, long.compiled, long.ps_per_s) == (32, True, 8.0), "half of the core is others'"
-    assert long.how == "32 replicas of paracetamol-gfn2-xtb, compiled"
-    assert tried == [(False, 1), (True, 1)], "a frame tells"
-    short = rolls("paracetamol-gfn2-xtb", LONG_S, 6.0)
-    assert (short.replicas, short.compiled, short.how) == (32, False, "32 replicas of paracetamol-gfn2-xtb")
-    other = rolls("alanine-dipeptide", LONG_S)
-    assert (other.replicas, other.compiled) == (8, False)
-    assert [compiled for compiled, _ in tried] == [False, True, False, False]
-    assert compiling_s(True, 2.0, LONG_S) > 0.0 == compiling_s(True, 2.0, 60.0) == compiling_s(False, 2.0, LONG_S)
-
-
 @pytest.mark.parametrize(
-    ("error", "why"),
-    [
-        (InputError("compiling needs a C++ compiler; leave it out."), "compiling needs a C++ compiler"),
-        (RuntimeError("CppCompileError: no space left\nmany lines"), "CppCompileError: no space left"),
-        (None, "no faster here"),
-    ],
+    ("name", "replicas", "chunk_ps"), [("paracetamol-gfn2-xtb", 32, 0.1), ("alanine-dipeptide", 8, 31.0)]
 )
-def test_where_compiling_fails_a_potential_rolls_plain_and_one_line_says_why(
-    error: Exception | None, why: str, monkeypatch: pytest.MonkeyPatch
+def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
+    name: str, replicas: int, chunk_ps: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def rate(scene: Any, weights: Any, how: Rolls, temperature_k: float) -> float:
-        if how.compiled and error is not None:
-            raise error
-        return 10.0
-
-    monkeypatch.setattr(measuring, "_measured_rate", rate)
-    found = rolls("paracetamol-gfn2-xtb", LONG_S)
-    assert (found.compiled, found.ps_per_s) == (False, 10.0)
-    assert found.how == f"32 replicas of paracetamol-gfn2-xtb, not compiled ({why})"
-
-
-def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
     def rollout(scene: Any, weights: Any, outs: Any, config: Any, *, progress: Any, **_: Any) -> None:
-        asked.append((len(outs), config.compile, config.time_ps))
+        asked.append((len(outs), config.time_ps))
         for k in range(3):
             progress(k, 3, "")
 
+    weights = load_weights(weights_path(name))
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
     monkeypatch.setattr(measuring, "time", SimpleNamespace(monotonic=iter([0.0, 4.0, 9.0]).__next__))
-    found = rolls("paracetamol-gfn2-xtb", 0.0)
-    assert asked == [(32, False, pytest.approx(0.4))]
-    assert found.ps_per_s == pytest.approx(32 * 0.1 / 4.0)
+    found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0)
+    assert asked == [(replicas, pytest.approx(6 * chunk_ps))], "of a potential a frame a chunk tells"
+    assert found.replicas == replicas
+    assert found.ps_per_s == pytest.approx(replicas * chunk_ps / 4.0 / 2.0), "half of the core is others'"

@@ -1,0 +1,168 @@
+"""The potential in lanes: copies of a molecule at once, each in its lane of the processor's vector registers.
+
+`lanes.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
+writing what a pair of atoms sees to memory; this machine's C++ compiler makes it at first use, in seconds.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from surrogate.models.painet.attention import EnergyAttention
+from surrogate.models.painet.pairs import N_SHELLS
+from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.edges import radial_grid
+from surrogate.models.painet.potential.energy import WALL, EnergyNetwork, Fabric, Look, Prepared
+from systems.files.native import CompilerError, compiled_program
+
+_SOURCE = Path(__file__).with_name("lanes.cpp")
+_SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", "n_heads", "head_dim", "n_members")
+# Copies at once: of a whole register, and where no more are asked for; of the register in bytes.
+_LANES, _FEW_LANES, _ALIGNED = 16, 4, 64
+_LEAST_NM = 1e-3
+
+
+class _Linear(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("weight", "turned", "bias")]
+
+
+class _Step(ctypes.Structure):
+    _fields_ = [
+        *((name, _Linear) for name in ("send", "first", "second", "third", "qkv", "out")),
+        *((name, ctypes.c_void_p) for name in ("phi", "psi")),
+    ]
+
+
+class Lanes:
+    """Frames `(rows, n_atoms, 3)` nm of one molecule -> the members' energies `(rows, n_members)` and the gradient
+    `(rows, n_atoms, 3)` of their mean, in the network's unit and by its weights as they are now."""
+
+    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: Prepared) -> None:
+        config, n = network.config, fabric.molecule.n_atoms
+        self.config, self.n_atoms = config, n
+        self._work: dict[tuple[int, int], npt.NDArray[Any]] = {}
+        # The program reads these arrays in place.
+        self._kept: list[npt.NDArray[Any]] = []
+        types = fabric.molecule.elements
+        steps = []
+        looks, attentions = cast(Iterable[Look], network.looks), cast(Iterable[EnergyAttention], network.steps)
+        for look, attention in zip(looks, attentions, strict=True):
+            phi, psi = (m[:, types][:, :, types] for m in attention.type_matrices())
+            dense = (look.update[0], look.update[2], look.update[4], attention.qkv, attention.out)
+            linear = [self._linear(layer) for layer in (look.send, *dense)]
+            steps.append(_Step(*linear, self._array(phi), self._array(psi)))
+        edges, shell = made.edges, made.edges.shell
+        begin, spacing = radial_grid(config.n_radial, config.cutoff_nm, made.of_atom)
+        per_cutoff2 = torch.where(shell == N_SHELLS - 1, config.cutoff_nm**-2, 0.0)
+        pairs = (begin[shell], 1.0 / spacing[shell], per_cutoff2, 1.0 / made.nearest_nm[:, 0].clamp(min=_LEAST_NM),
+                 1.0 / made.farthest_nm[:, 0])  # fmt: skip
+        seen = torch.cat([*made.looks, 0.5 * made.table], dim=-1)
+        last = cast(nn.Linear, network.site[2])
+        members = torch.cat([last.weight, last.bias[:, None], network.latent.T / n**2], dim=-1)
+        assert edges.dense
+
+        class Network(ctypes.Structure):
+            _fields_ = [
+                ("n", ctypes.c_int64),
+                ("steps", _Step * config.n_steps),
+                ("site", _Linear),
+                *((name, ctypes.c_void_p) for name in ("members", "of_atom", "edges", "pairs")),
+                ("eta", ctypes.c_float),
+                ("wall", ctypes.c_float),
+            ]
+
+        self._network = Network(
+            n,
+            (_Step * config.n_steps)(*steps),
+            self._linear(network.site[0]),
+            self._array(torch.cat([members, members.mean(0, keepdim=True)])),
+            self._array(made.of_atom),
+            self._array(seen.transpose(1, 2)),
+            self._array(torch.stack(pairs, dim=-1)),
+            config.step,
+            WALL,
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Lanes:
+        return self  # pointers into arrays that never change
+
+    @torch.no_grad()
+    def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
+        rows = len(positions_nm)
+        lanes = _width(rows)
+        program = _program(self.config, lanes)
+        n_blocks = -(-rows // lanes)
+        # Lanes without a frame of their own hold the last.
+        filled = positions_nm.double()[torch.arange(n_blocks * lanes).clamp(max=rows - 1)]
+        x = filled.unflatten(0, (n_blocks, lanes)).permute(0, 2, 3, 1).contiguous()
+        energy = torch.empty(n_blocks, self.config.n_members, lanes)
+        gradient = torch.empty(n_blocks, self.n_atoms, 3, lanes)
+        n_threads = min(torch.get_num_threads(), n_blocks)
+
+        def compute(thread: int) -> None:
+            if (work := self._work.get((lanes, thread))) is None:
+                work = _aligned(int(program.work_floats(ctypes.c_int64(self.n_atoms))))
+                self._work[lanes, thread] = work
+            for k in range(thread, n_blocks, n_threads):
+                places = (x[k].data_ptr(), energy[k].data_ptr(), gradient[k].data_ptr(), work.ctypes.data)
+                program.evaluate(ctypes.byref(self._network), *map(ctypes.c_void_p, places))
+
+        if n_threads == 1:
+            compute(0)
+        else:
+            list(_pool(n_threads).map(compute, range(n_threads)))
+        return energy.transpose(1, 2).flatten(0, 1)[:rows], gradient.permute(0, 3, 1, 2).flatten(0, 1)[:rows]
+
+    def _array(self, values: Tensor) -> int:
+        self._kept.append(np.ascontiguousarray(values.detach().numpy(), dtype=np.float32))
+        return self._kept[-1].ctypes.data
+
+    def _linear(self, layer: Any) -> _Linear:
+        if layer is None:
+            return _Linear()
+        return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
+
+
+def lanes_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int) -> Lanes | None:
+    """Return the potential in lanes, compiled for so many frames; None where it does not run in them: not in single
+    precision on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
+    if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
+        return None
+    try:
+        _program(network.config, _width(rows))
+    except (CompilerError, OSError):
+        return None
+    return Lanes(network, fabric, made)
+
+
+def _width(rows: int) -> int:
+    return _LANES if rows > _FEW_LANES else _FEW_LANES
+
+
+@lru_cache(maxsize=8)
+def _program(config: PotentialConfig, lanes: int) -> ctypes.CDLL:
+    program = compiled_program(_SOURCE, {"LANES": lanes, **{name.upper(): getattr(config, name) for name in _SIZES}})
+    program.work_floats.restype = ctypes.c_int64
+    return program
+
+
+@lru_cache(maxsize=1)
+def _pool(n_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(n_threads, "lanes")
+
+
+def _aligned(n_floats: int) -> npt.NDArray[Any]:
+    """Return an array that begins where a register may be loaded from."""
+    raw = np.empty(4 * n_floats + _ALIGNED, dtype=np.uint8)
+    begin = -raw.ctypes.data % _ALIGNED
+    return raw[begin : begin + 4 * n_floats].view(np.float32)
