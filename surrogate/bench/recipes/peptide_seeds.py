@@ -1,7 +1,8 @@
 """Diverse starting structures of a peptide: metadynamics on phi and psi of each residue, then a stratified choice.
 
 Well-tempered metadynamics (Barducci, Bussi and Parrinello, Phys. Rev. Lett. 100, 020603 (2008)) by OpenMM's own class,
-one bias in two dimensions for each residue, at 500 K so that side chains turn as well. Seeds carry no weights: a
+one bias in two dimensions for each residue, at 500 K so that side chains turn as well; of two residues with free
+termini the first has no phi and the second no psi, and the bias is on the two that there are. Seeds carry no weights: a
 propagator is conditional, so its forward windows need none.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from md_reference.run.engine import Engine
 from md_reference.run.machine import platform_properties
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, rotatable_torsions
+from systems.errors import InputError
 from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -83,6 +86,18 @@ def residue_torsions(scene: Scene) -> list[ResidueTorsions]:
     ]
 
 
+def biased_torsions(residues: list[ResidueTorsions]) -> list[tuple[Quad, Quad]]:
+    """Return what has a bias, pairs of a phi and a psi: those of each residue with both, or, where none has, the psi of
+    each residue and the phi that follows it. Raises InputError where there is no pair."""
+    both = [(r.phi, r.psi) for r in residues if r.phi is not None and r.psi is not None]
+    found = both or [
+        (after.phi, r.psi) for r, after in pairwise(residues) if r.psi is not None and after.phi is not None
+    ]
+    if not found:
+        raise InputError("metadynamics takes two residues, or one that is capped: there are no phi and psi to bias.")
+    return found
+
+
 def _outwards(scene: Scene, quads: npt.NDArray[Any]) -> list[tuple[int, ...]]:
     """Turn quads round whose bond is named CB-CA."""
     found = [tuple(int(a) for a in q) for q in quads]
@@ -99,21 +114,19 @@ def metadynamics(
     platform: str,
     spec: ForceFieldSpec | None = None,
 ) -> tuple[FloatArray, list[FloatArray]]:
-    """Run well-tempered metadynamics on (phi, psi) of every residue.
+    """Run well-tempered metadynamics on every pair of `biased_torsions`.
 
-    Returns frames `(n, n_atoms, 3)` nm, one a ps, and for each residue with both torsions its free energy in kJ/mol at
-    this temperature on a grid `(n_psi, n_phi)` from -π, both ends included. In chains every residue's bias is its own.
+    Returns frames `(n, n_atoms, 3)` nm, one a ps, and for each pair its free energy in kJ/mol at this temperature on a
+    grid `(n_psi, n_phi)` from -π, both ends included. In chains every residue's bias is its own.
     """
     import openmm
     from openmm import app, unit
 
     system = build_system(scene, spec or ForceFieldSpec("ff14SB", "obc2"))
     biases = []
-    for residue in residue_torsions(scene):
-        if residue.phi is None or residue.psi is None:
-            continue
+    for pair in biased_torsions(residue_torsions(scene)):
         variables = []
-        for quad in (residue.phi, residue.psi):
+        for quad in pair:
             force = openmm.CustomTorsionForce("theta")
             force.addTorsion(*quad)
             variables.append(app.BiasVariable(force, -math.pi, math.pi, _WIDTH_RAD, periodic=True, gridWidth=61))
@@ -201,18 +214,13 @@ def _positive_phi(frames_nm: FloatArray, residues: list[ResidueTorsions]) -> npt
 def _near_barriers(
     frames_nm: FloatArray, residues: list[ResidueTorsions], free: list[FloatArray]
 ) -> npt.NDArray[np.bool_]:
-    """Mark frames in the highest fifth of any residue's free energy among those visited."""
+    """Mark frames in the highest fifth of any bias's free energy among those visited."""
     marks = np.zeros(len(frames_nm), dtype=bool)
-    both = [r for r in residues if r.phi is not None and r.psi is not None]
-    for residue, surface in zip(both, free, strict=True):
-        assert residue.phi is not None and residue.psi is not None
+    for pair, surface in zip(biased_torsions(residues), free, strict=True):
         n = surface.shape[0] - 1
-        phi, psi = (
-            np.rint((_angles(frames_nm, q) + math.pi) / (2 * math.pi) * n).astype(int)
-            for q in (residue.phi, residue.psi)
-        )
+        phi, psi = (np.rint((_angles(frames_nm, q) + math.pi) / (2 * math.pi) * n).astype(int) for q in pair)
         height = surface[psi, phi]
-        marks |= height >= np.quantile(height, 1 - (1 - _BARRIER_QUANTILE) / len(both))
+        marks |= height >= np.quantile(height, 1 - (1 - _BARRIER_QUANTILE) / len(free))
     return marks
 
 

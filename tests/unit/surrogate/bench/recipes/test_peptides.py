@@ -21,6 +21,7 @@ from surrogate.bench.recipes.peptide_list import (
     training_peptides,
 )
 from systems.chemistry.geometry import torsion
+from systems.errors import InputError
 from systems.library import named_scenes
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
@@ -74,6 +75,27 @@ def test_metadynamics_fills_the_basins_and_not_the_clash() -> None:
     at = np.rint((np.radians([[-70, -30], [-70, 150], [0, 0]]) + np.pi) / (2 * np.pi) * n).astype(int)
     alpha, beta, clash = (free[psi, phi] for phi, psi in at)
     assert max(alpha, beta) < clash - 3.0
+
+
+def test_pairs_with_free_termini_are_biased_by_the_torsions_between_them() -> None:
+    """The first residue has no phi and the second no psi: twelve training peptides are such."""
+    free = [p for p in training_peptides() if not p.capped]
+    assert len(free) == 12 and {len(p.residues) for p in free} == {2}
+    scene = build_peptide(free[0].sequence)
+    first, second = residues = peptide_seeds.residue_torsions(scene)
+    assert first.phi is None and second.psi is None
+    assert peptide_seeds.biased_torsions(residues) == [(second.phi, first.psi)]
+    frames, (surface,) = peptide_seeds.metadynamics(
+        scene, time_ps=20, temperature_k=500, bias_factor=8, seed=4, platform="Reference"
+    )
+    assert len(frames) == 20 and surface.min() < -1.0, "hills were laid"
+    # What is visited has hills, and marks of barriers are where it has few.
+    marks = peptide_seeds._near_barriers(frames, residues, [surface])
+    assert 1 <= marks.sum() <= 10
+    capped = peptide_seeds.residue_torsions(build_peptide("ACE-ALA-GLY-NME"))
+    assert peptide_seeds.biased_torsions(capped) == [(r.phi, r.psi) for r in capped], "as before"
+    with pytest.raises(InputError, match="no phi and psi to bias"):
+        peptide_seeds.biased_torsions([first])
 
 
 def test_frames_are_drawn_evenly_over_cells() -> None:
