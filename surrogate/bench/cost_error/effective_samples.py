@@ -78,7 +78,7 @@ def training_cost(weights: Weights, md_s_per_ns: float) -> dict[str, float | Non
     seconds, known, frames = 0.0, False, dict[str, int]()
     record: Any = weights.provenance
     while isinstance(record, dict):
-        for key in ("stage_one_s", "stage_two_s", "spent_s"):
+        for key in ("stage_one_s", "stage_two_s", "spent_s", "training_s"):
             if isinstance(record.get(key), int | float):
                 seconds, known = seconds + float(record[key]), True
         for source in (*record.get("sources", ()), *record.get("stiff_terms", {}).get("sources", ())):

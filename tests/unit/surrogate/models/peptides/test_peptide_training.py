@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
+from surrogate.bench.cost_error.effective_samples import training_cost
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
@@ -207,6 +209,11 @@ def test_a_training_learns_and_its_weights_roll_at_any_lag(tmp_path: Path, frame
     assert flow[-1] < 0.999 and 0.0 < jumps[-1] < 0.1, "states that never change are hardly likely to"
     assert not list(tmp_path.glob("*.train.*"))
     weights = load_weights(out)
+    with out.with_suffix(".csv").open() as curves:
+        ends = {row["stage"]: float(row["spent_s"]) for row in csv.DictReader(curves)}
+    assert set(ends) == {"flow", "jumps"} and all(ends.values())
+    counted = training_cost(weights, 1.0)["training_s"]
+    assert counted == pytest.approx(sum(ends.values()), abs=0.2), "benchmarks of cost count both stages"
     assert weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
     for lag_ps in (1.0, 20.0):
         trajectory = tmp_path / f"{lag_ps:g}.h5"
