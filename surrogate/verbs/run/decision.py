@@ -34,7 +34,7 @@ LEAST_BUDGET_S = 20.0
 _AIM = 0.97
 # Processor seconds before the first step of a stage of MD: processes start, forces are built.
 _START_S = 4.0
-# In fewer a stage that goes on makes nothing more.
+# In fewer a stage that goes on makes nothing more, and bursts begin in vain.
 RESTART_S = 2.0
 # Of a run; no stage of MD spends more of its length on coming to equilibrium.
 _EQUILIBRATION_SHARE = 0.1

@@ -164,7 +164,7 @@ class _Run:
         assert rates is not None
         left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
         frames = self._frames(name) if name in MD_STAGES else 0
-        there = stage.found(self.site, record) if name in MD_STAGES else None
+        there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
         # Where less is left than was planned: without MD to judge by all else was in vain.
         is_late = left_s < sum(pending.seconds for pending in self._pending)
         least_s = least_md_s(rates) if name in MD_STAGES and there is None and is_late else 0.0
@@ -175,10 +175,13 @@ class _Run:
                 return math.inf
             return max(least_s, seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace))
 
-        enough = there is not None and (name != "md" or bool(there.held_out))
-        if there is not None and enough and may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:
-            self._ended(there, StageEntry(name, "out of time", 0.0))  # processes would hardly have begun
-            return
+        if may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:  # it would hardly have begun
+            if there is not None and (name != "md" or there.held_out):
+                self._ended(there, StageEntry(name, "out of time", 0.0))
+                return
+            if name == "bursts":
+                self._failed(name, "no time was left")
+                return
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES:

@@ -114,7 +114,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
             simulate_replicas(site.scene, config, files, resume=True, announce=heard)
         done = found(site, record)
         if done is None:
-            raise InputError("MD wrote no frames.")
+            raise InputError("MD wrote fewer than two frames, too few to judge.")
         return done
 
     def found(site: Site, record: RunRecord) -> RunRecord | None:

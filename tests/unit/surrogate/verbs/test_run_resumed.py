@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from md_reference.run import replicas
 from md_reference.run.lanes import Lanes
 from quick_report import judged_at_once
 from surrogate import api
@@ -164,20 +165,74 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     assert run(tmp_path / "run", "md", resume=True)["outcome"] == found["outcome"]
 
 
-def test_a_stage_that_has_no_time_to_go_on_keeps_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rates = replace(OPENMM, cores=2)
+@pytest.mark.parametrize(
+    ("asked", "name", "ends"),
+    [
+        ("md", "md", [("md", "out of time"), ("report", "done")]),
+        ("surrogate", "rollout", [("rollout", "out of time"), ("held-out md", "done"), ("report", "done")]),
+    ],
+)
+def test_a_stage_that_has_no_time_to_go_on_keeps_its_frames(
+    asked: str, name: str, ends: list[tuple[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates = replace(OPENMM, cores=2 if asked == "md" else 1)
     monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
     with monkeypatch.context() as patch:
-        patch.setitem(stages.STAGES, "md", disturbed(stages.STAGES["md"], after=kill))
+        patch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], after=kill))
         with pytest.raises(Killed):
-            run(tmp_path, "md")
+            run(tmp_path, asked)
     before = frames(tmp_path)
-    left_s = decide(rates, BUDGET_S, "md").seconds("report") + one_scene.RESTART_S - 0.5
-    write_run(tmp_path, replace(read_run(tmp_path), spent_s=BUDGET_S - left_s))
-    monkeypatch.setattr("md_reference.run.replicas.simulate_replicas", kill)
-    assert ended(run(tmp_path, "md", resume=True)) == [("md", "out of time"), ("report", "done")]
-    assert frames(tmp_path).keys() == before.keys() == {"md_r0.h5", "md_r1.h5"}
+    spend_until_no_time_for(name, tmp_path)
+    monkeypatch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], before=kill))
+    assert ended(run(tmp_path, asked, resume=True)) == ends
+    assert before and before.keys() <= frames(tmp_path).keys()
+    assert {"md": 2, "surrogate": REPLICAS}[asked] == len(before)
+
+
+def spend_until_no_time_for(name: str, folder: Path) -> None:
+    """Write into the record that no more is left than what comes after a stage takes, and a second."""
+    record = read_run(folder)
+    assert record.decision is not None
+    order = [stage.name for stage in record.decision.stages]
+    left_s = sum(stage.seconds for stage in record.decision.stages[order.index(name) + 1 :]) + one_scene.RESTART_S - 0.5
+    write_run(folder, replace(record, spent_s=BUDGET_S - left_s))
+
+
+def test_bursts_without_time_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, step_s=25e-6))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "bursts", disturbed(stages.STAGES["bursts"], before=kill))
+    with pytest.raises(Killed):  # where there is time
+        run(tmp_path, "surrogate")
+    spend_until_no_time_for("bursts", tmp_path)
+    found = run(tmp_path, "surrogate", resume=True)
+    assert ended(found)[:2] == [("rollout", "done"), ("bursts", "failed")] and ended(found)[-1] == ("report", "done")
+    assert found["stages"][1]["note"] == "no time was left"
+
+
+def test_files_of_one_frame_are_not_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One frame tells no interval: MD that made no more when its time was up has come to nothing."""
+    simulate, n_frames = replicas.simulate_replicas, [1]
+
+    def shorter(scene: Any, config: Any, files: list[Path], **more: Any) -> None:
+        simulate(scene, replace(config, time_ps=n_frames[0] * config.save_every_ps), files, **more)
+        raise KeyboardInterrupt("its time is up")
+
+    monkeypatch.setattr("md_reference.run.replicas.simulate_replicas", shorter)
+    monkeypatch.setattr(one_scene, "measure", lambda *_: OPENMM)
+    one, two = tmp_path / "one", tmp_path / "two"
+    with pytest.raises(InputError, match="MD to judge it by came to nothing in its time"):
+        run(one, "md")
+    assert {name: len(positions) for name, positions in frames(one).items()} == {"md.h5": 1, "held_out.h5": 1}
+    record = read_run(one)
+    assert [(entry.name, entry.status) for entry in record.stages] == [("md", "failed"), ("held-out md", "failed")]
+    assert record.trajectory == record.held_out == ()
+    n_frames[0] = 2  # control
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    found = run(two, "md")
+    assert ended(found) == [("md", "out of time"), ("held-out md", "out of time"), ("report", "done")]
+    assert found["trajectory"] == ["trajectory/md.h5"] and found["held_out"] == ["reference/held_out.h5"]
 
 
 def test_md_that_judges_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
