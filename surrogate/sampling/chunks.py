@@ -49,7 +49,7 @@ class ChunkSampler:
     """
 
     def __init__(
-        self, weights: Weights, *, solver_steps: int = 10, solver: str | None = None, precision: str = "auto",
+        self, weights: Weights, *, solver_steps: int | None = None, solver: str | None = None, precision: str = "auto",
         compile: bool = False, stiff: str | None = None,
     ) -> None:  # fmt: skip
         model, template = weights.model, weights.domain.scene
@@ -67,7 +67,7 @@ class ChunkSampler:
             )
         self._stiff = None if stiff == "modelled" else weights.stiff
         self.solver = solver or (known[0] if known else None)
-        self.solver_steps = solver_steps
+        self.solver_steps = solver_steps or model.usual_steps
         self.precision = choose_precision(precision, suits=model.bf16_by_default)
         self.batch: int | None = None
         # Chunks drawn, each row one, and the network evaluations they took together.

@@ -49,7 +49,9 @@ class RolloutConfig:
         "multistep, fitted (few steps), gaussian (peptides), euler or dopri5.", None, unset="the one that suits",
         section="sampling",
     )  # fmt: skip
-    solver_steps: int = option("Solver steps per chunk.", 10, within=(1, None), section="sampling")
+    solver_steps: int | None = option(
+        "Solver steps per chunk.", None, unset="10, of peptides 6", within=(1, None), section="sampling"
+    )
     precision: str = option("Of the network.", "auto", choices=("auto", "fp32", "bf16"), section="sampling")
     compile: bool = option(
         "Compile the network: a minute, a C++ compiler; for long rollouts.", False, section="sampling"

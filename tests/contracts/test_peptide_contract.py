@@ -62,7 +62,10 @@ class TestPeptideSlide(SurrogateContract):
         return small_model()
 
     def molecule(self, n_atoms: int) -> Molecule:
-        return describe(small_model(), scene_of(n_atoms))
+        found = describe(small_model(), scene_of(n_atoms))
+        assert found.chain is not None
+        # Frames of a model that learned nothing overlap, and which are drawn again would hang on the last digit.
+        return replace(found, chain=replace(found.chain, least_nm=torch.zeros_like(found.chain.least_nm)))
 
     def state(self, n_atoms: int, batch: int, model: Surrogate) -> tuple[Tensor, Tensor]:
         scene = scene_of(n_atoms)

@@ -84,14 +84,13 @@ def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
     """
     from surrogate.models.lam_slide.flow import ADAPTIVE
     from surrogate.models.precision import choose_precision
-    from surrogate.sampling.config import RolloutConfig
 
     known = weights.model.solvers
     unknown = [name for name in sweep.solvers or () if name not in known]
     if unknown:
         raise InputError(f"{weights.path.name} knows no solver {unknown[0]!r}; choose {', '.join(known) or 'none'}.")
     chosen: list[str | None] = [*(sweep.solvers or [name for name in known if name not in ADAPTIVE])] or [None]
-    own = RolloutConfig.solver_steps
+    own = weights.model.usual_steps
     numbers = (sweep.steps or STEPS) if known else (own,)
     found = [
         Setting(solver, n, precision, batch)

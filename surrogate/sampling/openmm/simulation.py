@@ -39,7 +39,7 @@ class SimulationOptions:
     stiff: str | None = from_field(RolloutConfig, "stiff")
     force: bool = from_field(RolloutConfig, "force")
     solver: str | None = from_field(RolloutConfig, "solver")
-    solver_steps: int = from_field(RolloutConfig, "solver_steps")
+    solver_steps: int | None = from_field(RolloutConfig, "solver_steps")
     precision: str = from_field(RolloutConfig, "precision")
 
 
