@@ -59,11 +59,12 @@ def _row(
     edges = np.stack([_edges([x[:, g] for x in measured[0]], measured, g, furthest / scale) for g in groups])
     widths = scale * np.diff(edges, axis=1)[:, 0]
     counts = [binned(v, groups, edges, s.blocks) for v, s in zip(measured, trio.samples, strict=True)]
-    flat = [c.reshape(len(c), -1) for c in counts]
+    # Added up along the bins once: what is drawn and dealt are sums over blocks, which can be taken before or after.
+    flat = [c.cumsum(axis=-1).reshape(len(c), -1) for c in counts]
 
     def distance(p: FloatArray, q: FloatArray) -> FloatArray:
         shape = (len(p), len(groups), _BINS)
-        return wasserstein(p.reshape(shape), q.reshape(shape), widths).mean(axis=-1)
+        return _between(p.reshape(shape), q.reshape(shape), widths).mean(axis=-1)
 
     equal = [c[: s.n_equal] for s, c in zip(trio.samples, flat, strict=True)]
     total = [c.sum(0)[None] for c in equal]
@@ -125,6 +126,12 @@ def wasserstein(counts_p: FloatArray, counts_q: FloatArray, widths: FloatArray) 
     The area between the two cumulative distributions, in the unit of `widths` `(n_groups,)`; NaN where one is empty.
     Source: Vallender, Theory Probab. Appl. 18, 784 (1974).
     """
+    return _between(counts_p.cumsum(axis=-1), counts_q.cumsum(axis=-1), widths)
+
+
+def _between(summed_p: FloatArray, summed_q: FloatArray, widths: FloatArray) -> FloatArray:
+    """Return the same of histograms whose bins are added up from the left."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        p, q = (c.cumsum(axis=-1) / c.sum(axis=-1, keepdims=True) for c in (counts_p, counts_q))
-        return np.asarray(np.abs(p - q).sum(axis=-1) * widths)
+        apart = summed_p / summed_p[..., -1:]
+        apart -= summed_q / summed_q[..., -1:]
+        return np.asarray(np.abs(apart, out=apart).sum(axis=-1) * widths)
