@@ -229,8 +229,8 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
-            # Frames of a potential are what its level says, as far as it has learned it: nothing is to mend them by.
-            guard="flag" if rates.dear else "repair",
+            # Nothing but the truth is there to mend a potential's frames by; one that flies apart must not end the others.
+            guard="resample" if rates.dear else "repair",
             resume=True,
             quiet=True,
         ),
