@@ -229,7 +229,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
-            # Nothing but the truth is there to mend a potential's frames by; one that flies apart must not end the others.
+            # Of a potential only the truth could mend frames; a replica that flies apart must not end the others.
             guard="resample" if rates.dear else "repair",
             resume=True,
             quiet=True,
