@@ -30,7 +30,7 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "surromd"
 
 
-def compiled_program(source: Path, macros: Mapping[str, int] | None = None) -> ctypes.CDLL:
+def compiled_program(source: Path, macros: Mapping[str, float] | None = None) -> ctypes.CDLL:
     """Compile `source` with these macros for this processor, once for each version of it, and load it.
 
     Raises CompilerError, and OSError where nothing can be kept.

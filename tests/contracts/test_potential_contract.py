@@ -21,6 +21,7 @@ from surrogate.models.painet.potential.edges import bonded_shells, find_edges
 from surrogate.models.painet.potential.energy import latent_energy
 from surrogate.models.painet.potential.lanes import lanes_of
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.painet.potential.rigid import RigidBonds
 from systems.errors import InputError
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4,
@@ -119,6 +120,42 @@ def test_forces_in_lanes_are_those_of_torch(config: PotentialConfig, rows: int) 
     # Negative control: torch's own single precision is no nearer.
     plain = model.evaluate(x, model.fabric(molecule)).forces_kj_mol_nm
     assert 0.0 < (plain - expected.forces_kj_mol_nm).abs().max() < 1e-4 * scale
+
+
+@needs_compiler
+@pytest.mark.parametrize("rows", [2, 19])
+@pytest.mark.parametrize("timestep_ps", [0.001, 0.004])
+def test_steps_in_lanes_are_those_of_torch(timestep_ps: float, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(SMALL, timestep_ps=timestep_ps, lag_ps=timestep_ps, hydrogen_mass_da=3.0, friction_per_ps=20.0)
+    elements = torch.tensor([6, 6, 8, 1, 1, 1, 1, 1, 1])
+    bonds = torch.tensor([(0, 1), (1, 2), (0, 3), (0, 4), (0, 5), (1, 6), (1, 7), (2, 8)])
+    generator = torch.Generator().manual_seed(5)
+    x = 0.1 * torch.eye(9, 3).cumsum(0) + 0.1 * torch.rand(9, 3, generator=generator)
+    x = (x + 0.002 * torch.randn(rows, 9, 3, generator=generator)).double()
+    bare = Molecule(elements, torch.where(elements == 1, 1.008, 14.0), bonds)
+    masses = lively(config).masses_da(bare)
+    rigid = RigidBonds.of(x[0], bonds[2:], masses)
+    molecule = Molecule(elements, bare.masses_da, bonds, own=rigid)
+    is_rigid = timestep_ps > 0.002
+    x = rigid.place(x, x) if is_rigid else x
+    # A bath of its own for each.
+    thermal = (torch.linspace(1.0, 4.0, rows)[:, None, None] / masses[:, None]).sqrt()
+    v = thermal * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+    draw = torch.randn(rows, 9, 3, 3, generator=generator)
+
+    def moved(model: PainetPotential) -> tuple[Tensor, Tensor]:
+        return model.langevin(x, v, molecule, masses[:, None], thermal, draw)
+
+    found = moved(lively(config))
+    with monkeypatch.context() as without:
+        without.setattr("surrogate.models.painet.potential.model.lanes_of", lambda *_, **__: None)
+        expected = moved(lively(config))
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float((other - other.mean(0)).abs().max()))
+    assert (expected[0] - x).abs().max() > 1e-3
+    off = rigid.length2 - (found[0][:, rigid.first] - found[0][:, rigid.second]).square().sum(-1)
+    assert (off.abs().max() < 1e-8 * rigid.length2.max()) == is_rigid
+    assert (masses[:, None] * found[1]).sum(1).abs().max() < 1e-6, "at rest as a whole"
 
 
 @needs_compiler

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from surrogate.data.weights import Weights
     from systems.scene import Scene
 
-# Rollouts side by side: one batch, which costs little more than one of them. A potential's step is cheaper by 1.7 times
-# for each of 32 than of 8, and by another tenth at most for each of more.
-REPLICAS, POTENTIAL_REPLICAS = 8, 32
+# Rollouts side by side: one batch, which costs little more than one of them. Of a potential's, sixteen run at once on
+# each core; by torch a step of 32 is half as dear for each as of 8.
+REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 # Weights for several lags step so far, or as near to it as they can.
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
@@ -103,7 +103,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         timestep_ps=config.timestep_ps,
         md_ps_per_s=0.0,
         coverage=coverage,
-        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch),
+        rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, cores),
         platform=by_openmm.platform,
         alone=1.0 if cores == 1 else min(1.0, measured_stretch(1) / stretch),
     )
@@ -149,8 +149,8 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
     return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_lanes=why)
 
 
-def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float) -> Rolls:
-    """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`: see `Rates`."""
+def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:
+    """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`, `cores`: see `Rates`."""
     from surrogate.data.shipped import shipped_weights
     from surrogate.sampling.domain import in_bath
     from surrogate.sampling.runner import RolloutConfig, rollout
@@ -160,7 +160,7 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
         lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
     replicas = REPLICAS
     if weights.model.integrates:  # so many steps a frame that one frame tells
-        weights, replicas = in_bath(weights, {"n_new": 1}), POTENTIAL_REPLICAS
+        weights, replicas = in_bath(weights, {"n_new": 1}), max(_POTENTIAL_REPLICAS, _REPLICAS_A_CORE * cores)
     chunk_ps = weights.model.n_new * lag_ps
     seen: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory(prefix="surromd-rate-") as folder:

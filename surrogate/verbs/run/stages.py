@@ -199,7 +199,8 @@ def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
         return None
     rates, _ = _rates_and_decision(record)
     try:
-        rolled = rollout_rate(site.scene, load_weights(out), site.config.temperature_k, rates.stretch)
+        weights = load_weights(out)
+        rolled = rollout_rate(site.scene, weights, site.config.temperature_k, rates.stretch, rates.cores)
     except SimulationError as error:
         raise SimulationError(f"its weights roll nothing: {str(error).partition(';')[0]}.") from error
     return replace(record, weights=WEIGHTS_NAME, rates=replace(rates, rolls=replace(rolled, weights=WEIGHTS_NAME)))

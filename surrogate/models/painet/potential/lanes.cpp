@@ -1,8 +1,9 @@
 // Energy and gradient of PAINET as a potential in lanes: LANES copies of one molecule, one in each element of a vector
 // register. What it computes, and in which order, is `energy.py`; the gradient is that of its every step, backwards.
 //
-// A value is a V: one number for each copy. Arrays are [..][LANES] floats; weights are the same for all copies. Sizes of
-// the network come as macros from lanes.py, which compiles this at first use. No copy depends on the others.
+// `langevin` moves the copies by it, in double precision. A value is a V, or a D: one number for each copy. Arrays are
+// [..][LANES]; weights are the same for all copies. Sizes of the network come as macros from lanes.py, which compiles this
+// at first use. No copy depends on the others, but for the number of rounds that rigid bonds take.
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -20,6 +21,15 @@ typedef float U __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 static const float HALF_WIDTH = 2.5f, SOFTENING_NM2 = 1e-8f, ROOT_TWO = 1.41421356f, LEAST_NORM = 1e-12f;
 
 struct Linear { const float *weight, *turned, *bias; };  // [out][in], [in][out], [out]
+
+// Rigid bonds, in the words of rigid.py, and the bath.
+struct Bath {
+    int64_t n_bonds;
+    const int32_t *bonds;  // [n_bonds][2]
+    const double *length2, *per_mass, *inverse;  // [n_bonds], [n_bonds][2], [n_bonds][n_bonds]
+    const double *atoms;   // [n][2]: 1/mass, share of the molecule's
+    double timestep, kept, unit;
+};
 
 struct Step {
     Linear send, first, second, third, qkv, out;
@@ -486,6 +496,9 @@ static int64_t laid_out(int64_t n, V *work, Kept *kept, Back *b, Edge **edges, V
     return work - begin;
 }
 
+// Of an atom, what `langevin` needs beside: a hydrogen has no more than two bonds.
+#define ROOM 37
+
 extern "C" {
 
 int64_t work_floats(int64_t n) {
@@ -493,7 +506,7 @@ int64_t work_floats(int64_t n) {
     Back b;
     Edge *edges;
     V *x, *h, *carried, *scratch;
-    return LANES * laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch);
+    return LANES * (laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch) + ROOM * n);
 }
 
 // `positions` [n][3][LANES] nm -> the members' `energy` [N_MEMBERS][LANES] and the `gradient` [n][3][LANES] of their mean,
@@ -555,5 +568,102 @@ void evaluate(const Network *net, const double *positions, float *energy, float 
     for (int64_t k = 0; k < 3 * n; k++) grad[k] = 10.0f * b.dx[k];
     measure_back(net, edges, b.d_radial, b.d_shape, grad);
     memcpy(energy, total, sizeof total);
+}
+
+// `moving` and `off` are room for a vector and a value of each bond.
+static void along(const Bath *bath, const D *x, D *out) {
+    for (int64_t k = 0; k < bath->n_bonds; k++)
+        for (int a = 0; a < 3; a++) out[3 * k + a] = x[3 * bath->bonds[2 * k] + a] - x[3 * bath->bonds[2 * k + 1] + a];
+}
+
+static inline D dot3(const D *a, const D *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// Moves atoms along bonds by what meets `off`, for all bonds at once.
+static void correct(const Bath *bath, const D *bonds, const D *off, D *x) {
+    for (int64_t k = 0; k < bath->n_bonds; k++) {
+        D step = {};
+        for (int64_t m = 0; m < bath->n_bonds; m++) step += off[m] * bath->inverse[m * bath->n_bonds + k];
+        for (int a = 0; a < 3; a++) {
+            x[3 * bath->bonds[2 * k] + a] += step * bonds[3 * k + a] * bath->per_mass[2 * k];
+            x[3 * bath->bonds[2 * k + 1] + a] -= step * bonds[3 * k + a] * bath->per_mass[2 * k + 1];
+        }
+    }
+}
+
+static bool beyond(const D off, double limit) {
+    double most = 0.0;
+    for (int l = 0; l < LANES; l++) most = fabs(off[l]) > most ? fabs(off[l]) : most;
+    return most > limit;
+}
+
+static void project(const Bath *bath, const D *bonds, D *v, D *moving, D *off) {
+    for (int round = 0; round < RIGID_ROUNDS; round++) {
+        bool any = false;
+        along(bath, v, moving);
+        for (int64_t k = 0; k < bath->n_bonds; k++) {
+            off[k] = -dot3(bonds + 3 * k, moving + 3 * k);
+            any |= beyond(off[k], RIGID_TOLERANCE);
+        }
+        if (!any) return;
+        correct(bath, bonds, off, v);
+    }
+}
+
+static void place(const Bath *bath, const D *bonds, D *x, D *moving, D *off) {
+    for (int round = 0; round < RIGID_ROUNDS; round++) {
+        bool any = false;
+        along(bath, x, moving);
+        for (int64_t k = 0; k < bath->n_bonds; k++) {
+            off[k] = 0.5 * (bath->length2[k] - dot3(moving + 3 * k, moving + 3 * k));
+            any |= beyond(off[k], RIGID_TOLERANCE * bath->length2[k]);
+        }
+        if (!any) return;
+        correct(bath, bonds, off, x);
+    }
+}
+
+static void rest(const Bath *bath, int64_t n, D *v) {
+    for (int a = 0; a < 3; a++) {
+        D mean = {};
+        for (int64_t i = 0; i < n; i++) mean += bath->atoms[2 * i + 1] * v[3 * i + a];
+        for (int64_t i = 0; i < n; i++) v[3 * i + a] -= mean;
+    }
+}
+
+// Positions nm and velocities nm/ps [n][3][LANES], in place, after steps that `draws` [n_steps][n][3][LANES] holds normal
+// numbers for; `lost` [n][LANES]: what the bath gives of them.
+void langevin(const Network *net, const Bath *bath, const double *lost, double *positions, double *velocities,
+              const float *draws, int64_t n_steps, float *work) {
+    const int64_t n = net->n;
+    const double dt = bath->timestep;
+    D *x = (D *)positions, *v = (D *)velocities;
+    const D *of_bath = (const D *)lost;
+    const U *draw = (const U *)draws;
+    V *room = (V *)work + work_floats(n) / LANES - ROOM * n;
+    D *gone = (D *)take(room, 6 * n), *bonds = (D *)take(room, 12 * n), *moving = (D *)take(room, 12 * n);
+    D *off = (D *)take(room, 4 * n);
+    float *gradient = (float *)take(room, 3 * n), energy[N_MEMBERS * LANES];
+    rest(bath, n, v);
+    for (int64_t step = 0; step < n_steps; step++) {
+        evaluate(net, positions, energy, gradient, work);
+        const U *g = (const U *)gradient;
+        for (int64_t i = 0; i < n; i++)
+            for (int a = 0; a < 3; a++)
+                v[3 * i + a] -= dt * bath->unit * bath->atoms[2 * i] * __builtin_convertvector(g[3 * i + a], D);
+        if (bath->n_bonds) {
+            along(bath, x, bonds);
+            project(bath, bonds, v, moving, off);
+        }
+        for (int64_t i = 0; i < n; i++)
+            for (int a = 0; a < 3; a++) {
+                x[3 * i + a] += 0.5 * dt * v[3 * i + a];
+                v[3 * i + a] = bath->kept * v[3 * i + a] + of_bath[i] * __builtin_convertvector(*draw++, D);
+            }
+        rest(bath, n, v);
+        for (int64_t k = 0; k < 3 * n; k++) gone[k] = x[k] += 0.5 * dt * v[k];
+        if (!bath->n_bonds) continue;
+        place(bath, bonds, x, moving, off);
+        for (int64_t k = 0; k < 3 * n; k++) v[k] += (x[k] - gone[k]) / dt;
+    }
 }
 }

@@ -1,14 +1,16 @@
 """The potential in lanes: copies of a molecule at once, each in its lane of the processor's vector registers.
 
 `lanes.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
-writing what a pair of atoms sees to memory; this machine's C++ compiler makes it at first use, in seconds.
+writing what a pair of atoms sees to memory, and moves the copies by it. This machine's C++ compiler makes it at first
+use, in seconds.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +25,7 @@ from surrogate.models.painet.pairs import N_SHELLS
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import radial_grid
 from surrogate.models.painet.potential.energy import WALL, EnergyNetwork, Fabric, Look, Prepared
+from surrogate.models.painet.potential.rigid import ROUNDS, TOLERANCE, RigidBonds
 from systems.files.native import CompilerError, compiled_program
 
 _SOURCE = Path(__file__).with_name("lanes.cpp")
@@ -43,13 +46,34 @@ class _Step(ctypes.Structure):
     ]
 
 
-class Lanes:
-    """Frames `(rows, n_atoms, 3)` nm of one molecule -> the members' energies `(rows, n_members)` and the gradient
-    `(rows, n_atoms, 3)` of their mean, in the network's unit and by its weights as they are now."""
+class _Bath(ctypes.Structure):
+    _fields_ = [
+        ("n_bonds", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("bonds", "length2", "per_mass", "inverse", "atoms")),
+        *((name, ctypes.c_double) for name in ("timestep", "kept", "unit")),
+    ]
 
-    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: Prepared) -> None:
+
+@dataclass(frozen=True, eq=False)
+class Bath:
+    """Langevin middle steps of `timestep_ps`, velocities `kept` in each and `lost` (rows, n_atoms, 1) times what is
+    drawn; `masses` (n_atoms, 1) in Da; `rigid` bonds, if any."""
+
+    timestep_ps: float
+    kept: float
+    lost: Tensor
+    masses: Tensor
+    rigid: RigidBonds | None
+
+
+class Lanes:
+    """Frames `(rows, n_atoms, 3)` nm of one molecule -> the members' energies `(rows, n_members)` in kJ/mol and the
+    gradient `(rows, n_atoms, 3)` of their mean, by the network's weights as they are now, times `unit` and from `zero`,
+    both in kJ/mol."""
+
+    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: Prepared, unit: float, zero: float) -> None:
         config, n = network.config, fabric.molecule.n_atoms
-        self.config, self.n_atoms = config, n
+        self.config, self.n_atoms, self.unit, self.zero = config, n, unit, zero
         self._work: dict[tuple[int, int], npt.NDArray[Any]] = {}
         # The program reads these arrays in place.
         self._kept: list[npt.NDArray[Any]] = []
@@ -98,30 +122,58 @@ class Lanes:
 
     @torch.no_grad()
     def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
-        rows = len(positions_nm)
-        lanes = _width(rows)
-        program = _program(self.config, lanes)
-        n_blocks = -(-rows // lanes)
-        # Lanes without a frame of their own hold the last.
-        filled = positions_nm.double()[torch.arange(n_blocks * lanes).clamp(max=rows - 1)]
-        x = filled.unflatten(0, (n_blocks, lanes)).permute(0, 2, 3, 1).contiguous()
-        energy = torch.empty(n_blocks, self.config.n_members, lanes)
-        gradient = torch.empty(n_blocks, self.n_atoms, 3, lanes)
-        n_threads = min(torch.get_num_threads(), n_blocks)
+        rows, lanes = len(positions_nm), _width(len(positions_nm))
+        x = _laid(positions_nm.double(), lanes)
+        energy = torch.empty(len(x), self.config.n_members, lanes)
+        gradient = torch.empty(len(x), self.n_atoms, 3, lanes)
 
-        def compute(thread: int) -> None:
+        def compute(block: int, program: ctypes.CDLL, work: int) -> None:
+            places = (x[block].data_ptr(), energy[block].data_ptr(), gradient[block].data_ptr(), work)
+            program.evaluate(ctypes.byref(self._network), *map(ctypes.c_void_p, places))
+
+        self._each_block(len(x), lanes, compute)
+        members = energy.transpose(1, 2).flatten(0, 1)[:rows].double()
+        return self.zero + self.unit * members, self.unit * _back(gradient, rows).double()
+
+    @torch.no_grad()
+    def langevin(self, x: Tensor, v: Tensor, draw: Tensor, bath: Bath) -> tuple[Tensor, Tensor]:
+        """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
+        n_steps, 3) holds normal numbers for."""
+        rows, lanes, n_steps = len(x), _width(len(x)), draw.shape[2]
+        at, moving = _laid(x.double(), lanes), _laid(v.double(), lanes)
+        lost, draws = _laid(bath.lost.expand(rows, -1, 1), lanes), _laid(draw.transpose(1, 2).float(), lanes)
+        atoms = torch.cat([1.0 / bath.masses, bath.masses / bath.masses.sum()], dim=-1)
+        if (rigid := bath.rigid) is None:
+            bonds, arrays = torch.zeros(0, 2, dtype=torch.int32), [atoms] * 4
+        else:
+            bonds = torch.stack([rigid.first, rigid.second], dim=-1).to(torch.int32)
+            arrays = [rigid.length2, rigid.per_mass.contiguous(), rigid.inverse.contiguous(), atoms]
+        places = (array.data_ptr() for array in (bonds, *arrays))
+        settings = _Bath(len(bonds), *places, bath.timestep_ps, bath.kept, self.unit)
+
+        def compute(block: int, program: ctypes.CDLL, work: int) -> None:
+            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (lost, at, moving, draws)]
+            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), *of_block, ctypes.c_int64(n_steps),
+                             ctypes.c_void_p(work))  # fmt: skip
+
+        self._each_block(len(at), lanes, compute)
+        return _back(at, rows), _back(moving, rows)
+
+    def _each_block(self, n_blocks: int, lanes: int, compute: Callable[[int, ctypes.CDLL, int], None]) -> None:
+        """Call `compute(block, program, room to work in)` for each block of copies, on as many cores as torch takes."""
+        program, n_threads = _program(self.config, lanes), min(torch.get_num_threads(), n_blocks)
+
+        def some(thread: int) -> None:
             if (work := self._work.get((lanes, thread))) is None:
                 work = _aligned(int(program.work_floats(ctypes.c_int64(self.n_atoms))))
                 self._work[lanes, thread] = work
-            for k in range(thread, n_blocks, n_threads):
-                places = (x[k].data_ptr(), energy[k].data_ptr(), gradient[k].data_ptr(), work.ctypes.data)
-                program.evaluate(ctypes.byref(self._network), *map(ctypes.c_void_p, places))
+            for block in range(thread, n_blocks, n_threads):
+                compute(block, program, work.ctypes.data)
 
         if n_threads == 1:
-            compute(0)
+            some(0)
         else:
-            list(_pool(n_threads).map(compute, range(n_threads)))
-        return energy.transpose(1, 2).flatten(0, 1)[:rows], gradient.permute(0, 3, 1, 2).flatten(0, 1)[:rows]
+            list(_pool(n_threads).map(some, range(n_threads)))
 
     def _array(self, values: Tensor) -> int:
         self._kept.append(np.ascontiguousarray(values.detach().numpy(), dtype=np.float32))
@@ -133,7 +185,8 @@ class Lanes:
         return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
 
 
-def lanes_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int) -> Lanes | None:
+def lanes_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int, *, unit: float = 1.0, zero: float = 0.0
+             ) -> Lanes | None:  # fmt: skip
     """Return the potential in lanes, compiled for so many frames; None where it does not run in them: not in single
     precision on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
     if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
@@ -142,16 +195,30 @@ def lanes_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int) 
         _program(network.config, _width(rows))
     except (CompilerError, OSError):
         return None
-    return Lanes(network, fabric, made)
+    return Lanes(network, fabric, made, unit, zero)
 
 
 def _width(rows: int) -> int:
     return _LANES if rows > _FEW_LANES else _FEW_LANES
 
 
+def _laid(values: Tensor, lanes: int) -> Tensor:
+    """`values` (rows, ..) -> (blocks, .., lanes); lanes without a row of their own hold the last."""
+    n_blocks = -(-len(values) // lanes)
+    if n_blocks * lanes > len(values):
+        values = values[torch.arange(n_blocks * lanes).clamp(max=len(values) - 1)]
+    return values.unflatten(0, (n_blocks, lanes)).movedim(1, -1).contiguous()
+
+
+def _back(laid: Tensor, rows: int) -> Tensor:
+    return laid.movedim(-1, 1).flatten(0, 1)[:rows]
+
+
 @lru_cache(maxsize=8)
 def _program(config: PotentialConfig, lanes: int) -> ctypes.CDLL:
-    program = compiled_program(_SOURCE, {"LANES": lanes, **{name.upper(): getattr(config, name) for name in _SIZES}})
+    sizes = {name.upper(): getattr(config, name) for name in _SIZES}
+    rigid = {"RIGID_ROUNDS": ROUNDS, "RIGID_TOLERANCE": TOLERANCE}
+    program = compiled_program(_SOURCE, {"LANES": lanes, **sizes, **rigid})
     program.work_floats.restype = ctypes.c_int64
     return program
 

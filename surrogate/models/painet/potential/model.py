@@ -15,7 +15,7 @@ from surrogate.models.painet.potential.config import LONGEST_FLEXIBLE_PS, Potent
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
 from surrogate.models.painet.potential.gradient import GradientFn, gradient_of
-from surrogate.models.painet.potential.lanes import lanes_of
+from surrogate.models.painet.potential.lanes import Bath, Lanes, lanes_of
 from surrogate.models.painet.potential.rigid import RigidBonds
 from systems.errors import InputError
 from systems.scene import Scene
@@ -189,16 +189,11 @@ class PainetPotential(Surrogate):
             self._known = known
         return known[1]
 
-    def _in_lanes(self, fabric: Fabric, made: Prepared, rows: int) -> GradientFn | None:
-        if self.training or (lanes := lanes_of(self.network, fabric, made, rows)) is None:
+    def _in_lanes(self, fabric: Fabric, made: Prepared, rows: int) -> Lanes | None:
+        if self.training:
             return None
-        offset, scale = self.energy_offset_kj_mol.double(), self.energy_scale_kj_mol.double()
-
-        def compute(positions_nm: Tensor) -> tuple[Tensor, Tensor]:
-            members, gradient = lanes(positions_nm)
-            return offset + scale * members.double(), scale * gradient.double()
-
-        return compute
+        unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
+        return lanes_of(self.network, fabric, made, rows, unit=unit, zero=zero)
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -210,9 +205,11 @@ class PainetPotential(Surrogate):
         dt = timestep_ps or self.config.timestep_ps
         kept = math.exp(-self.config.friction_per_ps * dt)
         lost = math.sqrt(1.0 - kept * kept) * thermal
+        rigid = self._rigid(molecule, dt)
+        if isinstance(lanes := self.gradient(x, molecule), Lanes):
+            return lanes.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
         share = masses / masses.sum()
         v = v - (share * v).sum(-2, keepdim=True)
-        rigid = self._rigid(molecule, dt)
         for k in range(draw.shape[2]):
             v = v + dt * self.forces(x, molecule) / masses
             if rigid is not None:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 # Of a squared length, and of a velocity along a bond in nm^2/ps; rounds until they are met.
-_TOLERANCE = 1e-9
-_ROUNDS = 50
+TOLERANCE = 1e-9
+ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class RigidBonds:
         """Return positions `(rows, n_atoms, 3)` nearest to `free_nm` at which bonds have their lengths, moved along
         the bonds of `before_nm`. Rows that cannot be mended are returned as far as they came."""
         along, x = self._along(before_nm), free_nm
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             off = 0.5 * (self.length2 - self._along(x).square().sum(-1))
-            if not bool((off.abs() > _TOLERANCE * self.length2).any()):
+            if not bool((off.abs() > TOLERANCE * self.length2).any()):
                 break
             x = self._moved(x, along, off)
         return x
@@ -59,9 +59,9 @@ class RigidBonds:
     def project(self, v: Tensor, x_nm: Tensor) -> Tensor:
         """Return velocities `(rows, n_atoms, 3)` without those along bonds, at positions `x_nm`."""
         along = self._along(x_nm)
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             off = -(along * self._along(v)).sum(-1)
-            if not bool((off.abs() > _TOLERANCE).any()):
+            if not bool((off.abs() > TOLERANCE).any()):
                 break
             v = self._moved(v, along, off)
         return v

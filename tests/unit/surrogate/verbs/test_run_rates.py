@@ -100,7 +100,7 @@ def test_without_a_compiler_the_line_is_plain(
 
 
 @pytest.mark.parametrize(
-    ("name", "replicas", "chunk_ps"), [("paracetamol-gfn2-xtb", 32, 0.1), ("alanine-dipeptide", 8, 31.0)]
+    ("name", "replicas", "chunk_ps"), [("paracetamol-gfn2-xtb", 64, 0.1), ("alanine-dipeptide", 8, 31.0)]
 )
 def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
     name: str, replicas: int, chunk_ps: float, monkeypatch: pytest.MonkeyPatch
@@ -115,7 +115,7 @@ def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
     weights = load_weights(weights_path(name))
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
     monkeypatch.setattr(measuring, "time", SimpleNamespace(monotonic=iter([0.0, 4.0, 9.0]).__next__))
-    found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0)
+    found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0, 4)
     assert asked == [(replicas, pytest.approx(6 * chunk_ps))], "of a potential a frame a chunk tells"
     assert found.replicas == replicas
     assert found.ps_per_s == pytest.approx(replicas * chunk_ps / 4.0 / 2.0), "half of the core is others'"
