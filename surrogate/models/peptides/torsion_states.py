@@ -33,6 +33,8 @@ _WIDTH = 96
 _WAVES = 8
 # Before training, a torsion changes to another state once in so many frames (in logits).
 _RARELY = -5.0
+# A step of training moves the odds by so many times as much as another parameter.
+_FAST = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +115,8 @@ class StateJumps(nn.Module):
         self.logits = nn.Linear(_WIDTH, MOST_STATES)
         # Of each type and torsion, from one state to another: a level, and a slope with the logarithm of time.
         self.of_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
+        # And a level of the residue before's type, and of the one after's: proline forbids what others allow.
+        self.beside_change = nn.Parameter(torch.zeros(2, n_types, MOST_TORSIONS, MOST_STATES, MOST_STATES))
         nn.init.zeros_(self.logits.weight)
         nn.init.constant_(self.logits.bias, _RARELY)
 
@@ -150,6 +154,8 @@ class StateJumps(nn.Module):
         level, slope = self.of_change[:, places[:, 0], torsion]  # (r, from, to)
         row = torch.arange(len(places), device=now.device)
         found = self.logits(F.silu(self.hidden(h))) + level[row, now] + slope[row, now] * logs[..., None, None]
+        for which in range(2):
+            found = found + _FAST * self.beside_change[which, places[:, 1 + which], torsion][row, now]
         # To stay has the logit zero.
         found = found.masked_fill(F.one_hot(now, MOST_STATES).bool(), 0.0)
         absent = torch.arange(MOST_STATES, device=now.device) >= counts[:, torsion, None].clamp(min=1)

@@ -124,6 +124,13 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0)))
     turns = np.exp(2.0) / (np.exp(-1.0) + np.exp(2.0) + 1.0)
     assert float(found) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
+    # What the neighbours' types say comes on top, before and after told apart: this residue's are both of type 1.
+    with torch.no_grad():
+        jumps.beside_change[1, 1, 0, 0, 1] = -0.2
+        jumps.beside_change[:, 0] = 5.0
+    forbidden = jumps.loss(torch.zeros(1, 2, 4), states, places, counts, time, time).detach()
+    crosses = 1.0 / (1.0 + np.exp(-(1.0 + 0.5 * 2.0 - 10.0 * 0.2)))
+    assert float(forbidden) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
 
 
 def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once() -> None:
