@@ -100,11 +100,17 @@ def test_without_a_compiler_the_line_is_plain(
 
 
 @pytest.mark.parametrize(
+    ("wall_s", "processor_s"),
+    [([0.0, 4.0, 9.0], [0.0, 8.0, 16.0]), ([0.0, 40.0, 90.0], [0.0, 4.0, 9.0])],
+    ids=["two cores", "interrupted"],
+)
+@pytest.mark.parametrize(
     ("name", "replicas", "chunk_ps"), [("paracetamol-gfn2-xtb", 64, 0.1), ("alanine-dipeptide", 8, 31.0)]
 )
 def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
-    name: str, replicas: int, chunk_ps: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    name: str, replicas: int, chunk_ps: float, wall_s: list[float], processor_s: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     asked = []
 
     def rollout(scene: Any, weights: Any, outs: Any, config: Any, *, progress: Any, **_: Any) -> None:
@@ -114,7 +120,8 @@ def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
 
     weights = load_weights(weights_path(name))
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(monotonic=iter([0.0, 4.0, 9.0]).__next__))
+    clocks = {"monotonic": iter(wall_s).__next__, "process_time": iter(processor_s).__next__}
+    monkeypatch.setattr(measuring, "time", SimpleNamespace(**clocks))
     found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0, 4)
     assert asked == [(replicas, pytest.approx(6 * chunk_ps))], "of a potential a frame a chunk tells"
     assert found.replicas == replicas
