@@ -28,6 +28,7 @@ from surrogate.models.peptides.torsion_states import (
     MOST_TORSIONS,
     PHI,
     PSI,
+    PSI_BEFORE_PROLINE,
     RING,
     THREEFOLD,
     Kind,
@@ -237,7 +238,8 @@ def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
             if layout.types[residue] not in _FREE_PHI:
                 rows.append(([atom, near, next_, last], residue, 0, PHI))
         elif names == ("N", "C", "CA"):
-            rows.append(([atom, near, next_, last], residue, 1, PSI))
+            before_proline = layout.types[residue + 1 : residue + 2] == ("PRO",)
+            rows.append(([atom, near, next_, last], residue, 1, PSI_BEFORE_PROLINE if before_proline else PSI))
         elif not graph.has_edge(near, next_):
             # The pucker of a ring, on either side of its plane.
             rows.append(([atom, near, next_, last], residue, FIRST_OF_SIDE_CHAIN, RING))

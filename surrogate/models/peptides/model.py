@@ -6,7 +6,8 @@ is lost. The flow runs on innovations: of each coordinate at time t after the co
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
 chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
 (`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Chunks that
-leave these states, or in which atoms overlap as they never do in MD, are drawn again, in the same states.
+leave these states, or in which atoms overlap as they never do in MD, are drawn again, in the same states and then in
+others.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ _LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
-MAX_REDRAWS = 4
+MAX_REDRAWS = 8
+# Where atoms overlap so many times, there may be no room for them in these states, and these are drawn again, too.
+_OVERLAPS = 2
 
 
 @dataclass(frozen=True)
@@ -338,15 +341,20 @@ class PeptideSlide(Surrogate):
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
         counts = chain.stated.counts
         shape = (self.n_new, *counts.shape)
-        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators(noise, STATES)]).to(known)
         apart = times_apart(times, self.config.forgotten_ps)
-        states = self.jumps.draw(known, now, chain.places, counts, times, apart, uniform)
-        of_states = told_states(torch.cat([now[:, None], states], dim=1), counts)
 
+        def draw_states(rows: Tensor, attempt: int) -> Tensor:
+            seeds = generators(noise[rows], STATES, attempt)
+            uniform = torch.stack([torch.rand(shape, generator=g) for g in seeds]).to(known)
+            return self.jumps.draw(known[rows], now[rows], chain.places, counts, times[rows], apart[rows], uniform)
+
+        rows = torch.arange(len(known), device=known.device)
+        states = draw_states(rows, 0)
         evaluations = 0.0
 
         def solve(rows: Tensor, drawn: Tensor) -> Tensor:
-            told = self.flow.told(known[rows], times[rows], chain.places, of_states[rows])
+            of_states = told_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
+            told = self.flow.told(known[rows], times[rows], chain.places, of_states)
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 nonlocal evaluations
@@ -356,11 +364,13 @@ class PeptideSlide(Surrogate):
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
             return self.frames_of(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
 
-        rows = torch.arange(len(known), device=known.device)
         frames = solve(rows, drawn)
         for attempt in range(MAX_REDRAWS):
             disobeyed = (chain.states(frames[rows]) != states[rows]).flatten(1).any(-1)
-            rows = rows[disobeyed | chain.overlap(frames[rows]).any(-1)]
+            overlap = chain.overlap(frames[rows]).any(-1)
+            if attempt >= _OVERLAPS and overlap.any():
+                states[rows[overlap]] = draw_states(rows[overlap], attempt)
+            rows = rows[disobeyed | overlap]
             if not len(rows):
                 break
             again = drawn.new_zeros(len(rows), *drawn.shape[1:])

@@ -125,7 +125,7 @@ class PeptideSubject:
         top = float(np.log(longest / t))
         stride = torch.exp(torch.rand(n, 1, generator=generator) * top).round().clamp(1, longest // t)
         drawn = torch.exp(torch.rand(n, t, generator=generator) * float(np.log(longest))).round().long()
-        drawn = torch.stack([_distinct(row, longest) for row in drawn.sort(dim=1).values])
+        drawn = _distinct(drawn.sort(dim=1).values, longest)
         ahead = torch.where(even, (stride * torch.arange(1, t + 1)).long(), drawn)
         span = ahead[:, -1].numpy()
         first = self._starts(span, ranges, generator)
@@ -289,12 +289,9 @@ class PeptideSubject:
 
 
 def _distinct(ahead: Tensor, longest: int) -> Tensor:
-    """Return ascending whole numbers from 1 to `longest`, each once, near those given (ascending)."""
+    """Return ascending whole numbers `(n, t)` from 1 to `longest`, each once in its row, near those given."""
     found = ahead.clone()
-    for k in range(1, len(found)):
-        found[k] = max(int(found[k]), int(found[k - 1]) + 1)
-    surplus = int(found[-1]) - longest
-    if surplus > 0:
-        top = torch.arange(longest - len(found) + 1, longest + 1)
-        found = torch.minimum(found, top)
-    return found
+    for k in range(1, found.shape[1]):
+        found[:, k] = torch.maximum(found[:, k], found[:, k - 1] + 1)
+    top = torch.arange(longest - found.shape[1] + 1, longest + 1)
+    return torch.minimum(found, top)

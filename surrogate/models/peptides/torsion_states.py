@@ -24,9 +24,11 @@ MOST_TORSIONS, MOST_STATES = 7, 3
 FIRST_OF_SIDE_CHAIN = 2
 # Where the first state begins and where the next ones do, counted from there, degrees: phi (negative, positive), psi
 # (strands, helices), a bond between tetrahedral atoms (gauche+, trans, gauche-), one to an aromatic ring (its sides).
+# Psi's barrier is at 70 to 80 degrees; before a proline, whose ring is in the way of helices, at 20 to 30.
 Kind = tuple[float, tuple[float, float]]
 PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
-PSI = (90.0, (150.0, 360.0))
+PSI = (75.0, (165.0, 360.0))
+PSI_BEFORE_PROLINE = (25.0, (215.0, 360.0))
 THREEFOLD = (0.0, (120.0, 240.0))
 RING = (0.0, (180.0, 360.0))
 _WIDTH = 96
@@ -162,11 +164,13 @@ class StateJumps(nn.Module):
         return found.masked_fill(absent, -torch.inf)
 
     def loss(
-        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor
-    ) -> Tensor:
+        self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,
+        share: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
         """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
-        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first.
+        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b,): what each
+        window counts, 1 where it is not given.
         """
         with torch.autocast(known.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
@@ -177,9 +181,9 @@ class StateJumps(nn.Module):
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
                 logits = self.odds(torsion, h, logs, before, new, places, counts)[:, :, has]
-                total = total + F.cross_entropy(
-                    logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="sum"
-                )
+                each = F.cross_entropy(logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="none")
+                of_window = each.reshape(len(known), -1).sum(-1)
+                total = total + (of_window if share is None else share * of_window).sum()
             return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(

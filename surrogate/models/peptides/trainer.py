@@ -22,6 +22,7 @@ from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import ENDS, PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
+from surrogate.models.peptides.state_windows import StateWindows
 from surrogate.models.peptides.torsion_states import MOST_STATES, times_apart, told_states
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
@@ -116,11 +117,17 @@ def train_peptides(
         idx, times = subject.batch(training.batch, config, generator)
         return peptide_loss(model, subject.chain, *subject.seen(model, idx), times.to(device), generator)
 
+    pools: dict[int, StateWindows] = {}
+
     def jumps_loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        subject = subjects[pick(subjects, generator)]
-        idx, times = subject.windows(_JUMPS_BATCH, config, generator)
+        which = pick(subjects, generator)
+        subject = subjects[which]
+        if which not in pools:
+            pools[which] = StateWindows.of(subject, config)
+        idx, times, share = pools[which].draw(_JUMPS_BATCH, generator)
         known, _ = subject.seen(model, idx[:, 0])
-        loss = state_loss(model, subject.chain, known, subject.states(idx).to(device), times.to(device), generator)
+        states = subject.states(idx).to(device)
+        loss = state_loss(model, subject.chain, known, states, times.to(device), generator, share=share.to(device))
         return loss, {"jumps": loss.detach()}
 
     @torch.no_grad()
@@ -315,14 +322,15 @@ def peptide_loss(
 
 def state_loss(
     model: PeptideSlide, chain: ChainFeatures, known: Tensor, states: Tensor, times_ps: Tensor,
-    generator: torch.Generator, *, noisy: bool = True,
+    generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
-    `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t); otherwise as `peptide_loss`."""
+    `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b,) what each window counts, 1 where it is not
+    given; otherwise as `peptide_loss`."""
     if noisy:
         known = _disturbed(known, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)
-    return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart)
+    return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
 def _disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
