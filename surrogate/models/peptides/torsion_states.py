@@ -169,8 +169,8 @@ class StateJumps(nn.Module):
     ) -> Tensor:  # fmt: skip
         """Return the negative log-likelihood of what torsions did, per frame and torsion.
 
-        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b,): what each
-        window counts, 1 where it is not given.
+        `known` (b, r, slots); `states` (b, 1 + t, r, MOST_TORSIONS), the given frame's first; `share` (b, r,
+        MOST_TORSIONS): what each torsion's change counts in a window, 1 where it is not given.
         """
         with torch.autocast(known.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
@@ -181,9 +181,9 @@ class StateJumps(nn.Module):
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
                 logits = self.odds(torsion, h, logs, before, new, places, counts)[:, :, has]
-                each = F.cross_entropy(logits.flatten(0, -2), new[..., has, torsion].flatten(), reduction="none")
-                of_window = each.reshape(len(known), -1).sum(-1)
-                total = total + (of_window if share is None else share * of_window).sum()
+                chosen = new[..., has, torsion]
+                each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
+                total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
             return total / (times_ps.numel() * max(1, int((counts > 0).sum())))
 
     def draw(

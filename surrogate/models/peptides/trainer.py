@@ -325,8 +325,8 @@ def state_loss(
     generator: torch.Generator, *, noisy: bool = True, share: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Return the negative log-likelihood of the changes of states: `known` (b, r, slots) the given frame's numbers,
-    `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b,) what each window counts, 1 where it is not
-    given; otherwise as `peptide_loss`."""
+    `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
+    1 where it is not given; otherwise as `peptide_loss`."""
     if noisy:
         known = _disturbed(known, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)

@@ -87,7 +87,7 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     yardstick = structure.Yardstick.of(reference, probing=False)
     account = account_of(reference)
     setting = comparison._Setting(
-        reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account
+        reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account, {}
     )
     trio = comparison._equal_terms(setting, candidate)[0]
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}

@@ -249,6 +249,34 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_states_in_which_atoms_always_overlap_are_drawn_again(monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
+    """Psi changes as often as not, and its other state is said to have no room."""
+    from surrogate.models.peptides import model as module
+
+    if not again:
+        monkeypatch.setattr(module, "_OVERLAPS", module.MAX_REDRAWS)
+    scene = build_peptide("ACE-ALA-NME")
+    torch.manual_seed(0)
+    model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
+    model.lag_ps = 1000.0
+    molecule = describe(model, scene)
+    chain = molecule.chain
+    assert chain is not None
+    model.token_mean.copy_(_middles(model, chain))
+    model.token_scale.fill_(0.01)
+    model.jumps.logits.bias[:] = -30.0
+    model.jumps.of_change[0, :, 1] = 30.0
+    last = torch.tensor(scene.positions_nm).float().expand(64, 1, -1, -1)
+    own = chain.states(last[0, 0])[1, 1]
+    monkeypatch.setattr(ChainFeatures, "overlap", lambda self, x: self.states(x)[..., 1, 1] != own)
+    noise = torch.randn(64, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
+    chunk = model.next_chunk(last, molecule, noise, solver_steps=2)
+    stayed = (chain.states(chunk.frames_nm)[..., 1, 1] == own).all(1).float().mean()
+    assert 0.35 < stayed < 0.65 if not again else stayed > 0.9
+    assert chunk.evaluations > 2 * (1.5 if again else 4)
+
+
 def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_apart() -> None:
     scene = build_peptide("ACE-ALA-NME")
     chain = chain_features(scene, _config(scene))
