@@ -24,7 +24,7 @@ MOST_TORSIONS, MOST_STATES = 7, 3
 FIRST_OF_SIDE_CHAIN = 2
 # Where the first state begins and where the next ones do, counted from there, degrees: phi (negative, positive), psi
 # (strands, helices), a bond between tetrahedral atoms (gauche+, trans, gauche-), one to an aromatic ring (its sides).
-# Psi's barrier is at 70 to 80 degrees; before a proline, whose ring is in the way of helices, at 20 to 30.
+# Psi's barrier lies elsewhere before a proline, whose ring is in the way of helices.
 Kind = tuple[float, tuple[float, float]]
 PHI = (POSITIVE_PHI_DEG[1], (360.0 - POSITIVE_PHI_DEG[1], 360.0))
 PSI = (75.0, (165.0, 360.0))
