@@ -185,13 +185,18 @@ class ChainFeatures:
         return self.stated.residue[self.stated.slot == 0]
 
     @cached_property
+    def stated_at(self) -> Tensor:
+        """Where among all numbers of a frame the cosine of each torsion that has states stands, `(n,)`; its sine is
+        next."""
+        turning = dict(zip(self.code.layout.turning, self.code.turning_at.tolist(), strict=True))
+        places = [turning[(a, b, c, d)] for a, b, c, d in self.stated.quads.tolist()]
+        return torch.tensor(places, dtype=torch.long, device=self.places.device)
+
+    @cached_property
     def state_at(self) -> Tensor:
         """Which of its residue's torsions `(n_residues, n_slots)` each number tells of; -1 of those without states."""
         found = torch.full_like(self.code.filled, -1, dtype=torch.long).flatten()
-        turning = dict(zip(self.code.layout.turning, self.code.turning_at.tolist(), strict=True))
-        for quad, slot in zip(self.stated.quads.tolist(), self.stated.slot.tolist(), strict=True):
-            at = turning[tuple(quad)]
-            found[at : at + 2] = slot
+        found[self.stated_at] = found[self.stated_at + 1] = self.stated.slot
         return found.reshape(self.code.filled.shape)
 
     def states(self, frames_nm: Tensor) -> Tensor:

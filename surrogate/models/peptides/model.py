@@ -5,9 +5,10 @@ internal coordinates of `models.peptides.chains`, so that no first stage is trai
 is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
 with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
 chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
-(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Chunks that
-leave these states, or in which atoms overlap as they never do in MD, are drawn again, in the same states and then in
-others.
+(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Frames that
+leave these states a little, or in which atoms overlap as they never do in MD, are set right by small turns
+(`models.peptides.settling`); chunks with frames where that is not enough are drawn again, in the same states and then
+in others.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.further_noise import REDRAWS, STATES, generators
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
 from surrogate.models.peptides.chains import ChainScale
+from surrogate.models.peptides.settling import settle
 from surrogate.models.peptides.torsion_states import MOST_STATES, MOST_TORSIONS, StateJumps, times_apart, told_states
 from surrogate.models.settings import build
 from systems.chemistry.geometry import superpose
@@ -226,7 +228,7 @@ class PeptideSlide(Surrogate):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     solvers = ("gaussian", *flow.solvers_for("linear"))
-    usual_steps: ClassVar[int] = 6
+    usual_steps: ClassVar[int] = 4
     float32_layers: tuple[str, ...] = ("flow.of_time",)
     config: PeptideConfig
     token_mean: Tensor
@@ -293,8 +295,13 @@ class PeptideSlide(Surrogate):
 
     def frames_of(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
         """The inverse of `normalised`, each frame laid on the template by heavy atoms."""
-        types = chain.places[:, 0]
-        frames = chain.code.decode(numbers.float() * self.token_scale[types] + self.middle(states, chain))
+        return self._laid(chain.code.decode(self._tokens(numbers, states, chain)), chain)
+
+    def _tokens(self, numbers: Tensor, states: Tensor, chain: ChainFeatures) -> Tensor:
+        return numbers.float() * self.token_scale[chain.places[:, 0]] + self.middle(states, chain)
+
+    @staticmethod
+    def _laid(frames: Tensor, chain: ChainFeatures) -> Tensor:
         flat = frames.flatten(0, -3).double().cpu().numpy()
         laid = superpose(flat, chain.template_nm, idx=chain.fitted)
         return torch.from_numpy(laid).float().reshape(frames.shape).to(frames.device)
@@ -352,7 +359,8 @@ class PeptideSlide(Surrogate):
         states = draw_states(rows, 0)
         evaluations = 0.0
 
-        def solve(rows: Tensor, drawn: Tensor) -> Tensor:
+        def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
             of_states = told_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
             told = self.flow.told(known[rows], times[rows], chain.places, of_states)
 
@@ -362,20 +370,22 @@ class PeptideSlide(Surrogate):
                 return torch.where(filled, self.flow(o, tau, told), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
-            return self.frames_of(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
+            tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
+            settled = settle(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
+            frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in settled)
+            return self._laid(frames, chain), astray.any(-1), crowded.any(-1)
 
-        frames = solve(rows, drawn)
+        frames, astray, crowded = solve(rows, drawn)
         for attempt in range(MAX_REDRAWS):
-            disobeyed = (chain.states(frames[rows]) != states[rows]).flatten(1).any(-1)
-            overlap = chain.overlap(frames[rows]).any(-1)
-            if attempt >= _OVERLAPS and overlap.any():
-                states[rows[overlap]] = draw_states(rows[overlap], attempt)
-            rows = rows[disobeyed | overlap]
+            wrong = astray | crowded
+            rows, overlap = rows[wrong], crowded[wrong]
             if not len(rows):
                 break
+            if attempt >= _OVERLAPS and overlap.any():
+                states[rows[overlap]] = draw_states(rows[overlap], attempt)
             again = drawn.new_zeros(len(rows), *drawn.shape[1:])
             seeds = generators(noise[rows], REDRAWS, attempt)
             fresh = (*drawn.shape[1:2], int(filled.sum()))
             again[..., filled] = torch.stack([torch.randn(fresh, generator=g) for g in seeds]).to(again)
-            frames[rows] = solve(rows, again)
+            frames[rows], astray, crowded = solve(rows, again)
         return Chunk(frames, evaluations=evaluations)

@@ -63,12 +63,17 @@ class StatedTorsions:
         tensors = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "n_residues"}
         return replace(self, **tensors)
 
+    @cached_property
+    def ends_deg(self) -> Tensor:
+        """Where each state begins and the next one does, `(n, MOST_STATES + 1)`, degrees from `first_deg` on."""
+        ends = F.pad(self.edges_deg, (1, 1))
+        ends[:, -1] = 360.0
+        return ends
+
     @property
     def middles_deg(self) -> Tensor:
         """The middle of each state, `(n, MOST_STATES)`, degrees; of no meaning where there are fewer."""
-        ends = F.pad(self.edges_deg, (1, 1))
-        ends[:, -1] = 360.0
-        return self.first_deg[:, None] + (ends[:, 1:] + ends[:, :-1]) / 2.0
+        return self.first_deg[:, None] + (self.ends_deg[:, 1:] + self.ends_deg[:, :-1]) / 2.0
 
     @cached_property
     def counts(self) -> Tensor:

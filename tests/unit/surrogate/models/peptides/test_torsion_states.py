@@ -11,6 +11,7 @@ from surrogate.data.descriptions import describe
 from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.settling import settle
 from surrogate.models.peptides.torsion_states import (
     MOST_TORSIONS,
     PHI,
@@ -221,8 +222,10 @@ def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
 
 def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_others() -> None:
     """With numbers that scatter widely about the middles of states, many frames disobey; with the odds of changes at
-    nothing more of them stay in the given states after drawing again, and a row alone is drawn as it is in a batch."""
+    nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the end of
+    their states, and a row alone is drawn as it is in a batch."""
     from surrogate.models.peptides import model as module
+    from surrogate.models.peptides import settling
 
     scene = build_peptide("ACE-ALA-NME")
     torch.manual_seed(0)
@@ -238,13 +241,14 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     model.token_scale[chain.places[1, 0]] = 0.75
     model.token_mean.copy_(_middles(model, chain))
     shares = []
-    for most in (0, module.MAX_REDRAWS):
+    for most, mirrored in ((0, 0.0), (module.MAX_REDRAWS, 0.0), (0, settling._MIRRORED_DEG)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "MAX_REDRAWS", most)
+            patch.setattr(settling, "_MIRRORED_DEG", mirrored)
             frames = model.next_chunk(last, molecule, noise, solver_steps=2).frames_nm
         obeys = (chain.states(frames) == own).flatten(1).all(dim=1)
         shares.append(float(obeys.float().mean()))
-    assert shares[0] < 0.7 and shares[1] > shares[0] + 0.15
+    assert shares[0] < 0.7 and min(shares[1:]) > shares[0] + 0.15
     alone = model.next_chunk(last[7:8], molecule, noise[7:8], solver_steps=2).frames_nm
     torch.testing.assert_close(alone[0], frames[7], rtol=0, atol=1e-5)
 
@@ -290,7 +294,9 @@ def test_atoms_overlap_where_they_are_nearer_than_md_lets_them_and_no_few_bonds_
 
 
 def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what is drawn the first of three rows is called overlapping twice: it alone is drawn three times."""
+    """Of what is drawn a frame of the first of three rows overlaps twice: that row alone is drawn three times."""
+    from surrogate.models.peptides import model as module
+
     scene = build_peptide("ACE-ALA-NME")
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
     model.lag_ps = 1.0
@@ -301,13 +307,13 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     model.token_mean.copy_(_middles(model, chain))
     seen: list[int] = []
 
-    def overlap(self: ChainFeatures, frames_nm: torch.Tensor) -> torch.Tensor:
-        seen.append(len(frames_nm))
-        found = torch.zeros(frames_nm.shape[:2], dtype=torch.bool)
-        found[0] = len(seen) < 3
-        return found
+    def settled(tokens: torch.Tensor, *told: object) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        frames, astray, crowded = settle(tokens, *told)  # type: ignore[arg-type]
+        seen.append(len(frames) // model.n_new)
+        crowded[model.n_new - 1] = len(seen) < 3
+        return frames, astray, crowded
 
-    monkeypatch.setattr(ChainFeatures, "overlap", overlap)
+    monkeypatch.setattr(module, "settle", settled)
     last = torch.tensor(scene.positions_nm).float().expand(3, 1, -1, -1)
     noise = torch.randn(3, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
     chunk = model.next_chunk(last, molecule, noise, solver_steps=2)
