@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from surrogate.judge.measure.distributions import distance
 from surrogate.judge.measure.torsions import find_torsions
-from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
+from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, POSITIVE_PHI_DEG
 from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 _BINS, _JOINT_BINS = 50, 36
 _LEAST_ENTRIES = 10
-_POSITIVE_CORE, _NEGATIVE_CORE = (30.0, 90.0), (-175.0, -45.0)  # of phi, degrees
 
 
 @dataclass(frozen=True)
@@ -194,8 +193,9 @@ def crossings(phi: Sequence[FloatArray], apart_ps: float) -> dict[str, float]:
     moves, spent_ns = np.zeros(2, dtype=int), np.zeros(2)
     for run in phi:
         degrees = np.degrees(run)
-        positive = (degrees > _POSITIVE_CORE[0]) & (degrees < _POSITIVE_CORE[1])
-        negative = (degrees > _NEGATIVE_CORE[0]) & (degrees < _NEGATIVE_CORE[1])
+        positive, negative = (
+            (degrees > low) & (degrees < high) for low, high in (POSITIVE_CORE_DEG, NEGATIVE_CORE_DEG)
+        )
         seen = np.flatnonzero(positive | negative)
         if len(seen):
             state = positive[seen].astype(int)

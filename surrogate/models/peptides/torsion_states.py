@@ -19,6 +19,8 @@ from torch.nn import functional as F
 
 # Beyond the second barrier phi > 0 is the far end of the strands' basin, which reaches across 180 degrees.
 POSITIVE_PHI_DEG = (0.0, 130.0)
+# Well inside either side, away from both barriers.
+POSITIVE_CORE_DEG, NEGATIVE_CORE_DEG = (30.0, 90.0), (-175.0, -45.0)
 # Of one residue: phi, psi, then those of its side chain outwards; and of one torsion.
 MOST_TORSIONS, MOST_STATES = 7, 3
 FIRST_OF_SIDE_CHAIN = 2
@@ -167,6 +169,13 @@ class StateJumps(nn.Module):
         found = found.masked_fill(F.one_hot(now, MOST_STATES).bool(), 0.0)
         absent = torch.arange(MOST_STATES, device=now.device) >= counts[:, torsion, None].clamp(min=1)
         return found.masked_fill(absent, -torch.inf)
+
+    @torch.no_grad()
+    def raise_entries(self, of_type: Tensor, before: Tensor, after: Tensor) -> None:
+        """Add levels `(n_types,)` to the logits of entering phi > 0, of the residue's type and of its neighbours'."""
+        self.of_change[0, :, 0, 0, 1] += of_type
+        self.beside_change[0, :, 0, 0, 1] += before / _FAST
+        self.beside_change[1, :, 0, 0, 1] += after / _FAST
 
     def loss(
         self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor, times_ps: Tensor, apart_ps: Tensor,

@@ -19,6 +19,7 @@ from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
+from surrogate.models.peptides.balance import balance_entries
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.model import ENDS, PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
@@ -169,6 +170,7 @@ def train_peptides(
         spent_s += run_stage(
             trained, stage, loss_fn, partial(validate, stage), place, progress=progress, on_save=partial(write, spent_s)
         )
+    balance_entries(model, subjects)
     if is_first_process():
         write(spent_s)
         for path in states:

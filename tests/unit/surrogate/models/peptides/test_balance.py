@@ -1,0 +1,75 @@
+"""Odds of entering phi > 0 after balancing: as many frames enter as leave."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from small_scenes import with_phi_turned
+from surrogate.data.features.peptide_chains import chain_features
+from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.models.peptides.balance import balance_entries, imbalances
+from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.peptides.peptide_subjects import PeptideSubject
+from surrogate.models.peptides.trainer import with_scale
+from systems.prepare.peptide import build_peptide
+
+SHARE = 0.02
+EACH = 400
+
+
+def _frames(sequence: str) -> TrainingFrames:
+    """As many frames on either side of the first residue's phi as on the other, trembling."""
+    scene = build_peptide(sequence)
+    sides = np.stack([scene.positions_nm, with_phi_turned(scene)]).repeat(EACH, axis=0)
+    sides = sides + 0.002 * np.random.default_rng(0).normal(size=sides.shape)
+    return TrainingFrames(scene, quantise(canonicalise(sides, scene)), np.array([0, EACH, 2 * EACH]), 1.0, True, {}, ())
+
+
+def _subject(frames: TrainingFrames, config: PeptideConfig) -> PeptideSubject:
+    weights = np.repeat([1.0 - SHARE, SHARE], EACH) * 2.0
+    return PeptideSubject(frames, chain_features(frames.scene, config), weights)
+
+
+def test_as_many_frames_enter_as_leave() -> None:
+    sets = [_frames(f"ACE-{name}-NME") for name in ("ALA", "SER", "ALA-SER", "SER-ALA")]
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), sets)
+    subjects = [_subject(frames, config) for frames in sets]
+    torch.manual_seed(0)
+    model = PeptideSlide(config).requires_grad_(False)
+    model.jumps.of_change[0, :, 0, 0, 1] = torch.randn(len(model.token_mean))
+    model.jumps.beside_change[:, :, 0, 0, 1] = 0.1 * torch.randn(2, len(model.token_mean))
+    model.jumps.logits.weight.normal_(std=0.05)
+    before = [row.lacking for subject in subjects for row in imbalances(model, subject)]
+    assert len(before) == 6 and max(map(abs, before)) > 2.0
+    leaving = model.jumps.of_change[:, :, :, 1].clone()
+    balance_entries(model, subjects)
+    after = [row.lacking for subject in subjects for row in imbalances(model, subject)]
+    assert max(map(abs, after)) < 0.35
+    assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the odds of leaving are what they were"
+
+
+def test_how_likely_the_rare_side_is_sets_the_odds() -> None:
+    frames = _frames("ACE-ALA-NME")
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
+    subject = _subject(frames, config)
+    model = PeptideSlide(config).requires_grad_(False)
+    (row,) = imbalances(model, subject)
+    # Odds are the same from either side at first.
+    assert row.lacking == pytest.approx(np.log(SHARE / (1.0 - SHARE)), abs=1e-3)
+    assert (config.types[row.residue - 2], config.types[row.before - 2], config.types[row.after - 2]) == (
+        "ALA", "ACE", "NME",
+    )  # fmt: skip
+
+
+def test_a_side_without_frames_or_weights_says_nothing() -> None:
+    frames = _frames("ACE-ALA-NME")
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
+    model = PeptideSlide(config).requires_grad_(False)
+    one_sided = PeptideSubject(frames, chain_features(frames.scene, config), np.repeat([2.0, 0.0], EACH))
+    alone = PeptideSubject(frames, chain_features(frames.scene, config))
+    assert imbalances(model, one_sided) == [] and imbalances(model, alone) == []
+    kept = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    balance_entries(model, [one_sided, alone])
+    assert all(torch.equal(tensor, kept[name]) for name, tensor in model.state_dict().items())
