@@ -9,35 +9,44 @@ residue's type and of its neighbours', to where this holds in the mean over the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from surrogate.models.peptides.chains import dihedral
+from surrogate.models.peptides.chains import ChainFeatures, dihedral
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, times_apart
 
 # Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
-_FRAMES, _SEED = 3000, 0
+_FRAMES, _SEED = 1000, 0
 _TIMES_PS = (3.0, 10.0, 30.0, 100.0)
 # Of a side that fewer frames show, nothing is said.
 _LEAST_FRAMES = 50
-_PASSES = 3
-# Holds levels that few peptides tell near zero.
-_RIDGE = 0.3
+_PASSES = 4
+# Holds levels that few peptides tell near zero, and what one phi may ask for within bounds.
+_RIDGE, _MOST = 0.3, 3.0
 
 
-class Imbalance(NamedTuple):
-    """Of one phi of one peptide: numbers of its residue's type and its neighbours', and the logarithm of by how much
-    the odds of entering phi > 0 are too low."""
+@dataclass(frozen=True, eq=False)
+class Phi:
+    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `known` (n,
+    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
+    other."""
 
+    chain: ChainFeatures
     residue: int
-    before: int
-    after: int
-    lacking: float
+    known: tuple[Tensor, Tensor]
+    states: tuple[Tensor, Tensor]
+    positive: float
+
+    @property
+    def places(self) -> list[int]:
+        """The numbers of its residue's type, of the one's before and of the one's after."""
+        return [int(k) for k in self.chain.places[self.residue]]
 
 
 @torch.no_grad()
@@ -45,35 +54,43 @@ def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> 
     """Move the odds of entering phi > 0 of `model` to where detailed balance holds in the mean over `subjects`, whose
     weights say how likely phi > 0 is; those without weights play no part."""
     n_types = len(model.token_mean)
+    phis = [phi for subject in subjects for phi in told_phis(model, subject)]
+    if not phis:
+        return
+    told = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
+    for k, phi in enumerate(phis):
+        for which, place in enumerate(phi.places):
+            told[k, which * n_types + place] = 1.0
+    held = told.T @ told + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
     for _ in range(_PASSES):
-        rows = [row for subject in subjects for row in imbalances(model, subject)]
-        if not rows:
-            return
-        told = torch.zeros(len(rows), 3 * n_types, dtype=torch.float64)
-        for k, row in enumerate(rows):
-            told[k, [row.residue, n_types + row.before, 2 * n_types + row.after]] = 1.0
-        lacking = torch.tensor([row.lacking for row in rows], dtype=torch.float64)
-        levels = torch.linalg.solve(
-            told.T @ told + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64), told.T @ lacking
-        )
+        lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
+        levels = torch.linalg.solve(held, told.T @ lacking.clamp(-_MOST, _MOST))
         model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
 
 
-def imbalances(model: PeptideSlide, subject: PeptideSubject) -> list[Imbalance]:
-    """Return how far each phi of a peptide is from balance, as far as its frames show both of its sides."""
+def told_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
+    """Return each phi of a peptide of which frames show both sides and weights tell how likely they are; before a
+    proline that is not known well enough."""
     if subject.weights is None:
         return []
     chain, found = subject.chain, []
-    places = chain.places.tolist()
+    types = (*chain.code.layout.types, "")
     for residue in chain.signed.tolist():
+        if types[residue + 1] == "PRO":
+            continue
         sides = [_side(subject, residue, state) for state in (0, 1)]
         if min(len(idx) for idx, _ in sides) < _LEAST_FRAMES:
             continue
-        enter, leave = (_log_odds(model, subject, residue, idx, state) for state, (idx, _) in enumerate(sides))
-        balance = torch.log(torch.tensor(sides[1][1] / sides[0][1]))
-        kind, before, after = places[residue]
-        found.append(Imbalance(kind, before, after, float((leave + balance - enter).mean())))
+        (known, states), (known_positive, states_positive) = (subject.seen(model, idx) for idx, _ in sides)
+        both, all_states = (known, known_positive), (states, states_positive)
+        found.append(Phi(chain, residue, both, all_states, sides[1][1] / sides[0][1]))
     return found
+
+
+def lacking_entries(model: PeptideSlide, phi: Phi) -> float:
+    """Return the logarithm of how many times too low the odds of entering phi > 0 are, in the mean over times."""
+    enter, leave = (_log_odds(model, phi, state) for state in (0, 1))
+    return float((leave - enter).mean()) + math.log(phi.positive)
 
 
 def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, float]:
@@ -95,17 +112,16 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     return drawn[(phi > low) & (phi < high)], total
 
 
-def _log_odds(model: PeptideSlide, subject: PeptideSubject, residue: int, idx: Tensor, state: int) -> Tensor:
-    """Return the logarithm of how likely phi is on the other side `_TIMES_PS` after frames `idx` (n,), of their
-    mean."""
-    chain = subject.chain
-    known, now = subject.seen(model, idx)
+def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
+    """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
+    later."""
+    known, now, chain = phi.known[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
     common = model.jumps.of_known(known, now, chain.places, counts)
     for time_ps in _TIMES_PS:
-        times = torch.full((len(idx), 1), time_ps, device=known.device)
+        times = torch.full((len(known), 1), time_ps, device=known.device)
         apart = times_apart(times, model.config.forgotten_ps)
         h, logs = model.jumps.of_frames(common, before, before, times, apart, counts)
         logits = model.jumps.odds(0, h, logs, before, torch.zeros_like(before), chain.places, counts)
-        found.append(logits.softmax(-1)[:, 0, residue, 1 - state].double().mean().log())
+        found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)

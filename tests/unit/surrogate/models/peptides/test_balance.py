@@ -9,7 +9,7 @@ import torch
 from small_scenes import with_phi_turned
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.models.peptides.balance import balance_entries, imbalances
+from surrogate.models.peptides.balance import balance_entries, lacking_entries, told_phis
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import with_scale
@@ -41,11 +41,11 @@ def test_as_many_frames_enter_as_leave() -> None:
     model.jumps.of_change[0, :, 0, 0, 1] = torch.randn(len(model.token_mean))
     model.jumps.beside_change[:, :, 0, 0, 1] = 0.1 * torch.randn(2, len(model.token_mean))
     model.jumps.logits.weight.normal_(std=0.05)
-    before = [row.lacking for subject in subjects for row in imbalances(model, subject)]
+    before = [lacking_entries(model, phi) for subject in subjects for phi in told_phis(model, subject)]
     assert len(before) == 6 and max(map(abs, before)) > 2.0
     leaving = model.jumps.of_change[:, :, :, 1].clone()
     balance_entries(model, subjects)
-    after = [row.lacking for subject in subjects for row in imbalances(model, subject)]
+    after = [lacking_entries(model, phi) for subject in subjects for phi in told_phis(model, subject)]
     assert max(map(abs, after)) < 0.35
     assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the odds of leaving are what they were"
 
@@ -55,12 +55,17 @@ def test_how_likely_the_rare_side_is_sets_the_odds() -> None:
     config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
     subject = _subject(frames, config)
     model = PeptideSlide(config).requires_grad_(False)
-    (row,) = imbalances(model, subject)
+    (phi,) = told_phis(model, subject)
     # Odds are the same from either side at first.
-    assert row.lacking == pytest.approx(np.log(SHARE / (1.0 - SHARE)), abs=1e-3)
-    assert (config.types[row.residue - 2], config.types[row.before - 2], config.types[row.after - 2]) == (
-        "ALA", "ACE", "NME",
-    )  # fmt: skip
+    assert lacking_entries(model, phi) == pytest.approx(np.log(SHARE / (1.0 - SHARE)), abs=1e-3)
+    assert [config.types[place - 2] for place in phi.places] == ["ALA", "ACE", "NME"]
+
+
+def test_before_a_proline_nothing_is_said() -> None:
+    frames = _frames("ACE-ALA-PRO-ALA-NME")
+    config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
+    phis = told_phis(PeptideSlide(config).requires_grad_(False), _subject(frames, config))
+    assert [phi.residue for phi in phis] == [3]
 
 
 def test_a_side_without_frames_or_weights_says_nothing() -> None:
@@ -69,7 +74,7 @@ def test_a_side_without_frames_or_weights_says_nothing() -> None:
     model = PeptideSlide(config).requires_grad_(False)
     one_sided = PeptideSubject(frames, chain_features(frames.scene, config), np.repeat([2.0, 0.0], EACH))
     alone = PeptideSubject(frames, chain_features(frames.scene, config))
-    assert imbalances(model, one_sided) == [] and imbalances(model, alone) == []
+    assert told_phis(model, one_sided) == [] and told_phis(model, alone) == []
     kept = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     balance_entries(model, [one_sided, alone])
     assert all(torch.equal(tensor, kept[name]) for name, tensor in model.state_dict().items())
