@@ -46,11 +46,16 @@ class Truth:
         return min(self.reference.total_ps, self.replicate.total_ps)
 
 
-def read_truth(scene: Scene, reference: Sequence[Path], replicate: Sequence[Path]) -> Truth:
-    """Measure two held-out runs of `scene`, atoms in its order. Raises InputError for a scene without φ and ψ."""
+def read_truth(
+    scene: Scene, reference: Sequence[Path], replicate: Sequence[Path], lag_ps: float | None = None
+) -> Truth:
+    """Measure two held-out runs of `scene`, atoms in its order, frames `lag_ps` apart or all. Raises InputError for a
+    scene without φ and ψ."""
     if not backbone(scene).residues:
         raise InputError(f"{scene.name} has no residue with φ and ψ, by whose map errors are measured here.")
     first, second = (load_ensemble(paths, template=scene) for paths in (reference, replicate))
+    if lag_ps is not None:
+        first, second = (run.strided(max(1, round(lag_ps / run.lag_ps))) for run in (first, second))
     yardstick = Yardstick.of(first, probing=False)
     return Truth(scene, yardstick, yardstick.measure(first), yardstick.measure(second))
 

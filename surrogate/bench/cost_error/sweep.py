@@ -36,10 +36,12 @@ from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.domain import fit_weights
 from surrogate.verbs.options import Trajectories
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError, StorageError, SurromdError
 from systems.options import part_of
+from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -84,30 +86,40 @@ def run_cost_error(
     """
     weights = [one for one, _ in chosen]
     prints = [refuse_trained_on(w, reference, replicate) for w in weights]
-    if len({w.domain.scene.topology_hash for w in weights}) != 1:
+    fitted = [_fitted(w, reference, config.lag_ps) for w in weights]
+    if len({w.domain.scene.topology_hash for w in fitted}) != 1:
         raise InputError("weights of several scenes cannot be measured by one reference; run them one by one.")
     header = {"references": prints[0], "config": asdict(config)}
     result = _earlier(folder, header)
-    scene = weights[0].domain.scene
+    scene = fitted[0].domain.scene
     report("reading the references")
-    truth = read_truth(scene, reference, replicate)
+    truth = read_truth(scene, reference, replicate, config.lag_ps)
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with _threads(config.threads):
             if "slowest" not in result.get("md", {}):  # an earlier version's did not say
                 report("OpenMM")
-                result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(weights[0], config)}
-            for one, settings in chosen:
+                result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
+            for (one, settings), as_rolled in zip(chosen, fitted, strict=True):
                 for setting in settings:
                     if not any(row["weights_hash"] == one.hash and _is(row, setting) for row in result["rows"]):
                         report(f"{one.path.stem}: {setting.label}")
-                        row = measure_setting(one, setting, truth, config, result["md"].get("slowest"))
+                        row = measure_setting(as_rolled, setting, truth, config, result["md"].get("slowest"))
                         result["rows"].append(row | _earned(row, one, result["md"]))
                         write_cost_error(result, folder)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{folder} keeps the settings that were finished; the same command goes on") from None
     write_cost_error(result, folder)
     return result
+
+
+def _fitted(weights: Weights, reference: Sequence[Path], lag_ps: float | None) -> Weights:
+    """Return weights as they roll the molecule of the references at one lag, where they know several of either."""
+    if lag_ps is None and not weights.domain.transferable:
+        return weights
+    with open_trajectory(reference[0]) as reader:
+        scene = reader.scene
+    return fit_weights(scene or weights.domain.scene, weights, lag_ps=lag_ps or weights.domain.lag_ps)[0]
 
 
 def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[str, Any]:

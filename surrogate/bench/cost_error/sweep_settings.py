@@ -47,12 +47,13 @@ class CostErrorConfig:
     settle_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
     rounds: int = option("Parts, by turns with OpenMM.", 4, within=(1, None))
     slice_ps: float = option("Of MD before each part.", 40.0, words=None)
+    lag_ps: float | None = option("Between frames, of weights that know several lags.", None, unset="the shortest")
     threads: int = option("Of both.", 1, within=(1, None), words=None)
     seed: int = option("Of every random number.", 0, within=(0, None))
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0:
+        if self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0 or (self.lag_ps or 1.0) <= 0:
             raise InputError("times must be positive.")
 
 

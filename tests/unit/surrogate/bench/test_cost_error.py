@@ -20,6 +20,7 @@ from surrogate.bench.cost_error.sweep import run_cost_error
 from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, Sweep, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.cli import main
+from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
 from systems.scene import Scene
@@ -185,6 +186,31 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
     for row in torn["rows"]:
         row |= {"valid_half_angstrom_%": {"value": 50.0}} if "jsd" in row else {}
     assert not crossings(torn)
+
+
+def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
+    tmp_path: Path, truth: Truth, alanine_dipeptide: Scene
+) -> None:
+    held = [
+        write(
+            tmp_path / f"h{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k), seed=50 + k, timestep_ps=0.004
+        )
+        for k in range(2)
+    ]
+    peptides = load_weights(weights_path("peptides"))
+    chosen, told = [(peptides, [Setting("gaussian", 2, "fp32")])], Setting("gaussian", 2, "fp32").label
+    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
+    lines: list[str] = []
+    found = run_cost_error(chosen, held[:1], held[1:], tmp_path / "a", config, report=lines.append)
+    assert lines[-1] == f"peptides: {told}"
+    (row,) = found["rows"]
+    assert row["ns"] >= 5.0, "a chunk of 32 replicas has 16 frames 10 ps apart"
+    of_neighbours = judge_truth(truth)["correlation"][0]["value"]
+    assert found["md"]["correlation"][0]["value"] < of_neighbours - 0.1, "cos psi 10 ps later, not 1 ps"
+    source_ns = 1e-3 * sum(source["n_frames"] for source in peptides.provenance["sources"])
+    assert row["before"]["reference_ns"] >= source_ns > 4000.0, "training saw frames 1 ps apart"
+    with pytest.raises(InputError, match="lags of 1 ps to 1 ns"):
+        run_cost_error(chosen, held[:1], held[1:], tmp_path / "b", replace(config, lag_ps=5000.0))
 
 
 def test_the_verb_says_in_one_line_what_it_cannot_use(
