@@ -115,11 +115,14 @@ def run_cost_error(
 
 def _fitted(weights: Weights, reference: Sequence[Path], lag_ps: float | None) -> Weights:
     """Return weights as they roll the molecule of the references at one lag, where they know several of either."""
-    if lag_ps is None and not weights.domain.transferable:
+    knows_lags = weights.domain.longest_lag_ps > weights.domain.lag_ps
+    if not (weights.domain.transferable or (knows_lags and lag_ps)):
         return weights
     with open_trajectory(reference[0]) as reader:
         scene = reader.scene
-    return fit_weights(scene or weights.domain.scene, weights, lag_ps=lag_ps or weights.domain.lag_ps)[0]
+    return fit_weights(
+        scene or weights.domain.scene, weights, lag_ps=(lag_ps or weights.domain.lag_ps) if knows_lags else None
+    )[0]
 
 
 def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[str, Any]:
@@ -166,8 +169,9 @@ def measure_setting(
     row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
     if only_timed:
         return row | {"timed_only": True}
+    every = max(1, round(truth.reference.lag_ps / weights.domain.lag_ps))
     errors, worth = judge_frames(
-        frames, truth, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
+        frames[:, every - 1 :: every], truth, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
     )
     spent = ns * row["cpu_s_per_ns"]["mean"]
     return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["mean"])

@@ -47,7 +47,9 @@ class CostErrorConfig:
     settle_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
     rounds: int = option("Parts, by turns with OpenMM.", 4, within=(1, None))
     slice_ps: float = option("Of MD before each part.", 40.0, words=None)
-    lag_ps: float | None = option("Between frames, of weights that know several lags.", None, unset="the shortest")
+    lag_ps: float | None = option(
+        "Between the frames compared; weights that know lags roll so.", None, unset="as in the references"
+    )
     threads: int = option("Of both.", 1, within=(1, None), words=None)
     seed: int = option("Of every random number.", 0, within=(0, None))
 

@@ -189,9 +189,9 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
 
 
 def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
-    tmp_path: Path, truth: Truth, alanine_dipeptide: Scene
+    tmp_path: Path, truth: Truth, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
 ) -> None:
-    held = [
+    runs = [
         write(
             tmp_path / f"h{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k), seed=50 + k, timestep_ps=0.004
         )
@@ -201,16 +201,21 @@ def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
     chosen, told = [(peptides, [Setting("gaussian", 2, "fp32")])], Setting("gaussian", 2, "fp32").label
     config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
     lines: list[str] = []
-    found = run_cost_error(chosen, held[:1], held[1:], tmp_path / "a", config, report=lines.append)
+    found = run_cost_error(chosen, runs[:1], runs[1:], tmp_path / "a", config, report=lines.append)
     assert lines[-1] == f"peptides: {told}"
     (row,) = found["rows"]
+    assert row["curve"][-1][0] == pytest.approx(1e3 * row["ns"])
     assert row["ns"] >= 5.0, "a chunk of 32 replicas has 16 frames 10 ps apart"
     of_neighbours = judge_truth(truth)["correlation"][0]["value"]
     assert found["md"]["correlation"][0]["value"] < of_neighbours - 0.1, "cos psi 10 ps later, not 1 ps"
     source_ns = 1e-3 * sum(source["n_frames"] for source in peptides.provenance["sources"])
     assert row["before"]["reference_ns"] >= source_ns > 4000.0, "training saw frames 1 ps apart"
     with pytest.raises(InputError, match="lags of 1 ps to 1 ns"):
-        run_cost_error(chosen, held[:1], held[1:], tmp_path / "b", replace(config, lag_ps=5000.0))
+        run_cost_error(chosen, runs[:1], runs[1:], tmp_path / "b", replace(config, lag_ps=5000.0))
+    # Others roll as they do, and every tenth of their frames is compared.
+    chosen = [(weights, [Setting("fitted", 2, "fp32")])]
+    (row,) = run_cost_error(chosen, held[:1], held[1:], tmp_path / "c", config)["rows"]
+    assert row["curve"][-1][0] == pytest.approx(1e3 * row["ns"], rel=0.2) and row["ns"] < 2.0
 
 
 def test_the_verb_says_in_one_line_what_it_cannot_use(

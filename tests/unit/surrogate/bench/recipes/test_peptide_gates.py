@@ -10,6 +10,7 @@ import pytest
 
 from surrogate.bench.recipes import peptide_gates
 from surrogate.bench.recipes.peptide_rollouts import free_energy
+from surrogate.data.weights import load_weights
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_writer
@@ -106,6 +107,13 @@ def test_the_pairs_gate_rolls_unseen_molecules_and_sets_them_beside_md_and_the_l
     arguments = ["pairs", str(tmp_path / "out"), "--train", str(runs), "--test", str(test), "--steps", "2"]
     with pytest.raises(InputError, match="1 pairs, 2 are asked for"):
         peptide_gates.main([*arguments, "--pairs", "2"])
+    with pytest.raises(InputError, match="0 chains, 1 are asked for"):
+        peptide_gates.main([*arguments, "--pairs", "1", "--chains", "1"])
+    chain = next(p.residues for p in peptide_gates.training_peptides() if len(p.residues) > 2)
+    write(runs / "-".join(chain) / "run_000.h5", "-".join(("ACE", *chain, "NME")), 900, 3)
+    peptide_gates.main([*arguments, "--pairs", "1", "--chains", "1"])
+    longest = load_weights(tmp_path / "out" / "pairs-1-chains-1.safetensors").domain.members[-1].scene
+    assert set(chain) < set(longest.residue_names)
     peptide_gates.main([*arguments, "--pairs", "1"])
     rows = json.loads((tmp_path / "out" / "pairs.json").read_text())
     assert [r["source"] for r in rows] == ["MD", "model", "library"]
