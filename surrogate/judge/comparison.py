@@ -82,8 +82,8 @@ class Judgement:
 
     `compared_ps` and `n_frames` are the equal length of all three; `block_ps` and `n_blocks` (of the reference) stand
     behind the error bars; `correlation_ps` is the integrated autocorrelation time of the slowest motion in reference
-    and replicate, which makes of the equal length `effective_samples` independent samples; `speed_ratio` is simulated
-    time per wall second over the reference's.
+    and replicate; `effective_samples` are the independent ones that the equal length holds of the slowest motion of any
+    of the three; `speed_ratio` is simulated time per wall second over the reference's.
     `worth` says by each measure how much MD the whole candidate is worth, and `worth_words` says it in a sentence
     (empty where it cannot be told, or frames are broken).
     """
@@ -269,7 +269,8 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
     seams, without_seams = relaxation_rows.boundary_row(trio)
     rooms = [room(trio) for room in ROOMS]
     more = [row for found, _, _ in rooms for row in found]
-    samples = effective_samples(round(trio.compared_ps / trio.reference.features.lag_ps), correlation)
+    n_compared = round(trio.compared_ps / trio.reference.features.lag_ps)
+    samples = effective_samples(n_compared, correlation)
     every = by_group([*rows, *kinetic, *slowest, *seams, *more])
     if samples < remarks.LEAST_FOR_TESTS:
         every = verdict.untested(every)
@@ -296,7 +297,7 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
         block_ps=truth.blocks.n_frames_each * truth.features.lag_ps,
         n_blocks=truth.blocks.n_blocks,
         correlation_ps=correlation * truth.features.lag_ps,
-        effective_samples=samples,
+        effective_samples=effective_samples(n_compared, max(correlation, own)),
         speed_ratio=speed_ratio(account, setting.account),
         faults=(
             faults_of(trio.reference, setting.geometry),

@@ -102,9 +102,11 @@ def told_states(states: Tensor, counts: Tensor) -> Tensor:
 class StateJumps(nn.Module):
     """The odds that torsions change their states between a frame and the next.
 
-    They follow from the given frame and its states (of the residue and its two neighbours), the residue's type, the
-    states of the frame before and of the one before that, the new states of the residue's torsions before this one
-    (side chains turn two torsions at once), how long after the given frame it is and how far apart the frames are.
+    They follow from the residue's type, its numbers in the given frame, its states and its two neighbours' in that and
+    in the frame before, its own in the one before that, the new states of its torsions before this one (side chains
+    turn two torsions at once), how long after the given frame it is and how far apart the frames are. Of what a
+    neighbour is only levels are learned, which add up: with numbers or types of neighbours the network would know each
+    pair of training by itself.
     """
 
     waves: Tensor
@@ -112,10 +114,11 @@ class StateJumps(nn.Module):
     def __init__(self, n_slots: int, n_types: int) -> None:
         super().__init__()
         n_states = MOST_TORSIONS * MOST_STATES
-        self.of_residue = nn.ModuleList(nn.Linear(n_slots + n_states, _WIDTH, bias=False) for _ in range(3))
+        self.of_numbers = nn.Linear(n_slots, _WIDTH, bias=False)
+        self.of_given = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
         self.of_before = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(3))
         self.of_earlier = nn.Linear(n_states, _WIDTH, bias=False)
-        self.of_type = nn.ModuleList(nn.Embedding(n_types, _WIDTH) for _ in range(3))
+        self.of_type = nn.Embedding(n_types, _WIDTH)
         self.register_buffer("waves", math.pi * torch.linspace(0.25, 2.0, _WAVES), persistent=False)
         self.of_times = nn.Linear(4 * _WAVES + 2, _WIDTH)
         self.of_new = nn.ModuleList(nn.Linear(n_states, _WIDTH, bias=False) for _ in range(MOST_TORSIONS))
@@ -132,9 +135,9 @@ class StateJumps(nn.Module):
     def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
         """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
         `places` (r, 3) -> (b, r, width)."""
-        told = torch.cat([known.float(), told_states(states, counts)], dim=-1)
-        h = sum((of(x) for of, x in zip(self.of_residue, _beside(told), strict=True)), torch.zeros(()))
-        return h + sum((of(places[:, k]) for k, of in enumerate(self.of_type)), torch.zeros(()))
+        beside = _beside(told_states(states, counts))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
+        return h + self.of_type(places[:, 0])
 
     def of_frames(
         self, known: Tensor, before: Tensor, earlier: Tensor, times_ps: Tensor, apart_ps: Tensor, counts: Tensor

@@ -64,6 +64,7 @@ def test_an_unvisited_state_is_undecided_not_fine(simulate: Callable[..., Ensemb
     judgement = compare(simulate(11, 120), [simulate(12, 120)], simulate(13, 120)).judgements[0]
     assert judgement.row("population").verdict == "undecided"
     assert judgement.status == "undecided" and "too few to judge by" in judgement.verdict
+    assert f"makes {judgement.effective_samples:.2g} independent samples" in judgement.verdict
     assert not judgement.worth_words
 
 

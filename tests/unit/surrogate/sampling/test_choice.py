@@ -55,6 +55,6 @@ def test_only_weights_that_cover_the_scene_are_loaded(monkeypatch: pytest.Monkey
 
 
 def test_the_nearest_weights_are_those_that_could_be_forced() -> None:
-    """Three residues are more than these weights saw, which `force` allows; others lack elements, which it does not."""
-    with pytest.raises(OutOfDomainError, match=r"The nearest: peptides.safetensors does not cover .* 3 amino acids"):
-        choose_weights(prepare("sequence:ACE-LEU-SER-ALA-NME"))
+    """Five residues are more than these weights saw, which `force` allows; others lack elements, which it does not."""
+    with pytest.raises(OutOfDomainError, match=r"The nearest: peptides.safetensors does not cover .* 5 amino acids"):
+        choose_weights(prepare("sequence:ACE-LEU-SER-ALA-GLY-VAL-NME"))
