@@ -228,7 +228,7 @@ class PeptideSlide(Surrogate):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     solvers = ("gaussian", *flow.solvers_for("linear"))
-    usual_steps: ClassVar[int] = 4
+    usual_steps: ClassVar[int] = 6
     float32_layers: tuple[str, ...] = ("flow.of_time",)
     config: PeptideConfig
     token_mean: Tensor
