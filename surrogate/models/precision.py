@@ -2,12 +2,14 @@
 
 Processors are of two kinds. With AMX or avx512_bf16 products in bf16 take a quarter to a fifteenth of the time, without
 them (or where ONEDNN_MAX_CPU_ISA forbids them) 1.3 to 7 times as long. No other work on the machine moves one across
-the limit between, so that a seed keeps its meaning on a machine.
+the limit between, so that a seed keeps its meaning on a machine. And on how many cores it multiplies (`torch_threads`).
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
@@ -109,3 +111,14 @@ def bf16_unit() -> str:
         if asked is not None and asked():
             return name
     return ""
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Inside, torch computes on `number` cores; afterwards on as many as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,7 +16,7 @@ from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.models.lean import with_lean_parts
-from surrogate.models.precision import choose_precision
+from surrogate.models.precision import choose_precision, torch_threads
 from surrogate.sampling.memory import keep_freed_memory
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
@@ -27,7 +26,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.floating[Any]]
 _Model = TypeVar("_Model", bound=Surrogate)
-# Up to as many replicas one thread was faster than two on pairs of hardware threads, alone nearly twice as fast.
+# Up to as many replicas one thread was faster than two, on a pair of hardware threads: products of few rows are too
+# small to be shared.
 _ROWS_OF_ONE_THREAD = 16
 
 
@@ -124,7 +124,7 @@ class ChunkSampler:
                 if given is not None and np.isnan(given).any():
                     given = None
                 try:
-                    with _threads_for(size):
+                    with torch_threads(1 if size <= _ROWS_OF_ONE_THREAD else torch.get_num_threads()):
                         parts.append((some, self._draw(last_frames_nm[some], [seeds[k] for k in some], given)))
                 except (MemoryError, RuntimeError) as error:
                     if not _out_of_memory(error):
@@ -192,17 +192,6 @@ def with_bf16_weights(model: _Model) -> _Model:
         if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers):
             module.to(torch.bfloat16)
     return copied
-
-
-@contextmanager
-def _threads_for(rows: int) -> Iterator[None]:
-    """Few rows are drawn by one thread: products of theirs are too small to be shared, and waiting costs more."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1 if rows <= _ROWS_OF_ONE_THREAD else before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _alike(velocities: FloatArray | None, n: int) -> list[npt.NDArray[np.int64]]:

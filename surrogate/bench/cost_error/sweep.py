@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from surrogate.bench.cost_error.cost_page import write_cost_error
 from surrogate.bench.cost_error.effective_samples import effective_row, training_cost
@@ -35,6 +33,7 @@ from surrogate.bench.cost_error.sweep_settings import (
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
+from surrogate.models.precision import torch_threads
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from surrogate.verbs.options import Trajectories
@@ -96,7 +95,7 @@ def run_cost_error(
     truth = read_truth(scene, reference, replicate, config.lag_ps)
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
-        with _threads(config.threads):
+        with torch_threads(config.threads):
             if "slowest" not in result.get("md", {}):  # an earlier version's did not say
                 report("OpenMM")
                 result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
@@ -179,16 +178,6 @@ def measure_setting(
 
 def _is(row: dict[str, Any], setting: Setting) -> bool:
     return all(row.get(key) == value for key, value in asdict(setting).items())
-
-
-@contextmanager
-def _threads(number: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _earlier(folder: Path, header: dict[str, Any]) -> dict[str, Any]:

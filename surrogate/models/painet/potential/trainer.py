@@ -7,8 +7,7 @@ the potential learn from different samples; where their forces spread most, the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +23,7 @@ from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.samples import Samples
+from surrogate.models.precision import torch_threads
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
 from surrogate.training.loss_curves import read_curves
 from surrogate.training.provenance import provenance_of, training_domain
@@ -311,7 +311,8 @@ def learn_potential(
 
     place = StagePlace(state, log, torch.device("cpu"), resume)
     learner.begin(budget_s)
-    with _one_thread():
+    # Arrays are small, and the truth has use for the other cores.
+    with torch_threads(1):
         spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
     errors = learner.errors()
     domain = domain_of(truth.scene, learner.samples, moving, model_config)
@@ -322,17 +323,6 @@ def learn_potential(
     save_weights(out, model.eval(), domain, provenance_of(origin, settings))
     state.unlink(missing_ok=True)
     return out
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Inside, torch computes on one core: its arrays are small, and the truth has use for the others."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _line(learner: Learner) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -18,9 +20,9 @@ def test_few_rows_take_one_thread(
     seen: list[int] = []
     draw = ChunkSampler._draw
 
-    def counted(self: ChunkSampler, *told: object) -> object:
+    def counted(self: ChunkSampler, *told: Any) -> Any:
         seen.append(torch.get_num_threads())
-        return draw(self, *told)  # type: ignore[arg-type]
+        return draw(self, *told)
 
     monkeypatch.setattr(ChunkSampler, "_draw", counted)
     before = torch.get_num_threads()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -307,8 +309,8 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     model.token_mean.copy_(_middles(model, chain))
     seen: list[int] = []
 
-    def settled(tokens: torch.Tensor, *told: object) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        frames, astray, crowded = settle(tokens, *told)  # type: ignore[arg-type]
+    def settled(tokens: torch.Tensor, *told: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        frames, astray, crowded = settle(tokens, *told)
         seen.append(len(frames) // model.n_new)
         crowded[model.n_new - 1] = len(seen) < 3
         return frames, astray, crowded
