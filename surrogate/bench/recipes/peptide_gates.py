@@ -14,9 +14,9 @@ beside what the short runs and a Markov model of them say. How likely phi > 0 is
 `code`: how far frames of the molecules below `--test`, coded by residues as in training and rebuilt, lie from
 themselves: heavy atoms (RMSD, Å) and torsions (degrees). The scale of the numbers is that of the monomers in `--train`.
 
-`pairs`: trained on the monomers, the first `--pairs` capped pairs and `--chains` longer ones below `--train` (`train`
-in a folder of `peptide_runs`), the model rolls each molecule below `--test` as long and as often as MD did. Distances
-over MD's own scatter, beside the library of monomers' torsions (`peptide_scores`).
+`pairs`: trained on the monomers, the first `--pairs` capped pairs, `--chains` longer ones and `--free` with free ends
+below `--train` (`train` in a folder of `peptide_runs`), the model rolls each molecule below `--test` as long and as
+often as MD did. Distances over MD's own scatter, beside the library of monomers' torsions (`peptide_scores`).
 
 `verdicts`: what `surromd compare` says of the rollouts that `pairs` left in FOLDER (`--rollouts`, a folder of it).
 
@@ -261,6 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pairs.add_argument("--from", dest="start", type=Path, help="weights that the training goes on from")
     pairs.add_argument("--pairs", type=int, nargs="+", default=(12, 24, 60), help="how many pairs to train on")
     pairs.add_argument("--chains", type=int, default=0, help="how many chains of three and four residues, too")
+    pairs.add_argument("--free", type=int, default=0, help="how many pairs with free ends, too")
     verdicts.add_argument("--rollouts", required=True, help="folder of rollouts in FOLDER, such as pairs-60")
     energy.add_argument("--sequence", default="ACE-ALA-NME")
     energy.add_argument("--time-ps", type=float, default=50_000.0, help="of each metadynamics run")

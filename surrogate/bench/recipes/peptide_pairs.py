@@ -27,14 +27,14 @@ _VALIDATE_S = 300.0
 
 
 def train_on_pairs(
-    runs: Path, out: Path, n_pairs: int, n_chains: int = 0, *, steps: int | None, budget_s: float | None = None,
-    start: Path | None = None,
+    runs: Path, out: Path, n_pairs: int, n_chains: int = 0, n_free: int = 0, *, steps: int | None,
+    budget_s: float | None = None, start: Path | None = None,
 ) -> None:  # fmt: skip
-    """Train on all monomers below `runs` and the first `n_pairs` capped pairs and `n_chains` longer chains that are
-    there; what is there stays.
+    """Train on all monomers below `runs` and the first `n_pairs` capped pairs, `n_chains` longer chains and `n_free`
+    pairs with free ends that are there; what is there stays.
 
     `start`: weights to go on from. Free energies of phi > 0 are those in the folder of `out`. Raises InputError when
-    fewer pairs or chains have runs.
+    fewer of a kind have runs.
     """
     from surrogate.data.frames import collect_frames
     from surrogate.data.weights import load_weights
@@ -44,16 +44,17 @@ def train_on_pairs(
 
     if is_trained(out):
         return
-    found = [(p, sorted((runs / p.name).glob("run_*.h5"))) for p in training_peptides() if p.capped]
-    by_length: dict[int, list[list[Path]]] = {1: [], 2: [], 3: []}
-    for peptide, files in found:
-        if files:
-            by_length[min(3, len(peptide.residues))].append(files)
-    singles, doubles, longer = by_length.values()
-    for what, there, asked in (("pairs", doubles, n_pairs), ("chains", longer, n_chains)):
+    kinds: dict[str, list[list[Path]]] = {"monomers": [], "pairs": [], "chains": [], "pairs with free ends": []}
+    for peptide in training_peptides():
+        kind = list(kinds)[min(3, len(peptide.residues)) - 1] if peptide.capped else "pairs with free ends"
+        if files := sorted((runs / peptide.name).glob("run_*.h5")):
+            kinds[kind].append(files)
+    chosen = kinds["monomers"]
+    for (what, there), asked in zip(list(kinds.items())[1:], (n_pairs, n_chains, n_free), strict=True):
         if len(there) < asked:
             raise InputError(f"{runs} holds runs of {len(there)} {what}, {asked} are asked for; simulate more first.")
-    sets = [collect_frames(files) for files in singles + doubles[:n_pairs] + longer[:n_chains]]
+        chosen = chosen + there[:asked]
+    sets = [collect_frames(files) for files in chosen]
     training = PeptideTraining(
         steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
         validate_every_s=_VALIDATE_S,
@@ -111,11 +112,11 @@ def pairs_gate(a: argparse.Namespace) -> None:
 
     rows = []
     for n_pairs in a.pairs:
-        chains = f"-chains-{a.chains}" if a.chains else ""
-        out = a.folder / f"pairs-{n_pairs}{chains}.safetensors"
+        further = "".join(f"-{what}-{n}" for what, n in (("chains", a.chains), ("free", a.free)) if n)
+        out = a.folder / f"pairs-{n_pairs}{further}.safetensors"
         budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
         steps = a.steps if a.budget is None else None
-        train_on_pairs(a.train, out, n_pairs, a.chains, steps=steps, budget_s=budget_s, start=a.start)
+        train_on_pairs(a.train, out, n_pairs, a.chains, a.free, steps=steps, budget_s=budget_s, start=a.start)
         weights = load_weights(out)
         for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
             runs = sorted(path for path in molecule.rglob("*.h5") if not path.name.startswith("."))

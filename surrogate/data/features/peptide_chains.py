@@ -14,6 +14,7 @@ import torch
 
 from surrogate.data.poses import fitted_atoms
 from surrogate.models.peptides.chains import (
+    FREE_ENDS,
     RIGID,
     STIFF,
     TURNING,
@@ -48,8 +49,13 @@ RIGID_NM = 2e-4
 _LENGTH, _ANGLE, _DIHEDRAL = "length", "angle", "dihedral"
 # Where the first residue's atoms are placed from: caps (ACE), then amino acids.
 _ROOTS = (("CH3", "C", "O"), ("N", "CA", "C"))
+# The free ends of a chain, whose coordinates are alike whatever residue bears them. Proline's nitrogen, which is in a
+# ring, bears an end of its own, and so does lysine's, whose rotor has no states.
+_AMMONIUM, _CARBOXYLATE = FREE_ENDS
 # Glycine's phi has no higher barrier, proline's ring holds it.
 _FREE_PHI = ("GLY", "PRO")
+# Side chains with as many torsions as there are places.
+_LONGEST = ("LYS",)
 _BACKBONE = ("N", "CA", "C", "CH3")
 # Neighbours of an atom whose bonds point to the corners of a tetrahedron.
 _TETRAHEDRAL = {"C": 4, "N": 4, "O": 2, "S": 2}
@@ -76,6 +82,7 @@ class _Builder:
         self.ring = {frozenset(bond) for bond in ring_bonds(scene).tolist()}
         self.residue = scene.residue_of_atom.tolist()
         self.names = self._names()
+        self.free_end = self._free_ends()
         self.placed: list[tuple[int, int, int, int]] = []
         self.closing: list[bool] = []
         self.primary: list[int] = []
@@ -151,6 +158,20 @@ class _Builder:
                 names[atom] = name
         return names
 
+    def _free_ends(self) -> dict[int, str]:
+        """Return which atoms make up which free end."""
+        found: dict[int, str] = {}
+        for atom in range(self.scene.n_atoms):
+            beside = list(self.graph[atom])
+            hydrogens = [i for i in beside if self.scene.elements[i] == "H"]
+            oxygens = [i for i in beside if self.scene.elements[i] == "O" and self.graph.degree[i] == 1]
+            own = self.scene.residue_names[self.residue[atom]] in _LONGEST
+            if self.names[atom] == "N" and len(hydrogens) == 3 and not own:
+                found |= dict.fromkeys(hydrogens, _AMMONIUM)
+            if self.names[atom] == "C" and len(oxygens) == 2:
+                found |= dict.fromkeys(oxygens, _CARBOXYLATE)
+        return found
+
     def _rank(self, atom: int, near: int) -> tuple[bool, bool, str]:
         """Sorts what lies beyond a bond: on along the backbone first, then heavy atoms, then by name."""
         onwards = {"N": ("CA", "CH3"), "CA": ("C",), "C": ("N",)}.get(self.names[near], ())
@@ -190,7 +211,7 @@ class _Builder:
             names = [self._name(i, owner) for i in atoms]
             if what != _DIHEDRAL and names[0] > names[-1]:
                 names.reverse()
-            self.keys.append(" ".join((self.scene.residue_names[owner], what, *names)))
+            self.keys.append(" ".join((self.free_end.get(atoms[0], self.scene.residue_names[owner]), what, *names)))
 
     def _name(self, atom: int, owner: int) -> str:
         """Return an atom's name as its coordinate's residue sees it; a cap's methyl stands where a neighbour has CA."""
@@ -226,8 +247,9 @@ def _least_distances(scene: Scene) -> torch.Tensor:
 
 def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
     """Return the torsions that have states: phi, psi, and in side chains those about bonds between tetrahedral atoms or
-    from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them; and the
-    side of its plane to which a saturated ring (of proline) is puckered."""
+    from one to an aromatic ring, in the order in which they lie outwards, rotors (of methyl groups) among them; the
+    side of its plane to which a saturated ring (of proline) is puckered; and, in the last place, the rotor of a free
+    end's ammonium."""
     graph = bonded_graph(scene)
     ring = {int(i) for i in ring_bonds(scene).flatten()}
     rows: list[tuple[list[int], int, int, Kind]] = []
@@ -243,6 +265,9 @@ def stated_torsions(scene: Scene, layout: ChainLayout) -> StatedTorsions:
         elif not graph.has_edge(near, next_):
             # The pucker of a ring, on either side of its plane.
             rows.append(([atom, near, next_, last], residue, FIRST_OF_SIDE_CHAIN, RING))
+        elif names[1:] == ("N", "CA"):
+            if layout.types[residue] not in _LONGEST:
+                rows.append(([atom, near, next_, last], residue, MOST_TORSIONS - 1, THREEFOLD))
         elif names[1] not in _BACKBONE:
             tetrahedral = all(graph.degree[i] == _TETRAHEDRAL.get(scene.elements[i]) for i in (near, next_))
             slot = taken.get(residue, FIRST_OF_SIDE_CHAIN)
@@ -258,7 +283,7 @@ def chain_scale(
     """Measure stiff coordinates over frames `(n, n_atoms, 3)` nm of several peptides, each frame as much as any other.
 
     Lengths that vary by less than RIGID_NM are rigid: their deviation is 0. Residues of one type share slots. What is
-    `known` stays as it is, with as many slots; only what it lacks is added. Raises InputError where it has no room.
+    `known` stays as it is; what it lacks is added.
     """
     found: dict[str, list[npt.NDArray[np.float64]]] = {}
     turning: dict[str, None] = {}
@@ -288,18 +313,20 @@ def chain_scale(
     taken: dict[str, set[int]] = {}
     for key, slot in slots.items():
         taken.setdefault(key.split()[0], set()).update((slot,) if key in mean else (slot, slot + 1))
-    # Torsions first, so that the backbone's stand in the same places for all residues.
-    for key in (*sorted(turning, key=_backbone_first), *sorted(k for k in found if deviation[k] > 0.0)):
-        of_residue = taken.setdefault(key.split()[0], set())
-        wanted = 2 if key in turning else 1
-        slots[key] = next(k for k in itertools.count() if of_residue.isdisjoint(range(k, k + wanted)))
-        of_residue.update(range(slots[key], slots[key] + wanted))
+    # Torsions first, so that the backbone's stand in the same places for all residues; free ends last, since theirs are
+    # at the same places of all.
+    order = (*sorted(turning, key=_backbone_first), *sorted(k for k in found if deviation[k] > 0.0))
+    for key in sorted(order, key=lambda key: key.split()[0] in FREE_ENDS):
+        bearer, wanted = key.split()[0], 2 if key in turning else 1
+        if bearer in FREE_ENDS:
+            start = 1 + max((slot for some in taken.values() for slot in some), default=-1)
+        else:
+            full = taken.get(bearer, set()).union(*(taken.get(end, ()) for end in FREE_ENDS))
+            start = next(k for k in itertools.count() if full.isdisjoint(range(k, k + wanted)))
+        slots[key] = start
+        taken.setdefault(bearer, set()).update(range(start, start + wanted))
     n_slots = 1 + max((slot for some in taken.values() for slot in some), default=-1)
-    if known is not None and n_slots > known.n_slots:
-        raise InputError(
-            f"a residue has {n_slots} numbers, more than the {known.n_slots} that these weights hold; train anew."
-        )
-    return ChainScale(mean, deviation, slots, n_slots if known is None else known.n_slots)
+    return ChainScale(mean, deviation, slots, n_slots if known is None else max(n_slots, known.n_slots))
 
 
 def _backbone_first(key: str) -> tuple[int, str]:

@@ -27,6 +27,9 @@ from surrogate.models.peptides.torsion_states import StatedTorsions
 
 # A number told in standard deviations, a torsion's cosine and sine, or what never changes.
 STIFF, TURNING, RIGID = 0, 1, 2
+# What stands for a residue's type in the keys of a free end's coordinates: hydrogens on the first nitrogen, oxygens on
+# the last carbon.
+FREE_ENDS = ("NH3+", "COO-")
 _TINY = 1e-12
 # Held in memory at once.
 _MOST_DISTANCES = 4_000_000
@@ -40,8 +43,8 @@ class ChainLayout:
     whose atom is bonded to c as well as to b, and which is placed by that length instead of an angle. `primary`: for
     each row the row whose dihedral its own is counted from (itself where it stands alone). `residue_of`: of the
     coordinates, three for the root (two lengths, an angle) and three for each row (length, angle or other length,
-    dihedral), the residue they belong to; `keys`: their names, equal for residues of one type; `kinds`: STIFF, TURNING
-    or RIGID. `types`: of the residues, by name.
+    dihedral), the residue they belong to; `keys`: their names, equal for residues of one type and for free ends;
+    `kinds`: STIFF, TURNING or RIGID. `types`: of the residues, by name.
     """
 
     n_atoms: int
@@ -68,7 +71,8 @@ class ChainLayout:
 class ChainScale:
     """Mean and standard deviation of each stiff coordinate by its key, nm or rad; of a rigid one the deviation is 0.
 
-    `slots`: the place of each coordinate's number in its residue's token of `n_slots`; a torsion takes two.
+    `slots`: the place of each coordinate's number in its residue's token of `n_slots`; a torsion takes two. Those of
+    free ends are no other coordinate's in any residue.
     """
 
     mean: dict[str, float]

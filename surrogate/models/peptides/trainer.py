@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import EllipsisType
 from typing import Any, cast
 
 import numpy as np
@@ -20,7 +21,7 @@ from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.losses import TAU_MAX
 from surrogate.models.lam_slide.subjects import pick
 from surrogate.models.peptides.balance import balance_entries
-from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.chains import FREE_ENDS, ChainFeatures
 from surrogate.models.peptides.model import ENDS, PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.state_windows import StateWindows
@@ -208,23 +209,41 @@ def with_scale(config: PeptideConfig, sets: Sequence[TrainingFrames]) -> Peptide
 def _go_on_from(start: PeptideSlide, model: PeptideSlide) -> None:
     """Give `model` the weights of `start`, and for the numbers that this knows its means, scales and correlations."""
     own = {name: tensor.clone() for name, tensor in model.named_buffers()}
-    model.load_state_dict(start.state_dict())
+    known = model.state_dict()
+    with torch.no_grad():
+        for name, tensor in start.state_dict().items():
+            # Numbers that are new come after those that are known.
+            known[name][tuple(slice(n) for n in tensor.shape)] = tensor
     assert start.config.scale is not None and model.config.scale is not None
-    new = model.config.scale.slots.keys() - start.config.scale.slots.keys()
-    kinds = {name: k for k, name in enumerate((*ENDS, *model.config.types))}
-    for key in new:
-        kind, slot = kinds[key.split()[0]], model.config.scale.slots[key]
-        width = 1 if key in model.config.scale.mean else 2
+    for key in model.config.scale.slots.keys() - start.config.scale.slots.keys():
+        places = _places(model.config, key)
         for name in ("token_mean", "token_scale", "correlation"):
-            getattr(model, name)[kind, ..., slot : slot + width] = own[name][kind, ..., slot : slot + width]
+            getattr(model, name)[places] = own[name][places]
+
+
+def _places(config: PeptideConfig, key: str) -> tuple[slice, EllipsisType, slice]:
+    """Return where a coordinate's numbers stand in `(n_types, ..., n_slots)`: of its residue's type, or, where it is a
+    free end's, of all."""
+    assert config.scale is not None
+    slot, kind = config.scale.slots[key], key.split()[0]
+    types = slice(None)
+    if kind not in FREE_ENDS:
+        at = (*ENDS, *config.types).index(kind)
+        types = slice(at, at + 1)
+    return types, ..., slice(slot, slot + (1 if key in config.scale.mean else 2))
 
 
 @torch.no_grad()
 def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int) -> None:
     """Measure what centres and scales each residue type's numbers, and their correlations in time, and set them.
 
-    A torsion's cosine and sine share one scale, the root of their mean variance, and one correlation.
+    A torsion's cosine and sine share one scale, the root of their mean variance, and one correlation; a free end's
+    numbers are alike in residues of all types.
     """
+    assert model.config.scale is not None
+    slots = model.config.scale.slots
+    of_ends = [_places(model.config, key) for key in slots if key.split()[0] in FREE_ENDS]
+    of_turning = [_places(model.config, key) for key in slots if key not in model.config.scale.mean]
     rng = np.random.default_rng(seed)
     lags = model.config.lags_ps
     n_types, _, n_slots = model.token_mean.shape
@@ -237,17 +256,16 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
         own = torch.where(at < 0, 0, states.gather(-1, at.clamp(min=0).expand(len(states), -1, -1)))
         for r, kind in enumerate(subject.chain.places[:, 0].tolist()):
             for state in range(MOST_STATES):
-                inside = own[:, r] == state
+                inside = (own[:, r] == state) & subject.chain.code.filled[r]
                 for power in range(3):
                     sums[power, kind, state] += (tokens[:, r].pow(power) * inside).sum(0)
+    for _, _, place in of_ends:
+        sums[..., place] = sums[..., place].sum(1, keepdim=True)
     mean = sums[1] / sums[0].clamp(min=1)
     within = (sums[2] - sums[0] * mean.square()).clamp(min=0).sum(1)
     variance = within / sums[0].sum(1).clamp(min=1)
-    pairs = [_pairs(subject, n_slots) for subject in subjects]
-    for subject, (cosine, places) in zip(subjects, pairs, strict=True):
-        for r, slot in zip(cosine.tolist(), places.tolist(), strict=True):
-            kind = int(subject.chain.places[r, 0])
-            variance[kind, slot : slot + 2] = variance[kind, slot : slot + 2].mean()
+    for places in of_turning:
+        variance[places] = variance[places].mean(-1, keepdim=True)
     scale = variance.sqrt().clamp(min=_LEAST_SCALE)
     model.token_mean.copy_(mean)
     model.token_scale.copy_(scale)
@@ -264,13 +282,10 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
                 x, y = both[0, :, r], both[1, :, r]
                 for what, value in enumerate((x * y, x * x, y * y)):
                     products[what, kind, k] += value.sum(0)
-    for subject, (cosine, places) in zip(subjects, pairs, strict=True):
-        done: set[tuple[int, int]] = set()
-        for r, slot in zip(cosine.tolist(), places.tolist(), strict=True):
-            kind = int(subject.chain.places[r, 0])
-            if (kind, slot) not in done:
-                done.add((kind, slot))
-                products[:, kind, :, slot : slot + 2] = products[:, kind, :, slot : slot + 2].mean(-1, keepdim=True)
+    for _, _, place in of_ends:
+        products[..., place] = products[..., place].sum(1, keepdim=True)
+    for places in of_turning:
+        products[:, *places] = products[:, *places].mean(-1, keepdim=True)
     found = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-12)
     model.correlation.copy_(found.clamp(0.0, 1.0))
 
@@ -282,12 +297,6 @@ def _count_middles(sums: Tensor, subject: PeptideSubject) -> None:
         kind, at = int(subject.chain.places[residue, 0]), int(torch.nonzero(slots[residue] == slot)[0])
         for place, value in ((at, middles.deg2rad().cos()), (at + 1, middles.deg2rad().sin())):
             sums[:, kind, :, place] += torch.stack([value**power for power in range(3)]).double()
-
-
-def _pairs(subject: PeptideSubject, n_slots: int) -> tuple[Tensor, Tensor]:
-    """Return residue and first slot of each torsion's two numbers."""
-    at = subject.chain.code.turning_at
-    return at // n_slots, at % n_slots
 
 
 def peptide_loss(

@@ -9,8 +9,15 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from surrogate.data.features.peptide_chains import chain_layout, chain_scale, settled
+from surrogate.data.features.peptide_chains import (
+    chain_layout,
+    chain_scale,
+    settled,
+    stated_torsions,
+    unknown_coordinates,
+)
 from surrogate.models.peptides.chains import (
+    FREE_ENDS,
     RIGID,
     STIFF,
     TURNING,
@@ -19,6 +26,7 @@ from surrogate.models.peptides.chains import (
     ChainScale,
     internal_coordinates,
 )
+from surrogate.models.peptides.torsion_states import MOST_TORSIONS
 from systems.chemistry.validity import INVALID, check_frames, geometry_from_frames
 from systems.errors import InputError
 from systems.prepare.molecule import scene_from_smiles
@@ -108,6 +116,28 @@ def test_residues_of_one_type_share_their_coordinates_wherever_they_stand() -> N
     for name in ("LEU", "SER", "NME", "ACE"):
         assert of(first, name) == of(second, name)
     assert len(of(first, "LEU")) == 3 * 19  # each atom its three; N is the one before's, the next N its own
+
+
+def test_free_ends_are_the_same_in_all_residues_and_their_numbers_no_others(scenes: dict[str, Scene]) -> None:
+    """What a chain's ends are is learned from a few residues that bear them, for all; the rotor of the ammonium has
+    states, but no phi. Lysine's side chain leaves its ammonium no place."""
+    free, capped = build_peptide("ALA-LEU-GLY"), build_peptide("ACE-ALA-LEU-GLY-NME")
+    scale = chain_scale((chain_layout(s), shaken(s)) for s in (free, capped))
+    ends = {key: slot for key, slot in scale.slots.items() if key.split()[0] in FREE_ENDS}
+    others = {slot for key, slot in scale.slots.items() if key not in ends}
+    assert len(ends) > 10
+    assert min(ends.values()) > max(others)
+    assert len(set(ends.values())) == len(ends)
+    # Other residues at both ends, and one end beside a cap.
+    for sequence, borne in (("LEU-ALA", FREE_ENDS), ("ACE-GLY-LEU", FREE_ENDS[1:]), ("LYS-ALA", FREE_ENDS[1:])):
+        layout = chain_layout(build_peptide(sequence))
+        assert {key.split()[0] for key in layout.keys} & set(FREE_ENDS) == set(borne)
+        assert not [key for key in unknown_coordinates(layout, scale) if key.split()[0] in FREE_ENDS]
+    stated = stated_torsions(free, chain_layout(free))
+    rotor = [q for q, r, k in zip(stated.quads.tolist(), stated.residue, stated.slot, strict=True)
+             if (int(r), int(k)) == (0, MOST_TORSIONS - 1)]  # fmt: skip
+    assert [free.atom_names[i] for i in rotor[0]] == ["H", "N", "CA", "C"]
+    assert not [r for r, k in zip(stated.residue.tolist(), stated.slot.tolist(), strict=True) if (r, k) == (0, 0)]
 
 
 def test_torsions_are_told_by_cosine_and_sine_and_rings_are_not(scenes: dict[str, Scene]) -> None:

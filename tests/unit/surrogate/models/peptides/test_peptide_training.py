@@ -243,27 +243,32 @@ def test_a_training_goes_on_from_weights_with_their_scales(tmp_path: Path, frame
 def test_a_training_goes_on_with_peptides_that_have_coordinates_of_which_its_start_knew_nothing(
     tmp_path: Path, frames: TrainingFrames, config: PeptideConfig
 ) -> None:
-    """Both ends of a free chain: what is known keeps its place and its scale, what is new gets those of its frames."""
+    """Both ends of a free chain: what is known keeps its place, its scale and its weights, what is new gets those of
+    its frames, and an end that one residue bore is known of all."""
     scene = build_peptide("ALA-ALA")
     x = scene.positions_nm + 0.004 * np.random.default_rng(1).normal(size=(800, scene.n_atoms, 3))
     free = replace(frames, scene=scene, coordinates=quantise(canonicalise(x, scene)))
     assert config.scale is not None
-    roomy = replace(config, scale=replace(config.scale, n_slots=config.scale.n_slots + 20))
     still = PeptideTraining(steps=1, batch=4, learning_rate=1e-12, validate_every_s=1e9)
-    start = load_weights(train_peptides([frames], tmp_path / "a.safetensors", roomy, still))
-    found = load_weights(train_peptides([free], tmp_path / "b.safetensors", roomy, still, start=start))
+    start = load_weights(train_peptides([frames], tmp_path / "a.safetensors", config, still))
+    found = load_weights(train_peptides([free], tmp_path / "b.safetensors", config, still, start=start))
     known, more = start.model.config.scale, found.model.config.scale
     assert known.slots.items() < more.slots.items() and known.mean.items() < more.mean.items()
     chain = chain_features(scene, found.model.config)
     numbers, _ = found.model.normalised(torch.from_numpy(x.astype(np.float32)), chain)
     new = numbers[..., chain.code.filled][:, [key not in known.slots for key in _numbered(chain)]]
     assert 0.5 < float(new.square().mean()) < 2.0
+    assert more.n_slots > known.n_slots
+    for name, before in start.model.state_dict().items():
+        kept = found.model.state_dict()[name][tuple(slice(n) for n in before.shape)]
+        if name in ("token_mean", "token_scale", "correlation"):
+            slots = [slot for key, slot in known.slots.items() if key.startswith("ALA ")]
+            kept, before = kept[..., slots], before[..., slots]
+        torch.testing.assert_close(kept, before, rtol=0, atol=2e-3)
     for name in ("token_mean", "token_scale", "correlation"):
-        before, after = (weights.model.state_dict()[name] for weights in (start, found))
-        kept = [slot for key, slot in known.slots.items() if key.startswith("ALA ")]
-        torch.testing.assert_close(after[..., kept], before[..., kept], rtol=0, atol=2e-3)
-    with pytest.raises(InputError, match="more than the"):
-        train_peptides([free], tmp_path / "c.safetensors", config, still)
+        of_ends = found.model.state_dict()[name][..., known.n_slots :]
+        assert of_ends.std() > 0.0
+        torch.testing.assert_close(of_ends, of_ends[:1].expand_as(of_ends))
 
 
 def _numbered(chain: ChainFeatures) -> list[str]:
