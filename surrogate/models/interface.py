@@ -93,8 +93,6 @@ class Surrogate(nn.Module, ABC):
     float32_layers: tuple[str, ...] = ()
     # Whether bf16 pays: False where the network is small and its rounding would heat what it integrates.
     bf16_by_default: ClassVar[bool] = True
-    # Steps of its solver, where nothing else is asked for.
-    usual_steps: ClassVar[int] = 10
     # Whether a chunk ends in velocities that the next one starts from.
     carries_velocities: ClassVar[bool] = False
     # Whether its frames leap by design: a baseline without motion, in which a jump is no fault.
@@ -117,6 +115,11 @@ class Surrogate(nn.Module, ABC):
     @abstractmethod
     def n_new(self) -> int:
         """Frames one call returns."""
+
+    @property
+    def usual_steps(self) -> int:
+        """Steps of its solver, where nothing else is asked for."""
+        return 10
 
     @property
     def imposed(self) -> tuple[str, ...]:

@@ -54,7 +54,8 @@ class PeptideConfig:
     """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
-    beside a stiff one. Flow times are logit-normal, as elsewhere."""
+    beside a stiff one. `usual_steps`: of the solver in rollouts; those that the flow was taught, if it was distilled.
+    Flow times are logit-normal, as elsewhere."""
 
     width: int = 128
     n_layers: int = 6
@@ -65,6 +66,7 @@ class PeptideConfig:
     innovation: bool = True
     conditioning_noise: float = 0.03
     turning_weight: float = 4.0
+    usual_steps: int = 6
     tau_location: float = 0.5
     tau_scale: float = 1.4
     types: tuple[str, ...] = ()
@@ -228,7 +230,6 @@ class PeptideSlide(Surrogate):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     solvers = ("gaussian", *flow.solvers_for("linear"))
-    usual_steps: ClassVar[int] = 6
     float32_layers: tuple[str, ...] = ("flow.of_time",)
     config: PeptideConfig
     token_mean: Tensor
@@ -247,6 +248,11 @@ class PeptideSlide(Surrogate):
         self.register_buffer("token_mean", torch.zeros(n_types, MOST_STATES, n_slots))
         self.register_buffer("token_scale", torch.ones(n_types, n_slots))
         self.register_buffer("correlation", torch.zeros(n_types, len(config.lags_ps), n_slots))
+
+    @property
+    def usual_steps(self) -> int:
+        """See `Surrogate.usual_steps`."""
+        return self.config.usual_steps
 
     @property
     def canonical(self) -> bool:

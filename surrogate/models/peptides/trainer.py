@@ -312,7 +312,7 @@ def peptide_loss(
     c, filled = model.config, chain.code.filled
     known, later = numbers[:, 0], numbers[:, 1:]
     if noisy:
-        known = _disturbed(known, chain, c, generator)
+        known = disturbed(known, chain, c, generator)
     target = model.innovations(later, known, times_ps, chain.places[:, 0])
     draws = torch.randn(len(numbers), generator=generator) * c.tau_scale + c.tau_location
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
@@ -321,14 +321,20 @@ def peptide_loss(
     told = model.flow.told(known, times_ps, chain.places, told_states(states, chain.stated.counts))
     found = model.flow(alpha * target + sigma * noise, tau, told)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
-    error = (found - target).square() * weight
+    loss, turning, stiff = by_kind((found - target).square() * weight, chain, c)
+    return loss, {"flow": loss.detach(), "turning": turning.detach(), "stiff": stiff.detach()}
+
+
+def by_kind(error: Tensor, chain: ChainFeatures, config: PeptideConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean of squared errors `(b, t, r, slots)` in which torsions count more, that of torsions alone, and
+    that of stiff numbers."""
+    filled = chain.code.filled
     turning = torch.zeros_like(filled).flatten()
     turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
     turning = turning.reshape(filled.shape)
     of_turning, of_stiff = (error[..., which].mean() for which in (turning, filled & ~turning))
-    share = c.turning_weight * turning.sum() / (c.turning_weight * turning.sum() + (filled & ~turning).sum())
-    loss = share * of_turning + (1 - share) * of_stiff
-    return loss, {"flow": loss.detach(), "turning": of_turning.detach(), "stiff": of_stiff.detach()}
+    share = config.turning_weight * turning.sum() / (config.turning_weight * turning.sum() + (filled & ~turning).sum())
+    return share * of_turning + (1 - share) * of_stiff, of_turning, of_stiff
 
 
 def state_loss(
@@ -339,11 +345,12 @@ def state_loss(
     `states` (b, 1 + t, r, MOST_TORSIONS), `times_ps` (b, t), `share` (b, r, MOST_TORSIONS) what each change counts,
     1 where it is not given; otherwise as `peptide_loss`."""
     if noisy:
-        known = _disturbed(known, chain, model.config, generator)
+        known = disturbed(known, chain, model.config, generator)
     apart = times_apart(times_ps, model.config.forgotten_ps)
     return model.jumps.loss(known, states, chain.places, chain.stated.counts, times_ps, apart, share)
 
 
-def _disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+def disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, generator: torch.Generator) -> Tensor:
+    """Return the given frame's numbers `(b, r, slots)` with the noise that training adds."""
     noise = torch.randn(known.shape, generator=generator).to(known.device)
     return known + config.conditioning_noise * chain.code.filled * noise

@@ -19,6 +19,7 @@ from surrogate.data.weights import load_weights
 from surrogate.models.peptides import peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.choices import PeptideTrainer
+from surrogate.models.peptides.distil import distil
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import PeptideTraining, normalise, train_peptides, with_scale
@@ -290,3 +291,24 @@ def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, fra
         trainer.check(replace(request, model={"width": 64}))
     with pytest.raises(InputError, match="holds lam-slide-peptides, not lam-slide"):
         trainer.check(replace(request, arch="lam-slide"))
+
+
+def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
+    tmp_path: Path, frames: TrainingFrames
+) -> None:
+    """Nearer than its own two steps come, with the same odds of states; the weights say how many steps they take."""
+    training = PeptideTraining(steps=150, batch=32, learning_rate=3e-3, validate_every_s=1e9)
+    start = train_peptides([frames], tmp_path / "a.safetensors", SMALL, training)
+    teacher = load_weights(start)
+    apart = {}
+    for name, rate in (("still", 1e-12), ("taught", 1e-3)):
+        taught = replace(training, learning_rate=rate)
+        out = distil([frames], load_weights(start), tmp_path / f"{name}.safetensors", taught, steps=2)
+        with out.with_suffix(".csv").open() as curves:
+            apart[name] = [float(row["validation_apart"]) for row in csv.DictReader(curves)][-1]
+    assert apart["taught"] < 0.5 * apart["still"]
+    found = load_weights(out)
+    assert (teacher.model.usual_steps, found.model.usual_steps) == (6, 2)
+    for name, tensor in teacher.model.jumps.state_dict().items():
+        torch.testing.assert_close(found.model.jumps.state_dict()[name], tensor)
+    assert found.provenance["distilled_to_steps"] == 2
