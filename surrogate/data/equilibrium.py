@@ -8,6 +8,7 @@ came from, there are as many as detailed balance asks for (Wu et al., Proc. Natl
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,17 +23,23 @@ _CLUSTERED_FRAMES = 20_000
 _DIMENSIONS = 6
 # No frame counts more than so many average ones: a cell hardly visited would otherwise be drawn over and over.
 _LARGEST = 20.0
+# How often a run that begins or ends is taken to have come from any frame; a frame's odds grow with this power of its
+# place in its run.
+_JUMPS_A_RUN, _LATE = 2.0, 2
+_CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
 _SEED = 1
 
 
 def equilibrium_weights(
     runs: Sequence[FloatArray], lag_frames: int, *, states: IntArray | None = None, shares: FloatArray | None = None
 ) -> FloatArray | None:
-    """Return a weight for each frame, of mean 1, in the order of the runs.
+    """Return a weight for each frame, of mean 1, in the order of the runs. None for runs too short for the lag.
 
     `runs`: features `(n, k)` that tell slow states apart (cosines and sines of torsions), one array for each run.
-    Frames outside the largest set of cells that runs both enter and leave weigh nothing. None when no such set can be
-    found: runs too short for the lag, or no two cells.
+
+    Where hardly any run goes between two states, a Markov model would put all weight into one that by chance was
+    entered and not left. So each run is taken to begin and to end with a jump between any two frames, late frames
+    (relaxed ones) more likely: what transitions do not tell is left as the runs show it.
 
     Where runs leave a rare state and none enters it, they do not tell how rare it is. What is known otherwise (from
     metadynamics) is given by `states` (n_frames,), the state of each frame, and `shares` (n_states,), their
@@ -44,17 +51,10 @@ def equilibrium_weights(
     cells = _cells(runs, lag_frames)
     if cells is None:
         return None
-    frames = np.concatenate(cells)
-    sets = _connected(cells, lag_frames)
-    if states is None or shares is None:
-        weights = sets[0][frames] if sets and (sets[0] > 0).sum() > 1 else np.zeros(0)
-    else:
-        # Sets count by their frames; what is right between them within one state is not known.
-        within = sum((one[frames] for one in sets), np.zeros(len(frames)))
-        total = np.bincount(states, weights=within, minlength=len(shares))
-        weights = within * (shares / np.maximum(total, 1e-12))[states]
-    if not weights.any():
-        return None
+    weights = _of_cells(cells, lag_frames)[np.concatenate(cells)]
+    if states is not None and shares is not None:
+        total = np.bincount(states, weights=weights, minlength=len(shares))
+        weights = weights * (shares / np.maximum(total, 1e-12))[states]
     weights = np.minimum(weights / weights.mean(), _LARGEST)
     return np.asarray(weights / weights.mean(), dtype=np.float64)
 
@@ -79,24 +79,26 @@ def _cells(runs: Sequence[FloatArray], lag_frames: int) -> list[npt.NDArray[np.i
     return [cells.transform(x, n_jobs=1).astype(np.int32) for x in projected]
 
 
-def _connected(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> list[FloatArray]:
-    """Return of each set of cells that runs go between, the largest first, what a frame of each cell weighs; zero for
-    cells of other sets. Frames of one set weigh 1 on average."""
-    from deeptime.markov import TransitionCountEstimator
+def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatArray:
+    """Return what a frame of each cell weighs `(n_cells,)`."""
+    from deeptime.markov import TransitionCountEstimator, TransitionCountModel
     from deeptime.markov.msm import MaximumLikelihoodMSM
+    from deeptime.util.exceptions import NotConvergedWarning
 
-    counts = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding").fit(list(cells)).fetch_model()
-    n_frames = np.bincount(np.concatenate(cells), minlength=counts.n_states).astype(np.float64)
-    found = []
-    for members in counts.connected_sets(connectivity_threshold=0):
-        population = n_frames[members] / n_frames[members].sum()
-        if len(members) > 1:
-            try:
-                model = MaximumLikelihoodMSM(reversible=True).fit(counts.submodel(members)).fetch_model()
-                population = np.asarray(model.stationary_distribution)
-            except (RuntimeError, ValueError, AssertionError, np.linalg.LinAlgError):  # too few counts for a model
-                continue
-        weights = np.zeros(len(n_frames))
-        weights[members] = population * n_frames[members].sum() / np.maximum(n_frames[members], 1)
-        found.append(weights)
-    return found
+    counted = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding", sparse=False).fit(list(cells))
+    counts = np.asarray(counted.fetch_model().count_matrix, dtype=np.float64)
+    lateness = np.concatenate([(np.arange(1, len(x) + 1) / len(x)) ** _LATE for x in cells])
+    late: FloatArray = np.bincount(np.concatenate(cells), weights=lateness, minlength=len(counts))
+    # Transitions are counted once at each frame of the lag, and so are the jumps.
+    counts += _JUMPS_A_RUN * len(cells) * lag_frames * np.outer(late, late) / late.sum() ** 2
+    visited = np.flatnonzero(late > 0)
+    with warnings.catch_warnings():
+        # What is left to converge after so many iterations is nothing beside the scatter of counts.
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        model = MaximumLikelihoodMSM(reversible=True, maxerr=_CONVERGED, maxiter=_MOST_ITERATIONS).fit(
+            TransitionCountModel(counts[np.ix_(visited, visited)])
+        )
+    n_frames = np.bincount(np.concatenate(cells), minlength=len(counts))
+    weights = np.zeros(len(counts))
+    weights[visited] = model.fetch_model().stationary_distribution / n_frames[visited]
+    return weights
