@@ -88,7 +88,7 @@ def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatA
     counted = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding", sparse=False).fit(list(cells))
     counts = np.asarray(counted.fetch_model().count_matrix, dtype=np.float64)
     lateness = np.concatenate([(np.arange(1, len(x) + 1) / len(x)) ** _LATE for x in cells])
-    late: FloatArray = np.bincount(np.concatenate(cells), weights=lateness, minlength=len(counts))
+    late = np.asarray(np.bincount(np.concatenate(cells), weights=lateness, minlength=len(counts)), dtype=np.float64)
     # Transitions are counted once at each frame of the lag, and so are the jumps.
     counts += _JUMPS_A_RUN * len(cells) * lag_frames * np.outer(late, late) / late.sum() ** 2
     visited = np.flatnonzero(late > 0)
