@@ -19,7 +19,7 @@ from torch import Tensor
 from surrogate.models.peptides.chains import ChainFeatures, dihedral
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, times_apart
+from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, times_apart, told_states
 
 # Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
 _FRAMES, _SEED = 1000, 0
@@ -121,7 +121,8 @@ def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     for time_ps in _TIMES_PS:
         times = torch.full((len(known), 1), time_ps, device=known.device)
         apart = times_apart(times, model.config.forgotten_ps)
-        h, logs = model.jumps.of_frames(common, before, before, times, apart, counts)
-        logits = model.jumps.odds(0, h, logs, before, torch.zeros_like(before), chain.places, counts)
+        of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
+        h = model.jumps.of_frames(common, before, before, of_times, counts)
+        logits = model.jumps.odds(0, h, levels, before[..., 0], told_states(before, counts))
         found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)

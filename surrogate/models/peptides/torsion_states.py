@@ -139,39 +139,41 @@ class StateJumps(nn.Module):
         h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
         return h + self.of_type(places[:, 0])
 
-    def of_frames(
-        self, known: Tensor, before: Tensor, earlier: Tensor, times_ps: Tensor, apart_ps: Tensor, counts: Tensor
+    def of_times_alone(
+        self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """`known` as `of_known` returns it; states `before` each frame and `earlier`, two before, `(b, t, r,
-        MOST_TORSIONS)`; `times_ps` and `apart_ps` (b, t) after the given frame and after the one before -> (b, t, r,
-        width), and the logarithms of `apart_ps`."""
-        told = told_states(before, counts)
-        h = sum((of(x) for of, x in zip(self.of_before, _beside(told), strict=True)), torch.zeros(()))
-        h = h + self.of_earlier(told_states(earlier, counts))
+        """Return what follows from frames' `times_ps` and `apart_ps` (b, t), after the given frame and after the one
+        before: `(b, t, width)`, and the levels of the odds `(b, t, MOST_TORSIONS, r, from, to)`."""
         logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
         angles = logs[..., None] * self.waves
         waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
-        of_times = self.of_times(torch.cat([waves, logs], dim=-1))
-        return known[:, None] + h + of_times[:, :, None], logs[..., 1]
+        level, slope = (change[places[:, 0]].transpose(0, 1) for change in self.of_change)
+        for which, change in enumerate(self.beside_change):
+            level = level + _FAST * change[places[:, 1 + which]].transpose(0, 1)
+        absent = torch.arange(MOST_STATES, device=counts.device) >= counts.T[..., None, None].clamp(min=1)
+        levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
+        return self.of_times(torch.cat([waves, logs], dim=-1)), levels
 
-    def odds(
-        self, torsion: int, h: Tensor, logs: Tensor, before: Tensor, new: Tensor, places: Tensor, counts: Tensor
-    ) -> Tensor:
-        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue; `h`, `logs` are
-        what `of_frames` returns, `new` like `before` the new states, of which those of torsions before it count."""
-        told = told_states(new, counts)
-        told[..., torsion * MOST_STATES :] = 0.0
-        h = F.silu(h + self.of_new[torsion](told) + self.of_torsion.weight[torsion])
-        now = before[..., torsion]
-        level, slope = self.of_change[:, places[:, 0], torsion]  # (r, from, to)
-        row = torch.arange(len(places), device=now.device)
-        found = self.logits(F.silu(self.hidden(h))) + level[row, now] + slope[row, now] * logs[..., None, None]
-        for which in range(2):
-            found = found + _FAST * self.beside_change[which, places[:, 1 + which], torsion][row, now]
+    def of_frames(self, known: Tensor, before: Tensor, earlier: Tensor, of_times: Tensor, counts: Tensor) -> Tensor:
+        """`known` as `of_known` returns it; states `before` each frame and `earlier`, two before, `(b, t, r,
+        MOST_TORSIONS)`; `of_times` (b, t, width) -> (b, t, r, width)."""
+        told = _beside(told_states(before, counts))
+        h: Tensor = sum((of(x) for of, x in zip(self.of_before, told, strict=True)), known[:, None])
+        return h + self.of_earlier(told_states(earlier, counts)) + of_times[:, :, None]
+
+    def odds(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, told: Tensor) -> Tensor:
+        """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
+
+        `h` is what `of_frames` returns, `levels` what `of_times_alone` does; `now` (b, t, r) the torsion's state in the
+        frame before, `told` (b, t, r, n) what `told_states` returns of the new frame, of which torsions before this one
+        count.
+        """
+        n = torsion * MOST_STATES
+        h = F.silu(h + F.linear(told[..., :n], self.of_new[torsion].weight[:, :n]) + self.of_torsion.weight[torsion])
+        at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
+        level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
-        found = found.masked_fill(F.one_hot(now, MOST_STATES).bool(), 0.0)
-        absent = torch.arange(MOST_STATES, device=now.device) >= counts[:, torsion, None].clamp(min=1)
-        return found.masked_fill(absent, -torch.inf)
+        return (self.logits(F.silu(self.hidden(h))) + level).scatter(-1, now[..., None], 0.0)
 
     @torch.no_grad()
     def raise_entries(self, of_type: Tensor, before: Tensor, after: Tensor) -> None:
@@ -192,12 +194,13 @@ class StateJumps(nn.Module):
         with torch.autocast(known.device.type, enabled=False):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
-            common = self.of_known(known, states[:, 0], places, counts)
-            h, logs = self.of_frames(common, before, earlier, times_ps, apart_ps, counts)
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            h = self.of_frames(self.of_known(known, states[:, 0], places, counts), before, earlier, of_times, counts)
+            told = told_states(new, counts)
             total = known.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
-                logits = self.odds(torsion, h, logs, before, new, places, counts)[:, :, has]
+                logits = self.odds(torsion, h, levels, before[..., torsion], told)[:, :, has]
                 chosen = new[..., has, torsion]
                 each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
                 total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
@@ -211,19 +214,21 @@ class StateJumps(nn.Module):
         (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
         with torch.autocast(known.device.type, enabled=False):
             common = self.of_known(known, states, places, counts)
+            of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
             torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
             before, earlier, found = states[:, None], states[:, None], []
             for k in range(times_ps.shape[1]):
-                h, logs = self.of_frames(
-                    common, before, earlier, times_ps[:, k : k + 1], apart_ps[:, k : k + 1], counts
-                )
+                at = slice(k, k + 1)
+                h = self.of_frames(common, before, earlier, of_times[:, at], counts)
                 new = torch.zeros_like(before)
+                told = told_states(new, torch.zeros_like(counts))
                 for torsion in torsions:
-                    share = self.odds(torsion, h, logs, before, new, places, counts).softmax(-1).cumsum(-1)
-                    at = uniform[:, k : k + 1, :, torsion, None]
+                    share = self.odds(torsion, h, levels[:, at], before[..., torsion], told).softmax(-1).cumsum(-1)
                     # Shares may end below one by rounding.
-                    drawn = (at >= share[..., :-1]).sum(-1)
+                    drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1)
                     new[..., torsion] = torch.minimum(drawn, (counts[:, torsion] - 1).clamp(min=0))
+                    one = told_states(new[..., torsion, None], counts[:, torsion, None])
+                    told[..., torsion * MOST_STATES : (torsion + 1) * MOST_STATES] = one
                 found.append(new)
                 before, earlier = new, before
             return torch.cat(found, dim=1)

@@ -166,13 +166,14 @@ def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() ->
     before = torch.zeros(1, 1, 1, MOST_TORSIONS, dtype=torch.long)
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
     common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
-    h, logs = jumps.of_frames(common, before, before, time, time, counts)
+    of_times, levels = jumps.of_times_alone(time, time, places, counts)
+    h = jumps.of_frames(common, before, before, of_times, counts)
 
     def odds(**moved: int) -> torch.Tensor:
         new = before.clone()
         for name, state in moved.items():
             new[..., int(name[1:])] = state
-        return jumps.odds(1, h, logs, before, new, places, counts)
+        return jumps.odds(1, h, levels, before[..., 1], told_states(new, counts))
 
     assert not torch.equal(odds(), odds(t0=1))
     assert torch.equal(odds(), odds(t1=2)) and torch.equal(odds(), odds(t2=1))
@@ -205,8 +206,9 @@ def test_rates_of_two_residue_types_are_learned() -> None:
     for apart_ps in (1.0, 10.0):
         time = torch.tensor([[apart_ps]])
         common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
-        h, logs = net.of_frames(common, up[:, None], up[:, None], time, time, counts)
-        odds = net.odds(0, h, logs, up[:, None], up[:, None], places, counts)[0, 0].softmax(-1)[:, 0]
+        of_times, levels = net.of_times_alone(time, time, places, counts)
+        h = net.of_frames(common, up[:, None], up[:, None], of_times, counts)
+        odds = net.odds(0, h, levels, up[:, None, :, 0], told_states(up, counts)[:, None])[0, 0].softmax(-1)[:, 0]
         np.testing.assert_allclose(odds.detach(), leaves * apart_ps, rtol=0.35)
 
 
