@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -169,7 +170,8 @@ class StateJumps(nn.Module):
         count.
         """
         n = torsion * MOST_STATES
-        h = F.silu(h + F.linear(told[..., :n], self.of_new[torsion].weight[:, :n]) + self.of_torsion.weight[torsion])
+        of_new = cast(nn.Linear, self.of_new[torsion]).weight[:, :n]
+        h = F.silu(h + F.linear(told[..., :n], of_new) + self.of_torsion.weight[torsion])
         at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
         level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
