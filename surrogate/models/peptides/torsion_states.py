@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -170,8 +169,8 @@ class StateJumps(nn.Module):
         count.
         """
         n = torsion * MOST_STATES
-        of_new = cast(nn.Linear, self.of_new[torsion]).weight[:, :n]
-        h = F.silu(h + F.linear(told[..., :n], of_new) + self.of_torsion.weight[torsion])
+        earlier = F.pad(told[..., :n], (0, told.shape[-1] - n))
+        h = F.silu(h + self.of_new[torsion](earlier) + self.of_torsion.weight[torsion])
         at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
         level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
