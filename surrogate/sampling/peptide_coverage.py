@@ -13,6 +13,7 @@ import torch
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.features.standard_peptide import standard_peptide
 from surrogate.data.poses import in_standard_pose
+from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.sampling.coverage import Deviation
 from systems.chemistry.validity import INVALID, check_frames, flag_names, geometry_from_scene
 from systems.errors import InputError
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from surrogate.data.weights import TrainingDomain
     from surrogate.models.peptides.model import PeptideConfig
     from systems.scene import Scene
+
+_CAPS = ("ACE", "NME", "NH2")
 
 
 def cover_peptide(
@@ -64,14 +67,17 @@ def cover_peptide(
 
 
 def unseen_neighbours(scene: Scene, domain: TrainingDomain) -> list[str]:
-    """Return the pairs of neighbouring residues of a standard peptide that no training peptide has, as 'LEU-SER'."""
+    """Return the pairs of neighbouring residues of a standard peptide that no training peptide has, as 'LEU-SER', or,
+    where residues bear free ends, 'NH3+-LEU'."""
     known = {pair for member in domain.members for pair in _pairs(member.scene)}
     return [f"{a}-{b}" for a, b in dict.fromkeys(_pairs(scene)) if (a, b) not in known]
 
 
 def _pairs(scene: Scene) -> list[tuple[str, str]]:
-    return list(pairwise(scene.residue_names))
+    begins, ends = FREE_ENDS
+    names = list(scene.residue_names)
+    return list(pairwise([begins] * (names[0] not in _CAPS) + names + [ends] * (names[-1] not in _CAPS)))
 
 
 def _n_amino_acids(scene: Scene) -> int:
-    return sum(name not in ("ACE", "NME", "NH2") for name in scene.residue_names)
+    return sum(name not in _CAPS for name in scene.residue_names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,10 +63,13 @@ def train_on_pairs(
     train_peptides(sets, out, PeptideConfig(), training, start=known_weights, resume=True)
 
 
-def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path) -> list[Scores]:
+def molecule_scores(
+    weights: Weights, runs: Sequence[Path], monomers: Path, folder: Path, positive_kt: Mapping[str, float]
+) -> list[Scores]:
     """Return the distances of one test molecule: MD's own, the model's, and those of the library of `monomers`.
 
-    The model rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
+    `positive_kt`: of residue types, how likely phi > 0 is, for the library, which seeded runs do not tell. The model
+    rolls as often and as long as the `runs` of MD, frames FRAMES_PS apart; its files stay in `folder`.
     """
     from surrogate.bench.recipes.peptide_scores import (
         angles,
@@ -92,7 +95,8 @@ def molecule_scores(weights: Weights, runs: Sequence[Path], monomers: Path, fold
     alone = [thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
     own = [turns_of(of) for of, _, _ in alone]
     values = [[angles(t, run) for run in x] for t, (_, x, _) in zip(own, alone, strict=True)]
-    likely = [frame_weights(x) for x in values]
+    phi = [next((k for k, turn in enumerate(t) if turn.kind == "phi"), None) for t in own]
+    likely = [frame_weights(x, k, positive_kt.get(name)) for x, k, name in zip(values, phi, names, strict=True)]
     rng = np.random.default_rng(0)
     drawn = [
         library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
@@ -117,12 +121,12 @@ def pairs_gate(a: argparse.Namespace) -> None:
         budget_s = None if a.budget is None else parse_wall_s(a.budget, "--budget")
         steps = a.steps if a.budget is None else None
         train_on_pairs(a.train, out, n_pairs, a.chains, a.free, steps=steps, budget_s=budget_s, start=a.start)
-        weights = load_weights(out)
+        weights, energies = load_weights(out), known_energies(a.folder)
         for molecule in sorted(path for path in a.test.iterdir() if path.is_dir()):
             runs = sorted(path for path in molecule.rglob("*.h5") if not path.name.startswith("."))
             if len(runs) < 2:
                 continue
-            for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name):
+            for scores in molecule_scores(weights, runs, a.train, a.folder / out.stem / molecule.name, energies):
                 rows.append({"pairs": n_pairs, "molecule": molecule.name, **asdict(scores)})
             sys.stderr.write(f"{n_pairs} pairs: {molecule.name} measured\n")
     (a.folder / "pairs.json").write_text(json.dumps(rows, indent=1))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
 from systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,13 +58,22 @@ def rolled(
     return [thinned([out], lag_ps)[1][0] for out in outs]
 
 
-def frame_weights(runs: Sequence[FloatArray]) -> FloatArray:
-    """Return how likely each frame of seeded runs, torsions `(n_frames, n)` FRAMES_PS apart, is in equilibrium."""
+def frame_weights(runs: Sequence[FloatArray], phi: int | None = None, positive_kt: float | None = None) -> FloatArray:
+    """Return how likely each frame of seeded runs, torsions `(n_frames, n)` FRAMES_PS apart, is in equilibrium.
+
+    `positive_kt`: the free energy of phi > 0, where it is known, of the torsion at place `phi`.
+    """
     from surrogate.data.equilibrium import equilibrium_weights
 
+    states = shares = None
+    if phi is not None and positive_kt is not None:
+        low, high = np.radians(POSITIVE_PHI_DEG)
+        angle = np.concatenate(runs)[:, phi]
+        states, shares = ((angle > low) & (angle < high)).astype(np.int64), np.array([1.0, np.exp(-positive_kt)])
     found = equilibrium_weights(
-        [np.concatenate([np.cos(x), np.sin(x)], axis=1) for x in runs], round(_MARKOV_LAG_PS / FRAMES_PS)
-    )
+        [np.concatenate([np.cos(x), np.sin(x)], axis=1) for x in runs], round(_MARKOV_LAG_PS / FRAMES_PS),
+        states=states, shares=shares,
+    )  # fmt: skip
     n = sum(len(x) for x in runs)
     return np.full(n, 1.0 / n) if found is None else found / found.sum()
 

@@ -26,12 +26,14 @@ def test_an_unseen_molecule_gets_weights_that_cover_it_and_is_told() -> None:
     assert "without having seen it" in why or "trained on this molecule" in why
 
 
-def test_an_unseen_peptide_gets_the_weights_of_peptides() -> None:
-    weights, why = choose_weights(prepare("sequence:ACE-LEU-SER-NME"))
+@pytest.mark.parametrize("sequence", ["ACE-LEU-SER-NME", "GLY-ALA", "ACE-TRP-ARG", "LYS-PRO-ASP-PRO"])
+def test_an_unseen_peptide_gets_the_weights_of_peptides(sequence: str) -> None:
+    """Capped or with free ends, at which most residues never stood in training, or both."""
+    weights, why = choose_weights(prepare(f"sequence:{sequence}"))
     assert weights.path.stem == "peptides" and "without having seen it" in why
 
 
-@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "sequence:GLY-ALA"])
+@pytest.mark.parametrize("scene", ["smiles:c1ccccc1", "sequence:ACE-ASH-NME"])
 def test_a_molecule_that_none_covers_is_refused_with_a_reason(scene: str) -> None:
     with pytest.raises(OutOfDomainError, match=r"no shipped weights cover .* The nearest: .*does not cover"):
         choose_weights(prepare(scene))

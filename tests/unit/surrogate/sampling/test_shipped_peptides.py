@@ -40,6 +40,12 @@ def _amber(residue: str, name: str) -> str:
     return name
 
 
+def _free(named: Callable[[str, str], str], *ends: str) -> Callable[[str, str], str]:
+    """The names that a program gives the hydrogens of ILE's ammonium and the oxygens of PHE's carboxylate."""
+    own = dict(zip([("ILE", "H"), ("ILE", "H2"), ("ILE", "H3"), ("PHE", "O"), ("PHE", "OXT")], ends, strict=True))
+    return lambda residue, name: own.get((residue, name)) or named(residue, name)
+
+
 def _pdb(scene: Scene, named: Callable[[str, str], str], *, capped_into: bool, hydrogens_last: bool) -> str:
     """`capped_into`: caps stand in their neighbours, as CHARMM has them; `hydrogens_last`: behind each residue's heavy
     atoms."""
@@ -62,13 +68,19 @@ def _pdb(scene: Scene, named: Callable[[str, str], str], *, capped_into: bool, h
 
 
 @pytest.mark.parametrize(
-    ("pair", "named", "capped_into", "hydrogens_last"),
-    [("LEU-SER", _charmm, True, False), ("VAL-ASN", _gromacs, False, True), ("PHE-GLY", _amber, False, False)],
+    ("sequence", "named", "capped_into", "hydrogens_last"),
+    [
+        ("ACE-LEU-SER-NME", _charmm, True, False),
+        ("ACE-VAL-ASN-NME", _gromacs, False, True),
+        ("ACE-PHE-GLY-NME", _amber, False, False),
+        ("ILE-VAL-PHE", _free(_charmm, "HT1", "HT2", "HT3", "OT1", "OT2"), False, False),
+        ("ILE-VAL-PHE", _free(_gromacs, "H1", "H2", "H3", "O1", "O2"), False, True),
+    ],
 )
 def test_files_of_other_programs_roll_without_naming_weights(
-    tmp_path: Path, pair: str, named: Callable[[str, str], str], capped_into: bool, hydrogens_last: bool
+    tmp_path: Path, sequence: str, named: Callable[[str, str], str], capped_into: bool, hydrogens_last: bool
 ) -> None:
-    scene = build_peptide(f"ACE-{pair}-NME")
+    scene = build_peptide(sequence)
     path, out = tmp_path / "theirs.pdb", tmp_path / "out.h5"
     path.write_text(_pdb(scene, named, capped_into=capped_into, hydrogens_last=hydrogens_last))
     result = run("rollout", str(path), "--time", "3.2ns", "--save-every", "100ps", "-o", str(out))

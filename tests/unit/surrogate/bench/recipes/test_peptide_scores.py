@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from surrogate.bench.recipes.peptide_rollouts import frame_weights
 from surrogate.bench.recipes.peptide_scores import (
     FloatArray,
     Turn,
@@ -125,3 +126,15 @@ def test_a_perfect_source_is_as_far_as_md_and_the_library_fails_on_joint_maps_al
     assert (one_sided[:, 1] > 0).all()
     shifted = score(turns, truth, [x + 0.3 for x in source], "shifted")
     assert shifted.single > 3.0 * least.single
+
+
+def test_seeded_runs_that_only_leave_phi_above_zero_are_weighted_by_its_free_energy() -> None:
+    """Half of the runs begin on the left-handed side and are there for the first third."""
+    rng = np.random.default_rng(0)
+    runs = []
+    for k in range(24):
+        phi = np.radians(np.where(np.arange(150) < 50 * (k % 2), 55.0, -80.0) + 8.0 * rng.normal(size=150))
+        runs.append(np.stack([phi, rng.uniform(-np.pi, np.pi, 150)], axis=1))
+    positive = np.concatenate(runs)[:, 0] > 0
+    assert frame_weights(runs, 0, 6.0)[positive].sum() == pytest.approx(np.exp(-6.0) / (1 + np.exp(-6.0)), rel=1e-3)
+    assert frame_weights(runs)[positive].sum() > 0.01, "runs alone show it too often"
