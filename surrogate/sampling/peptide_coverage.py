@@ -33,7 +33,8 @@ def cover_peptide(
 
     The molecule is the scene under standard names; a valid frame has the bond lengths and angles that residues of its
     kinds have on average in the training references. A residue, or an end of a chain, that no training peptide has
-    cannot be forced; more residues than any of them has, and a strained start, can.
+    cannot be forced; more residues than any of them has, and a strained start, can. What charges at the ends do to each
+    other reaches along a chain, so that one with a free end may have no more residues than those that had.
     """
     try:
         standard, order = standard_peptide(scene)
@@ -41,10 +42,13 @@ def cover_peptide(
     except InputError as error:
         return domain, np.arange(0), (Deviation("residues", str(error).rstrip("."), forcible=False),)
     found = []
-    most = max(_n_amino_acids(member.scene) for member in domain.members)
+    free = _has_free_end(standard)
+    alike = [member.scene for member in domain.members if _has_free_end(member.scene) or not free]
+    most = max((_n_amino_acids(scene) for scene in alike), default=0)
     if _n_amino_acids(standard) > most:
+        ends = " with free ends" if free else ""
         found.append(
-            Deviation("size", f"{_n_amino_acids(standard)} amino acids; trained on up to {most}", forcible=True)
+            Deviation("size", f"{_n_amino_acids(standard)} amino acids{ends}; trained on up to {most}", forcible=True)
         )
     tokens = chain.code.encode(torch.tensor(standard.positions_nm))
     turning = torch.zeros(tokens.numel(), dtype=torch.bool)
@@ -77,6 +81,10 @@ def _pairs(scene: Scene) -> list[tuple[str, str]]:
     begins, ends = FREE_ENDS
     names = list(scene.residue_names)
     return list(pairwise([begins] * (names[0] not in _CAPS) + names + [ends] * (names[-1] not in _CAPS)))
+
+
+def _has_free_end(scene: Scene) -> bool:
+    return scene.residue_names[0] not in _CAPS or scene.residue_names[-1] not in _CAPS
 
 
 def _n_amino_acids(scene: Scene) -> int:

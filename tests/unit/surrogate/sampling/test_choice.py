@@ -26,7 +26,7 @@ def test_an_unseen_molecule_gets_weights_that_cover_it_and_is_told() -> None:
     assert "without having seen it" in why or "trained on this molecule" in why
 
 
-@pytest.mark.parametrize("sequence", ["ACE-LEU-SER-NME", "GLY-ALA", "ACE-TRP-ARG", "LYS-PRO-ASP-PRO"])
+@pytest.mark.parametrize("sequence", ["ACE-LEU-SER-NME", "GLY-ALA", "ACE-TRP-ARG", "LYS-PRO"])
 def test_an_unseen_peptide_gets_the_weights_of_peptides(sequence: str) -> None:
     """Capped or with free ends, at which most residues never stood in training, or both."""
     weights, why = choose_weights(prepare(f"sequence:{sequence}"))
@@ -57,6 +57,10 @@ def test_only_weights_that_cover_the_scene_are_loaded(monkeypatch: pytest.Monkey
 
 
 def test_the_nearest_weights_are_those_that_could_be_forced() -> None:
-    """Five residues are more than these weights saw, which `force` allows; others lack elements, which it does not."""
-    with pytest.raises(OutOfDomainError, match=r"The nearest: peptides.safetensors does not cover .* 5 amino acids"):
+    """So many residues are more than these weights saw, which `force` allows; others lack elements, which it does
+    not."""
+    nearest = "The nearest: peptides.safetensors does not cover .* 5 amino acids; trained on up to 4"
+    with pytest.raises(OutOfDomainError, match=nearest):
         choose_weights(prepare("sequence:ACE-LEU-SER-ALA-GLY-VAL-NME"))
+    with pytest.raises(OutOfDomainError, match="3 amino acids with free ends; trained on up to 2"):
+        choose_weights(prepare("sequence:LEU-SER-ALA"))

@@ -73,8 +73,8 @@ def _pdb(scene: Scene, named: Callable[[str, str], str], *, capped_into: bool, h
         ("ACE-LEU-SER-NME", _charmm, True, False),
         ("ACE-VAL-ASN-NME", _gromacs, False, True),
         ("ACE-PHE-GLY-NME", _amber, False, False),
-        ("ILE-VAL-PHE", _free(_charmm, "HT1", "HT2", "HT3", "OT1", "OT2"), False, False),
-        ("ILE-VAL-PHE", _free(_gromacs, "H1", "H2", "H3", "O1", "O2"), False, True),
+        ("ILE-PHE", _free(_charmm, "HT1", "HT2", "HT3", "OT1", "OT2"), False, False),
+        ("ILE-PHE", _free(_gromacs, "H1", "H2", "H3", "O1", "O2"), False, True),
     ],
 )
 def test_files_of_other_programs_roll_without_naming_weights(
