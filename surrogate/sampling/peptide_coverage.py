@@ -33,8 +33,9 @@ def cover_peptide(
 
     The molecule is the scene under standard names; a valid frame has the bond lengths and angles that residues of its
     kinds have on average in the training references. A residue, or an end of a chain, that no training peptide has
-    cannot be forced; more residues than any of them has, and a strained start, can. What charges at the ends do to each
-    other reaches along a chain, so that one with a free end may have no more residues than those that had.
+    cannot be forced; more residues than any of them has, and a strained start, can. So can a residue at a free end that
+    none has there, whose side chain the charge turns elsewhere, and more residues between free ends than any has, since
+    what charges do to each other reaches along a chain.
     """
     try:
         standard, order = standard_peptide(scene)
@@ -50,6 +51,10 @@ def cover_peptide(
         found.append(
             Deviation("size", f"{_n_amino_acids(standard)} amino acids{ends}; trained on up to {most}", forcible=True)
         )
+    begins, ends = FREE_ENDS
+    unborne = [x for x in unseen_neighbours(standard, domain) if x.startswith(begins) or x.endswith(ends)]
+    if unborne:
+        found.append(Deviation("ends", f"free ends that no training peptide has: {', '.join(unborne)}", forcible=True))
     tokens = chain.code.encode(torch.tensor(standard.positions_nm))
     turning = torch.zeros(tokens.numel(), dtype=torch.bool)
     turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True

@@ -17,7 +17,7 @@ TEST_CHAINS = (
     ("SER", "LEU", "ALA"), ("ALA", "SER", "VAL", "LEU"), ("GLY", "TYR", "GLU", "LYS"),
     ("VAL", "GLY", "ASP", "ALA", "PHE"), ("ALA", "LYS", "LEU", "GLU", "THR", "ILE"),
 )  # fmt: skip
-TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"), ("SER", "LEU"), ("VAL", "GLU"))
+TEST_FREE_CHAINS = (("ILE", "GLN", "ALA", "PHE"), ("SER", "LEU"), ("VAL", "GLU"), ("LEU", "ILE"), ("MET", "SER"))
 # Beside the rounds of pairs: what these hold little of, residues before proline and opposite charges side by side.
 FURTHER_PAIRS = (
     ("GLY", "PRO"), ("VAL", "PRO"), ("SER", "PRO"), ("LEU", "PRO"), ("LYS", "PRO"), ("GLU", "PRO"), ("ASN", "PRO"),

@@ -41,8 +41,8 @@ def _amber(residue: str, name: str) -> str:
 
 
 def _free(named: Callable[[str, str], str], *ends: str) -> Callable[[str, str], str]:
-    """The names that a program gives the hydrogens of ILE's ammonium and the oxygens of PHE's carboxylate."""
-    own = dict(zip([("ILE", "H"), ("ILE", "H2"), ("ILE", "H3"), ("PHE", "O"), ("PHE", "OXT")], ends, strict=True))
+    """The names that a program gives the hydrogens of LEU's ammonium and the oxygens of SER's carboxylate."""
+    own = dict(zip([("LEU", "H"), ("LEU", "H2"), ("LEU", "H3"), ("SER", "O"), ("SER", "OXT")], ends, strict=True))
     return lambda residue, name: own.get((residue, name)) or named(residue, name)
 
 
@@ -73,8 +73,8 @@ def _pdb(scene: Scene, named: Callable[[str, str], str], *, capped_into: bool, h
         ("ACE-LEU-SER-NME", _charmm, True, False),
         ("ACE-VAL-ASN-NME", _gromacs, False, True),
         ("ACE-PHE-GLY-NME", _amber, False, False),
-        ("ILE-PHE", _free(_charmm, "HT1", "HT2", "HT3", "OT1", "OT2"), False, False),
-        ("ILE-PHE", _free(_gromacs, "H1", "H2", "H3", "O1", "O2"), False, True),
+        ("LEU-SER", _free(_charmm, "HT1", "HT2", "HT3", "OT1", "OT2"), False, False),
+        ("LEU-SER", _free(_gromacs, "H1", "H2", "H3", "O1", "O2"), False, True),
     ],
 )
 def test_files_of_other_programs_roll_without_naming_weights(
