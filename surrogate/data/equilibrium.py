@@ -23,8 +23,8 @@ _CLUSTERED_FRAMES = 20_000
 _DIMENSIONS = 6
 # No frame counts more than so many average ones: a cell hardly visited would otherwise be drawn over and over.
 _LARGEST = 20.0
-# How often a run that begins or ends is taken to have come from any frame; a frame's odds grow with this power of its
-# place in its run.
+# How many jumps between any two frames each run stands for, its beginning and its end; a frame's odds to take part grow
+# with this power of its place in its run.
 _JUMPS_A_RUN, _LATE = 2.0, 2
 _CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
 _SEED = 1
