@@ -43,17 +43,14 @@ def cover_peptide(
     except InputError as error:
         return domain, np.arange(0), (Deviation("residues", str(error).rstrip("."), forcible=False),)
     found = []
-    free = _has_free_end(standard)
-    alike = [member.scene for member in domain.members if _has_free_end(member.scene) or not free]
+    free = any(_free_ends(standard))
+    alike = [member.scene for member in domain.members if any(_free_ends(member.scene)) or not free]
     most = max((_n_amino_acids(scene) for scene in alike), default=0)
-    if _n_amino_acids(standard) > most:
-        ends = " with free ends" if free else ""
-        found.append(
-            Deviation("size", f"{_n_amino_acids(standard)} amino acids{ends}; trained on up to {most}", forcible=True)
-        )
-    begins, ends = FREE_ENDS
-    unborne = [x for x in unseen_neighbours(standard, domain) if x.startswith(begins) or x.endswith(ends)]
-    if unborne:
+    if (n := _n_amino_acids(standard)) > most:
+        what = f"{n} amino acids{' with free ends' if free else ''}; trained on up to {most}"
+        found.append(Deviation("size", what, forcible=True))
+    first, last = FREE_ENDS
+    if unborne := [x for x in unseen_neighbours(standard, domain) if x.startswith(first) or x.endswith(last)]:
         found.append(Deviation("ends", f"free ends that no training peptide has: {', '.join(unborne)}", forcible=True))
     tokens = chain.code.encode(torch.tensor(standard.positions_nm))
     turning = torch.zeros(tokens.numel(), dtype=torch.bool)
@@ -83,13 +80,13 @@ def unseen_neighbours(scene: Scene, domain: TrainingDomain) -> list[str]:
 
 
 def _pairs(scene: Scene) -> list[tuple[str, str]]:
-    begins, ends = FREE_ENDS
-    names = list(scene.residue_names)
-    return list(pairwise([begins] * (names[0] not in _CAPS) + names + [ends] * (names[-1] not in _CAPS)))
+    first, last = ([end] * free for end, free in zip(FREE_ENDS, _free_ends(scene), strict=True))
+    return list(pairwise([*first, *scene.residue_names, *last]))
 
 
-def _has_free_end(scene: Scene) -> bool:
-    return scene.residue_names[0] not in _CAPS or scene.residue_names[-1] not in _CAPS
+def _free_ends(scene: Scene) -> tuple[bool, bool]:
+    """Return whether a chain's first residue bears an end of its own, and whether its last does."""
+    return scene.residue_names[0] not in _CAPS, scene.residue_names[-1] not in _CAPS
 
 
 def _n_amino_acids(scene: Scene) -> int:

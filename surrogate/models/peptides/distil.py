@@ -49,10 +49,11 @@ def distil(
     a CSV of how far both end apart, in the units of the flow. Raises SimulationError when training diverges."""
     torch.manual_seed(training.seed)
     assert isinstance(start.model, PeptideSlide)
-    teacher = start.model.flow
-    model = PeptideSlide(replace(start.model.config, usual_steps=steps))
+    device = torch.device(training.device)
+    teacher = start.model.to(device).flow
+    model = PeptideSlide(replace(start.model.config, usual_steps=steps)).to(device)
     model.load_state_dict(start.model.state_dict())
-    subjects = [PeptideSubject(f, chain_features(f.scene, model.config)) for f in sets]
+    subjects = [PeptideSubject(f, chain_features(f.scene, model.config).to(device)) for f in sets]
     held = [
         (
             subject,
@@ -62,7 +63,7 @@ def distil(
     ]
 
     def apart(subject: PeptideSubject, idx: Tensor, times: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        return arrival_loss(model, teacher, subject.chain, *subject.seen(model, idx), times, generator)
+        return arrival_loss(model, teacher, subject.chain, *subject.seen(model, idx), times.to(device), generator)
 
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
@@ -84,7 +85,7 @@ def distil(
         bf16=training.bf16, validate_every_s=training.validate_every_s,
     )  # fmt: skip
     state = out.with_name(f"{out.stem}.train.safetensors")
-    place = StagePlace(state, out.with_suffix(".csv"), torch.device("cpu"), resume)
+    place = StagePlace(state, out.with_suffix(".csv"), device, resume)
     spent_s = run_stage(model.flow, stage, loss, validate, place, on_save=write)
     if is_first_process():
         write(spent_s)

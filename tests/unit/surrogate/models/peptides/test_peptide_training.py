@@ -12,10 +12,11 @@ import torch
 
 from small_scenes import with_phi_turned
 from surrogate.bench.cost_error.effective_samples import training_cost
+from surrogate.data.descriptions import describe
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.splits import Split
-from surrogate.data.weights import load_weights
+from surrogate.data.weights import Weights, load_weights
 from surrogate.models.peptides import peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.choices import PeptideTrainer
@@ -312,3 +313,13 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     for name, tensor in teacher.model.jumps.state_dict().items():
         torch.testing.assert_close(found.model.jumps.state_dict()[name], tensor)
     assert found.provenance["distilled_to_steps"] == 2
+    last = torch.from_numpy(frames.positions_nm(np.arange(0, 800, 50)))[:, None]
+    noise = torch.randn(len(last), *teacher.model.noise_shape(frames.scene.n_atoms))
+
+    def rolled(weights: Weights, steps: int) -> torch.Tensor:
+        model = weights.model
+        return model.next_chunk(last, describe(model, frames.scene), noise, solver_steps=steps).frames_nm
+
+    there = rolled(teacher, 6)
+    ours, its_own = ((rolled(weights, 2) - there).square().mean() for weights in (found, teacher))
+    assert ours < 0.5 * its_own
