@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from surrogate.data.frames import collect_frames
+from surrogate.bench.recipes.peptide_subset import training_sets
 from surrogate.data.weights import load_weights
 from surrogate.models.peptides.distil import distil
 from surrogate.models.peptides.trainer import PeptideTraining
@@ -27,8 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=2, help="evaluations of a rollout")
     parser.add_argument("--budget", required=True, help="wall time, as 40min")
     a = parser.parse_args(arguments)
-    runs = (sorted(folder.glob("run_*.h5")) for folder in sorted(a.train.iterdir()))
-    sets = [collect_frames(files) for files in runs if files]
+    sets = [frames for folder in sorted(a.train.iterdir()) for frames in training_sets(folder)]
     training = PeptideTraining(
         budget_s=parse_wall_s(a.budget, "--budget"), learning_rate=_LEARNING_RATE, validate_every_s=_VALIDATE_S
     )

@@ -36,7 +36,7 @@ def train_on_pairs(
     `start`: weights to go on from. Free energies of phi > 0 are those in the folder of `out`. Raises InputError when
     fewer of a kind have runs.
     """
-    from surrogate.data.frames import collect_frames
+    from surrogate.bench.recipes.peptide_subset import has_frames, training_sets
     from surrogate.data.weights import load_weights
     from surrogate.models.lam_slide.trainer import is_trained
     from surrogate.models.peptides.model import PeptideConfig
@@ -44,17 +44,17 @@ def train_on_pairs(
 
     if is_trained(out):
         return
-    kinds: dict[str, list[list[Path]]] = {"monomers": [], "pairs": [], "chains": [], "pairs with free ends": []}
+    kinds: dict[str, list[Path]] = {"monomers": [], "pairs": [], "chains": [], "pairs with free ends": []}
     for peptide in training_peptides():
         kind = list(kinds)[min(3, len(peptide.residues)) - 1] if peptide.capped else "pairs with free ends"
-        if files := sorted((runs / peptide.name).glob("run_*.h5")):
-            kinds[kind].append(files)
+        if has_frames(runs / peptide.name):
+            kinds[kind].append(runs / peptide.name)
     chosen = kinds["monomers"]
     for (what, there), asked in zip(list(kinds.items())[1:], (n_pairs, n_chains, n_free), strict=True):
         if len(there) < asked:
             raise InputError(f"{runs} holds runs of {len(there)} {what}, {asked} are asked for; simulate more first.")
         chosen = chosen + there[:asked]
-    sets = [collect_frames(files) for files in chosen]
+    sets = [frames for folder in chosen for frames in training_sets(folder)]
     training = PeptideTraining(
         steps=steps, budget_s=budget_s, time_reversal=True, positive_phi_kt=known_energies(out.parent),
         validate_every_s=_VALIDATE_S,

@@ -271,7 +271,9 @@ def normalise(model: PeptideSlide, subjects: Sequence[PeptideSubject], seed: int
     model.token_scale.copy_(scale)
     products = torch.zeros(3, n_types, len(lags), n_slots, dtype=torch.float64)
     for subject in subjects:
-        for k, lag in enumerate((lags / subject.frames.lag_ps).round().long().clamp(min=1).tolist()):
+        for k, lag in enumerate((lags / subject.frames.lag_ps).round().long().tolist()):
+            if lag == 0:
+                continue
             try:
                 starts = subject.frames.window_starts(lag + 1, validation=False)
             except InputError:

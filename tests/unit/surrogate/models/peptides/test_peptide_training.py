@@ -162,6 +162,17 @@ def test_correlations_are_those_of_the_process(frames: TrainingFrames, config: P
     assert float(numbers[:, 1, filled].std()) == pytest.approx(1.0, abs=0.15)
 
 
+def test_frames_far_apart_say_nothing_of_shorter_times(frames: TrainingFrames, config: PeptideConfig) -> None:
+    """Every tenth frame beside all: at 1 ps the correlation stays that of all, and is no mean with that at 10 ps."""
+    chain = chain_features(frames.scene, config)
+    sparse = replace(frames, coordinates=frames.coordinates[::10], starts=frames.starts // 10, lag_ps=10.0)
+    model = PeptideSlide(config)
+    normalise(model, [PeptideSubject(f, chain) for f in (frames, sparse)], 0)
+    types = torch.tensor([config.types.index("ALA") + 2])
+    found = model.correlation_at(torch.tensor([[1.0, 10.0]]), types)[0, :, 0, chain.code.filled[1]].mean(-1)
+    np.testing.assert_allclose(found, [0.9, 0.9**10], atol=0.08)
+
+
 def test_batches_show_crossings_of_phi_apart_from_what_is_likely(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs that stand on one side of phi and, from frame 50 on, on the other: half of the windows made to hold the
     crossing are read backwards, and then only from runs whose frames equilibrium has."""
