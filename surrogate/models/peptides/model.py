@@ -230,7 +230,7 @@ class PeptideSlide(Surrogate):
 
     arch: ClassVar[str] = "lam-slide-peptides"
     solvers = ("gaussian", *flow.solvers_for("linear"))
-    float32_layers: tuple[str, ...] = ("flow.of_time",)
+    float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
     config: PeptideConfig
     token_mean: Tensor
     token_scale: Tensor

@@ -154,23 +154,21 @@ class StateJumps(nn.Module):
         levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
         return self.of_times(torch.cat([waves, logs], dim=-1)), levels
 
-    def of_frames(self, known: Tensor, before: Tensor, earlier: Tensor, of_times: Tensor, counts: Tensor) -> Tensor:
-        """`known` as `of_known` returns it; states `before` each frame and `earlier`, two before, `(b, t, r,
-        MOST_TORSIONS)`; `of_times` (b, t, width) -> (b, t, r, width)."""
-        told = _beside(told_states(before, counts))
-        h: Tensor = sum((of(x) for of, x in zip(self.of_before, told, strict=True)), known[:, None])
-        return h + self.of_earlier(told_states(earlier, counts)) + of_times[:, :, None]
+    def of_frames(self, told: Tensor, earlier: Tensor) -> Tensor:
+        """What `told_states` returns of the frame before each, `told` (b, t, r, n), and of the one before that,
+        `earlier` -> (b, t, r, width)."""
+        of_all = torch.cat([of.weight for of in (*self.of_before, self.of_earlier)], dim=1)
+        return F.linear(torch.cat([*_beside(told), earlier], dim=-1), of_all)
 
     def odds(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, told: Tensor) -> Tensor:
         """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
 
-        `h` is what `of_frames` returns, `levels` what `of_times_alone` does; `now` (b, t, r) the torsion's state in the
+        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what `of_times_alone` does; `now` (b, t, r) the torsion's state in the
         frame before, `told` (b, t, r, n) what `told_states` returns of the new frame, of which torsions before this one
         count.
         """
         n = torsion * MOST_STATES
-        earlier = F.pad(told[..., :n], (0, told.shape[-1] - n))
-        h = F.silu(h + self.of_new[torsion](earlier) + self.of_torsion.weight[torsion])
+        h = F.silu(h + F.linear(told[..., :n], self.of_new[torsion].weight[:, :n], self.of_torsion.weight[torsion]))
         at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
         level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
@@ -196,7 +194,8 @@ class StateJumps(nn.Module):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            h = self.of_frames(self.of_known(known, states[:, 0], places, counts), before, earlier, of_times, counts)
+            h = self.of_frames(told_states(before, counts), told_states(earlier, counts)) + of_times[:, :, None]
+            h = h + self.of_known(known, states[:, 0], places, counts)[:, None]
             told = told_states(new, counts)
             total = known.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
@@ -214,24 +213,26 @@ class StateJumps(nn.Module):
         """Return states `(b, t, r, MOST_TORSIONS)` of new frames, from the given frame's numbers and `states`
         (b, r, MOST_TORSIONS) and numbers `uniform` (b, t, r, MOST_TORSIONS) in [0, 1)."""
         with torch.autocast(known.device.type, enabled=False):
-            common = self.of_known(known, states, places, counts)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
+            common = self.of_known(known, states, places, counts)[:, None] + of_times[:, :, None]
+            # What is told of a residue's torsion in each state.
+            ones = torch.eye(MOST_STATES, device=known.device) * (counts > 0)[..., None, None]
+            residues, most = torch.arange(len(counts), device=known.device), (counts - 1).clamp(min=0)
             torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
-            before, earlier, found = states[:, None], states[:, None], []
+            now, found = states[:, None], []
+            before = told = told_states(now, counts)
             for k in range(times_ps.shape[1]):
                 at = slice(k, k + 1)
-                h = self.of_frames(common, before, earlier, of_times[:, at], counts)
-                new = torch.zeros_like(before)
-                told = told_states(new, torch.zeros_like(counts))
+                h = self.of_frames(told, before) + common[:, at]
+                new, before, told = torch.zeros_like(now), told, torch.zeros_like(told)
                 for torsion in torsions:
-                    share = self.odds(torsion, h, levels[:, at], before[..., torsion], told).softmax(-1).cumsum(-1)
+                    share = self.odds(torsion, h, levels[:, at], now[..., torsion], told).softmax(-1).cumsum(-1)
                     # Shares may end below one by rounding.
-                    drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1)
-                    new[..., torsion] = torch.minimum(drawn, (counts[:, torsion] - 1).clamp(min=0))
-                    one = told_states(new[..., torsion, None], counts[:, torsion, None])
-                    told[..., torsion * MOST_STATES : (torsion + 1) * MOST_STATES] = one
+                    drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1).minimum(most[:, torsion])
+                    new[..., torsion] = drawn
+                    told[..., torsion * MOST_STATES : (torsion + 1) * MOST_STATES] = ones[residues, torsion, drawn]
                 found.append(new)
-                before, earlier = new, before
+                now = new
             return torch.cat(found, dim=1)
 
 

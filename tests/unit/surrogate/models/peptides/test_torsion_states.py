@@ -167,7 +167,8 @@ def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() ->
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
     common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
     of_times, levels = jumps.of_times_alone(time, time, places, counts)
-    h = jumps.of_frames(common, before, before, of_times, counts)
+    told = told_states(before, counts)
+    h = jumps.of_frames(told, told) + common[:, None] + of_times[:, :, None]
 
     def odds(**moved: int) -> torch.Tensor:
         new = before.clone()
