@@ -31,6 +31,8 @@ def settle(tokens: Tensor, states: Tensor, chain: ChainFeatures) -> tuple[Tensor
     tokens, astray = _within_states(tokens, states, chain)
     frames = chain.code.decode(tokens)
     crowded = chain.overlap(frames)
+    if not crowded.any():
+        return frames, astray, crowded
     for rows in torch.nonzero(crowded)[:, 0].split(_BLOCK):
         turned, strayed = _within_states(_apart(tokens[rows], chain), states[rows], chain)
         frames[rows] = chain.code.decode(turned)
