@@ -117,12 +117,12 @@ def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     later."""
     known, now, chain = phi.known[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
-    common = model.jumps.of_known(known, now, chain.places, counts)
+    told = told_states(before, counts)
+    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(told, told)
     for time_ps in _TIMES_PS:
         times = torch.full((len(known), 1), time_ps, device=known.device)
         apart = times_apart(times, model.config.forgotten_ps)
         of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
-        h = model.jumps.of_frames(common, before, before, of_times, counts)
-        logits = model.jumps.odds(0, h, levels, before[..., 0], told_states(before, counts))
+        logits = model.jumps.odds(0, common + of_times[:, :, None], levels, before[..., 0], told)
         found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)

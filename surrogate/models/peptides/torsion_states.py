@@ -163,9 +163,9 @@ class StateJumps(nn.Module):
     def odds(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, told: Tensor) -> Tensor:
         """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
 
-        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what `of_times_alone` does; `now` (b, t, r) the torsion's state in the
-        frame before, `told` (b, t, r, n) what `told_states` returns of the new frame, of which torsions before this one
-        count.
+        `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what
+        `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `told` (b, t, r, n) what
+        `told_states` returns of the new frame, of which torsions before this one count.
         """
         n = torsion * MOST_STATES
         h = F.silu(h + F.linear(told[..., :n], self.of_new[torsion].weight[:, :n], self.of_torsion.weight[torsion]))

@@ -208,8 +208,9 @@ def test_rates_of_two_residue_types_are_learned() -> None:
         time = torch.tensor([[apart_ps]])
         common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
         of_times, levels = net.of_times_alone(time, time, places, counts)
-        h = net.of_frames(common, up[:, None], up[:, None], of_times, counts)
-        odds = net.odds(0, h, levels, up[:, None, :, 0], told_states(up, counts)[:, None])[0, 0].softmax(-1)[:, 0]
+        told = told_states(up[:, None], counts)
+        h = net.of_frames(told, told) + common[:, None] + of_times[:, :, None]
+        odds = net.odds(0, h, levels, up[:, None, :, 0], told)[0, 0].softmax(-1)[:, 0]
         np.testing.assert_allclose(odds.detach(), leaves * apart_ps, rtol=0.35)
 
 
