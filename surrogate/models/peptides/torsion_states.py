@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -168,7 +169,8 @@ class StateJumps(nn.Module):
         `told_states` returns of the new frame, of which torsions before this one count.
         """
         n = torsion * MOST_STATES
-        h = F.silu(h + F.linear(told[..., :n], self.of_new[torsion].weight[:, :n], self.of_torsion.weight[torsion]))
+        of_new = cast(nn.Linear, self.of_new[torsion]).weight
+        h = F.silu(h + F.linear(told[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
         at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
         level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
