@@ -35,8 +35,12 @@ def training_domain(
 
 def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weights | None = None) -> dict[str, Any]:
     """Return when, where and from what weights were made. `origin`: of the frames trained on (`TrainingFrames.origin`);
-    `settings`: of the training; `start`: the weights that it began with."""
-    earlier = {} if start is None else {"from": {"hash": start.hash, **start.provenance}}
+    `settings`: of the training; `start`: the weights that it began with, of whose trajectories those are told that are
+    not among `origin`'s."""
+    earlier = {}
+    if start is not None:
+        known = {source.get("sha256") for source in origin.get("sources", ())}
+        earlier = {"from": {"hash": start.hash, **_beside(start.provenance, known)}}
     return {
         **earlier,
         "trained": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -45,3 +49,13 @@ def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weigh
         **origin,
         **settings,
     }
+
+
+def _beside(record: dict[str, Any], known: set[str | None]) -> dict[str, Any]:
+    """Return what earlier weights say of themselves, and those that they began with, of trajectories those that are not
+    `known`."""
+    left = [source for source in record.get("sources", ()) if source.get("sha256") not in known - {None}]
+    found = {**record, "sources": left} if "sources" in record else dict(record)
+    if isinstance(record.get("from"), dict):
+        found["from"] = _beside(record["from"], known | {source.get("sha256") for source in left})
+    return found

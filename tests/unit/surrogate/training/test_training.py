@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from surrogate.models.lam_slide.losses import FlowWindows, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
+from surrogate.training.provenance import provenance_of
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.files.toml_file import read_toml
 from systems.scene import Scene
@@ -82,6 +84,23 @@ def test_training_goes_on_from_weights(tmp_path: Path, harmonic_frames: Training
     assert 0.0 < change < 0.3
     assert further.provenance["from"]["hash"] == small_weights.hash
     assert {r["stage"] for r in csv.DictReader(out.with_suffix(".csv").open())} == {"flow"}
+
+
+def test_weights_tell_each_trajectory_of_their_ancestors_once(small_weights: Weights) -> None:
+    def told(*files: str, **more: Any) -> dict[str, Any]:
+        return {"sources": [{"file": name, "sha256": name} for name in files], **more}
+
+    eldest = {"hash": "0", **told("a", "b"), "spent_s": 1.0}
+    start = replace(small_weights, provenance=told("b", "c", **{"from": eldest, "spent_s": 2.0}), hash="1")
+    made = provenance_of(told("c", "d"), {}, start)
+    assert [source["file"] for source in made["sources"]] == ["c", "d"]
+    assert made["from"] == {
+        "hash": "1",
+        **told("b"),
+        "spent_s": 2.0,
+        "from": {"hash": "0", **told("a"), "spent_s": 1.0},
+    }
+    assert start.provenance["sources"] == told("b", "c")["sources"], "which stay as they are"
 
 
 def test_training_goes_on_only_from_weights_that_fit(tmp_path: Path, harmonic_frames: TrainingFrames,
