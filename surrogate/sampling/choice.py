@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import shipped_weights
@@ -46,3 +47,16 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
     why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
     beside = f"; {', '.join(others)} would do, too" if others else ""
     return weights, f"weights not named, taken are the shipped {name}: {why}{beside}"
+
+
+def weights_to_go_on_from(scene: Scene) -> str | None:
+    """Return the name of shipped weights of peptides that know all residues of a scene, so that a training on MD of it
+    may begin with them, whatever keeps them from covering it; None where none do."""
+    for name, path in shipped_weights().items():
+        header = read_header(path)
+        config = architecture(header.arch).config(header.config)
+        if isinstance(config, PeptideConfig):
+            with suppress(OutOfDomainError):
+                match_known(scene, header.domain, path.name, config, force=True)
+                return name
+    return None

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
+from surrogate.data.features.standard_peptide import standard_peptide
+from surrogate.data.frames import TrainingFrames
 from surrogate.data.references import References
 from surrogate.data.weights import load_weights, read_header
 from surrogate.models.peptides.model import PeptideConfig
@@ -55,9 +60,23 @@ class PeptideTrainer(Trainer):
             advance(stage, done + share * (JUMPS_SHARE if stage == "jumps" else 1 - JUMPS_SHARE))
 
         def run(advance: AdvanceFn) -> Path:
+            trained, unseen = (
+                [_under_standard_names(frames) for frames in some] for some in (sets.trained, sets.unseen)
+            )
             return train_peptides(
-                sets.trained, request.out, settings.model, settings.training, unseen=sets.unseen, start=start,
+                trained, request.out, settings.model, settings.training, unseen=unseen, start=start,
                 resume=request.resume, progress=partial(report, advance),
             )  # fmt: skip
 
         return Prepared(sets.names, run)
+
+
+def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
+    """Return frames of a peptide from any program's file, atoms in the order and residues under the names of ours."""
+    standard, order = standard_peptide(frames.scene)
+    if standard.residue_names == frames.scene.residue_names and (order == np.arange(len(order))).all():
+        return frames
+    return replace(
+        frames, scene=replace(standard, name=frames.scene.name), coordinates=frames.coordinates[:, order],
+        velocities=None if frames.velocities is None else frames.velocities[:, order],
+    )  # fmt: skip

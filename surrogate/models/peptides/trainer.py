@@ -151,7 +151,9 @@ def train_peptides(
         return {key: float(np.mean(values)) for key, values in found.items()}
 
     domains = [training_domain(f, strides=_strides(config, f)) for f in sets]
-    domain = replace(domains[0], further=tuple(domains[1:]), transferable=True)
+    # One molecule tells nothing of others, whatever the weights knew that it was trained from.
+    several = len({f.scene.topology_hash for f in sets}) > 1
+    domain = replace(domains[0], further=tuple(domains[1:]), transferable=several)
 
     def write(*spent_s: float) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}

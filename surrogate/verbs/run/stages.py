@@ -149,6 +149,8 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
+    from surrogate.sampling.choice import weights_to_go_on_from
+
     out = site.folder / WEIGHTS_NAME
     _, decision = _rates_and_decision(record)
     dear, seconds = decision.way == "potential", decision.seconds("train")
@@ -157,6 +159,7 @@ def _train(site: Site, record: RunRecord) -> RunRecord:
         raise InputError(f"it takes {beside_s:.0f} s beside its steps, and has {seconds:.0f} s.")
     options = TrainOptions(
         level=site.options.level if dear else None,
+        start_from=None if dear else weights_to_go_on_from(site.scene),
         # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
         budget_s=seconds if dear else min(seconds - beside_s, _OPTIMISING * seconds),
         seed=site.options.seed,

@@ -10,6 +10,7 @@ import pytest
 
 from quick_report import judged_at_once
 from surrogate import api
+from surrogate.verbs.options import TrainOptions
 from surrogate.verbs.run import one_scene, stages
 from surrogate.verbs.run.many_scenes import molecules_in
 from surrogate.verbs.run.rates import Rates, Rolls
@@ -103,6 +104,23 @@ def test_weights_that_roll_nothing_end_the_training_and_not_the_run(
     failed = next(stage for stage in found["stages"] if stage["name"] == "train")
     assert failed["status"] == "failed" and failed["note"] == "its weights roll nothing: 31 frames and no valid one."
     assert found["decision"]["way"] == "md" and found["outcome"] is not None and not found["weights"]
+
+
+@pytest.mark.parametrize(("scene", "known"), [("sequence:GLY-HIS-LYS", "peptides"), ("smiles:CCO", None)])
+def test_training_on_a_peptide_begins_with_weights_that_know_its_residues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: str, known: str | None
+) -> None:
+    asked = []
+
+    def train(*_: object, options: TrainOptions) -> None:
+        asked.append(options.start_from)
+        raise SimulationError("enough")
+
+    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="no", md_ps_per_s=0.01))
+    monkeypatch.setattr(stages, "train", train)
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    api.run(scene, tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
+    assert asked == [known]
 
 
 def test_a_training_that_cannot_end_is_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,12 +20,14 @@ from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from surrogate.models.peptides.model import PeptideConfig
 from surrogate.models.peptides.trainer import PeptideTraining
 from surrogate.models.settings import toml_text
+from surrogate.sampling.domain import match_domain
 from surrogate.training.trainer import TrainingRequest
-from systems.errors import InputError
+from systems.errors import InputError, OutOfDomainError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.source import prepare
 from systems.trajectory.codec import open_writer
+from systems.trajectory.topology_file import pdb_text
 
 MD = {"kind": "reference", "temperature_k": 300.0, "force_field": "ff14SB", "solvent": "obc2"}
 
@@ -123,6 +125,27 @@ def test_peptides_are_trained_and_rolled_by_the_verb(peptides: list[Path], tmp_p
     weights = load_weights(out)
     assert weights.model.arch == "lam-slide-peptides" and weights.domain.lag_ps == pytest.approx(2.0)
     assert len(weights.domain.members) == 2 and weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
+
+
+def test_a_peptide_from_any_file_is_learned_under_standard_names_and_for_itself_alone(tmp_path: Path) -> None:
+    """Histidine as a structure database calls it, without hydrogens: prepared, it has other names and another order."""
+    built, pdb = build_peptide("ACE-HIE-NME"), tmp_path / "his.pdb"
+    lines = [line for line in pdb_text(built).splitlines() if line.startswith(("ATOM", "HETATM"))]
+    pdb.write_text("".join(line.replace("HIE", "HIS") + "\n" for line in lines if line[76:78].strip() != "H"))
+    scene = prepare(str(pdb))
+    assert "HIS" in scene.residue_names and scene.atom_names != built.atom_names
+    (folder := tmp_path / "runs").mkdir()
+    config, out = folder / "small.toml", folder / "w.safetensors"
+    config.write_text("[model]\nwidth = 16\nn_layers = 1\nn_heads = 2\nchunk_frames = 4\n")
+    done = run("train", str(write(folder, scene, 200)), "--arch", "lam-slide-peptides", "--config", str(config),
+               "--steps", "2", "-o", str(out), "-q")  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    weights = load_weights(out)
+    assert weights.domain.scene.residue_names[1] in ("HID", "HIE"), "whichever its hydrogens say"
+    order = match_domain(scene, weights).order
+    assert [scene.elements[k] for k in order] == list(weights.domain.scene.elements)
+    with pytest.raises(OutOfDomainError, match="atoms"):
+        match_domain(build_peptide("ACE-HID-ALA-NME"), weights, force=True)
 
 
 def test_several_lags_are_learned_where_they_are_asked_for(alanine: Path) -> None:
