@@ -2,7 +2,7 @@
 
 For a machine with a GPU that little can be carried to. All atoms are kept, as int16: hydrogens are part of what the
 model learns, and placing them anew would teach it their ideal places. Of each molecule about as many frames: half of
-them 1 ps apart, in stretches drawn by how rare the states of torsions in them are, half 20 ps apart, in whole runs
+them 1 ps apart, in stretches drawn by how rare the states of torsions in them are, half 10 ps apart, in whole runs
 drawn in the same way: `OUT/MOLECULE/fine.windows.h5` and `wide.windows.h5`, windows files as of `surromd windows`.
 Other recipes take OUT as `--train`. What is held out of all runs is not trained on here either.
 
@@ -40,7 +40,7 @@ from surrogate.models.peptides.trainer import PeptideTraining, peptide_loss, tra
 MOST_MIB = 60.0
 # Of frames 1 ps apart; a chunk and the frame before it take 17.
 _STRETCH = 96
-_WIDE_PS = 20.0
+_WIDE_PS = 10.0
 # What a file holds beside its frames: the scene, where they are from.
 _HEADER_BYTES = 20_000
 _EVERY, _HELD_WINDOWS = 10, 256

@@ -33,7 +33,8 @@ from surrogate.training.provenance import provenance_of
 
 # Evaluations of the teacher: more of them end in the same distribution.
 _TEACHER_STEPS = 6
-_HELD_WINDOWS, _HELD_SEED = 32, 0
+# Of each molecule, of many fewer of each: validation solves as often as training does, and is to stay a small share.
+_HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL, _HELD_SEED = 32, 2, 256, 0
 
 
 def distil(
@@ -54,11 +55,9 @@ def distil(
     model = PeptideSlide(replace(start.model.config, usual_steps=steps)).to(device)
     model.load_state_dict(start.model.state_dict())
     subjects = [PeptideSubject(f, chain_features(f.scene, model.config).to(device)) for f in sets]
+    n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // len(subjects)))
     held = [
-        (
-            subject,
-            *subject.windows(_HELD_WINDOWS, model.config, torch.Generator().manual_seed(_HELD_SEED), validation=True),
-        )
+        (subject, *subject.windows(n_held, model.config, torch.Generator().manual_seed(_HELD_SEED), validation=True))
         for subject in subjects
     ]
 
@@ -73,7 +72,8 @@ def distil(
     @torch.no_grad()
     def validate() -> dict[str, float]:
         generator = torch.Generator().manual_seed(_HELD_SEED)
-        found = [apart(*each, generator) for each in held]
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=training.bf16):
+            found = [apart(*each, generator) for each in held]
         return {f"validation_{name}": float(np.mean([float(terms[name]) for terms in found])) for name in found[0]}
 
     def write(spent_s: float) -> None:

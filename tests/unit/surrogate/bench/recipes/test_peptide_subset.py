@@ -41,8 +41,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_parts_are_frames_of_the_runs_and_none_that_is_held_out_is_trained_on(runs: Path) -> None:
     frames = collect_frames(sorted((runs / "ALA").glob("*.h5")))
     fine, wide = choose_parts(frames, 800, seed=1)
-    assert (fine.lag_ps, wide.lag_ps) == (1.0, 20.0)
-    assert 300 < fine.n_frames <= 400 and wide.n_frames == 4 * 57
+    assert (fine.lag_ps, wide.lag_ps) == (1.0, 10.0)
+    assert 300 < fine.n_frames <= 400 and wide.n_frames == 3 * 114
     cut = round(0.95 * _N)
     for part in (fine, wide):
         trained = {begin for begin, _ in part.split.ranges(part.starts, validation=False)}
@@ -76,7 +76,7 @@ def test_the_subset_fits_and_its_loss_is_measured_beside_that_of_all_runs(
     assert [path.name for path in files] == ["fine.windows.h5", "wide.windows.h5"] * 2
     assert 0.15 < sum(path.stat().st_size for path in files) / 2**20 <= 0.3
     assert "2 molecules" in capsys.readouterr().out
-    assert [f.lag_ps for f in training_sets(out / "ALA")] == [1.0, 20.0]
+    assert [f.lag_ps for f in training_sets(out / "ALA")] == [1.0, 10.0]
     assert [f.n_frames for f in training_sets(runs / "ALA")] == [_N * _RUNS]
     peptide_subset.main(["measure", str(out), "--train", str(runs), "--steps", "2"])
     record = json.loads((out / "losses-2.json").read_text())
