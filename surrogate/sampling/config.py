@@ -46,7 +46,7 @@ class RolloutConfig:
     hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
     ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
     solver: str | None = option(
-        "multistep, fitted (few steps), gaussian (peptides), euler or dopri5.", None, unset="the one that suits",
+        "multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.", None, unset="the one that suits",
         section="sampling",
     )  # fmt: skip
     solver_steps: int | None = option(

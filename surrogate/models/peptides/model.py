@@ -54,7 +54,7 @@ class PeptideConfig:
     """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
     shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
     to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
-    beside a stiff one. `usual_steps`: of the solver in rollouts; those that the flow was taught, if it was distilled.
+    beside a stiff one. `usual_steps`, `usual_solver`: of rollouts; those that the flow was taught, if it was distilled.
     Flow times are logit-normal, as elsewhere."""
 
     width: int = 128
@@ -67,6 +67,7 @@ class PeptideConfig:
     conditioning_noise: float = 0.03
     turning_weight: float = 4.0
     usual_steps: int = 6
+    usual_solver: str = "gaussian"
     tau_location: float = 0.5
     tau_scale: float = 1.4
     types: tuple[str, ...] = ()
@@ -229,7 +230,6 @@ class PeptideSlide(Surrogate):
     """
 
     arch: ClassVar[str] = "lam-slide-peptides"
-    solvers = ("gaussian", *flow.solvers_for("linear"))
     float32_layers: tuple[str, ...] = ("flow.of_time", "jumps")
     config: PeptideConfig
     token_mean: Tensor
@@ -241,6 +241,10 @@ class PeptideSlide(Surrogate):
         if config.scale is None or not config.types:
             raise InputError("a model of peptides needs the scale of their coordinates and their residue types.")
         self.config = config
+        suiting = ("gaussian", "angular", *flow.solvers_for("linear"))
+        if config.usual_solver not in suiting:
+            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(suiting)}.")
+        self.solvers = tuple(dict.fromkeys((config.usual_solver, *suiting)))
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)

@@ -14,13 +14,13 @@ from surrogate.models.lam_slide import flow
 MEAN, STD = 1.5, 0.4
 
 
-def gaussian_posterior(interpolant: str, std: float = STD):
-    """E[o1 | o_tau] for data N(MEAN, std^2): the exact data prediction."""
+def gaussian_posterior(interpolant: str, std: float = STD, mean: float = MEAN):
+    """E[o1 | o_tau] for data N(mean, std^2): the exact data prediction."""
 
     def predict(o: Tensor, tau: Tensor) -> Tensor:
         alpha, sigma, _, _ = (flow.expand(c, o) for c in flow.coefficients(tau, interpolant))
         gain = alpha * std**2 / (alpha**2 * std**2 + sigma**2)
-        return MEAN + gain * (o - alpha * MEAN)
+        return mean + gain * (o - alpha * mean)
 
     return predict
 
@@ -179,6 +179,23 @@ def test_gaussian_steps_keep_unit_variance_and_multistep_does_not(n_steps: int) 
     assert errors["gaussian"] < (0.06 if n_steps == 3 else 0.01), errors
     assert min(errors["multistep"], errors["euler"]) > 2.5 * errors["gaussian"], errors
     assert abs(relative_width("gaussian", 0.3, 40) - 1) < 0.01, "of other widths it is of second order, too"
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 10])
+def test_angular_steps_are_exact_for_unit_variance_and_of_second_order_for_others(n_steps: int) -> None:
+    def width_of(solver: str, width: float, n_steps: int) -> float:
+        noise = torch.linspace(-2.0, 2.0, 9, dtype=torch.float64)[:, None]
+        sample = flow.SOLVERS[solver](gaussian_posterior("linear", width, mean=0.0), noise, n_steps, "linear")
+        return float(sample.std() / noise.std())
+
+    assert width_of("angular", 1.0, n_steps) == pytest.approx(1.0, abs=1e-6)
+    assert abs(width_of("gaussian", 1.0, n_steps) - 1.0) > 1e-4, "negative control"
+    for width in (0.5, 1.5):
+        errors = [abs(width_of("angular", width, n) - width) for n in (20, 40, 80)]
+        assert all(0.15 < fine / coarse < 0.35 for coarse, fine in pairwise(errors)), errors
+        assert errors[-1] < 0.002
+    with pytest.raises(ValueError, match="gvp"):
+        flow.angular(gaussian_posterior("linear"), torch.zeros(1, 1), n_steps, "gvp")
 
 
 @pytest.mark.parametrize("width", [2.0, 0.4, 0.2])
