@@ -48,6 +48,8 @@ class PeptideTrainer(Trainer):
         asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
         training = request.settings(PeptideTraining, asked)
         model = request.model if request.start_from is None else read_header(request.start_from).config
+        if request.start_from is not None:  # learning further, a flow forgets the few steps that it was taught
+            model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
         return Settings(PeptideConfig.from_dict(model), training, frozenset(asked))
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:

@@ -88,7 +88,10 @@ def train_peptides(
     """
     out = Path(out)
     torch.manual_seed(training.seed)
-    config = with_scale(config if start is None else start.model.config, sets)
+    if start is not None:
+        # Learning further, a flow forgets the few steps that it was taught to end in.
+        config = replace(start.model.config, usual_steps=config.usual_steps, usual_solver=config.usual_solver)
+    config = with_scale(config, sets)
     device = torch.device(training.device)
     model = PeptideSlide(config).to(device)
     subjects, held_out = (

@@ -321,6 +321,10 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     assert apart["taught"] < 0.5 * apart["still"]
     found = load_weights(out)
     assert (teacher.model.usual_steps, found.model.usual_steps) == (6, 2)
+    assert (teacher.model.solvers[0], found.model.solvers[0]) == ("gaussian", "angular")
+    assert sorted(teacher.model.solvers) == sorted(found.model.solvers)
+    with pytest.raises(InputError, match="usual_solver = 'angle' is none of gaussian, angular"):
+        PeptideSlide(replace(found.model.config, usual_solver="angle"))
     for name, tensor in teacher.model.jumps.state_dict().items():
         torch.testing.assert_close(found.model.jumps.state_dict()[name], tensor)
     assert found.provenance["distilled_to_steps"] == 2
@@ -329,8 +333,14 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
 
     def rolled(weights: Weights, steps: int) -> torch.Tensor:
         model = weights.model
-        return model.next_chunk(last, describe(model, frames.scene), noise, solver_steps=steps).frames_nm
+        chunk = model.next_chunk(last, describe(model, frames.scene), noise, solver_steps=steps, solver="angular")
+        return chunk.frames_nm
 
     there = rolled(teacher, 6)
     ours, its_own = ((rolled(weights, 2) - there).square().mean() for weights in (found, teacher))
     assert ours < 0.5 * its_own
+    # What learns further from it ends in two evaluations no more.
+    request = TrainingRequest("lam-slide-peptides", tmp_path / "on.safetensors", steps=1, start_from=out)
+    model, once = PeptideTrainer().settings(request).model, replace(training, steps=1)
+    on = load_weights(train_peptides([frames], request.out, model, once, start=found)).model
+    assert (on.usual_steps, on.solvers[0]) == (6, "gaussian")
