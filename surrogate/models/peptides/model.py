@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 ENDS = ("<", ">")
 # Residues further apart along the chain are alike far.
 _FAR = 6
+_SOLVERS = ("gaussian", "angular", *flow.solvers_for("linear"))
 _LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
@@ -241,10 +242,9 @@ class PeptideSlide(Surrogate):
         if config.scale is None or not config.types:
             raise InputError("a model of peptides needs the scale of their coordinates and their residue types.")
         self.config = config
-        suiting = ("gaussian", "angular", *flow.solvers_for("linear"))
-        if config.usual_solver not in suiting:
-            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(suiting)}.")
-        self.solvers = tuple(dict.fromkeys((config.usual_solver, *suiting)))
+        if config.usual_solver not in _SOLVERS:
+            raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(_SOLVERS)}.")
+        self.solvers = tuple(dict.fromkeys((config.usual_solver, *_SOLVERS)))
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)
@@ -356,9 +356,8 @@ class PeptideSlide(Surrogate):
         times = ahead.expand(len(known), -1).float()
         drawn = known.new_zeros(*noise.shape[:2], *filled.shape)
         drawn[..., filled] = noise.flatten(2)[..., : int(filled.sum())].to(known)
-        counts = chain.stated.counts
+        counts, apart = chain.stated.counts, times_apart(times, self.config.forgotten_ps)
         shape = (self.n_new, *counts.shape)
-        apart = times_apart(times, self.config.forgotten_ps)
 
         def draw_states(rows: Tensor, attempt: int) -> Tensor:
             seeds = generators(noise[rows], STATES, attempt)
