@@ -124,7 +124,11 @@ def test_peptides_are_trained_and_rolled_by_the_verb(peptides: list[Path], tmp_p
     assert "model.longest_ps = 40.0: --longest-lag" in done.stderr and "frames pass the guards" in done.stderr
     weights = load_weights(out)
     assert weights.model.arch == "lam-slide-peptides" and weights.domain.lag_ps == pytest.approx(2.0)
-    assert len(weights.domain.members) == 2 and weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
+    assert (
+        len(weights.domain.members) == 2
+        and weights.domain.transferable
+        and weights.domain.longest_lag_ps == pytest.approx(40.0, rel=0.1)
+    )
 
 
 def test_a_peptide_from_any_file_is_learned_under_standard_names_and_for_itself_alone(tmp_path: Path) -> None:
@@ -142,6 +146,7 @@ def test_a_peptide_from_any_file_is_learned_under_standard_names_and_for_itself_
     assert done.exit_code == 0, done.stderr
     weights = load_weights(out)
     assert weights.domain.scene.residue_names[1] in ("HID", "HIE"), "whichever its hydrogens say"
+    assert not weights.domain.transferable
     order = match_domain(scene, weights).order
     assert [scene.elements[k] for k in order] == list(weights.domain.scene.elements)
     with pytest.raises(OutOfDomainError, match="atoms"):
