@@ -39,7 +39,7 @@ def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weigh
     not among `origin`'s."""
     earlier = {}
     if start is not None:
-        known = {source.get("sha256") for source in origin.get("sources", ())}
+        known = {source["sha256"] for source in origin.get("sources", ()) if "sha256" in source}
         earlier = {"from": {"hash": start.hash, **_beside(start.provenance, known)}}
     return {
         **earlier,
@@ -51,11 +51,11 @@ def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weigh
     }
 
 
-def _beside(record: dict[str, Any], known: set[str | None]) -> dict[str, Any]:
+def _beside(record: dict[str, Any], known: set[str]) -> dict[str, Any]:
     """Return what earlier weights say of themselves, and those that they began with, of trajectories those that are not
     `known`."""
-    left = [source for source in record.get("sources", ()) if source.get("sha256") not in known - {None}]
+    left = [source for source in record.get("sources", ()) if source.get("sha256") not in known]
     found = {**record, "sources": left} if "sources" in record else dict(record)
     if isinstance(record.get("from"), dict):
-        found["from"] = _beside(record["from"], known | {source.get("sha256") for source in left})
+        found["from"] = _beside(record["from"], known | {source["sha256"] for source in left if "sha256" in source})
     return found
