@@ -36,6 +36,7 @@ from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.state_windows import balanced_starts
 from surrogate.models.peptides.trainer import PeptideTraining, peptide_loss, train_peptides, with_scale
+from systems.errors import InputError
 
 MOST_MIB = 60.0
 # Of frames 1 ps apart; a chunk and the frame before it take 17.
@@ -101,6 +102,8 @@ def _parts(frames: TrainingFrames, ranges: Ranges, every: int) -> TrainingFrames
 def write(out: Path, runs: Path, most_mib: float) -> None:
     """Write the subset of all molecules below `runs` that have any; what is there stays."""
     files = {p.name: found for p in training_peptides() if (found := sorted((runs / p.name).glob(_RUNS)))}
+    if not files:
+        raise InputError(f"{runs} holds no runs of training peptides; give `train` in a folder of `peptide_runs`.")
     atoms = {name: collect_frames(found[:1]).scene.n_atoms for name, found in files.items()}
     room = most_mib * 2**20 - 2 * _HEADER_BYTES * len(files)
     n_frames = int(room / (6 * sum(atoms.values())))
@@ -132,6 +135,8 @@ def held_losses(model: PeptideSlide, sets: Sequence[TrainingFrames]) -> npt.NDAr
 def measure(subset: Path, runs: Path, steps: int) -> None:
     """Train on all runs and on the subset of a tenth of the molecules, print the losses; models stay in `subset`."""
     names = [p.name for p in training_peptides()[::_EVERY] if (subset / p.name).is_dir()]
+    if not names:
+        raise InputError(f"{subset} holds no part of any molecule that is measured; `write` it first.")
     whole = [frames for name in names for frames in training_sets(runs / name)]
     parts = [frames for name in names for frames in training_sets(subset / name)]
     # One start, so that what scales the numbers, and with it the unit of the losses, is one.

@@ -14,6 +14,7 @@ from surrogate.bench.recipes import peptide_subset
 from surrogate.bench.recipes.peptide_subset import choose_parts, held_losses, training_sets
 from surrogate.data.frames import collect_frames
 from surrogate.data.weights import load_weights
+from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_writer
 
@@ -71,6 +72,10 @@ def test_the_subset_fits_and_its_loss_is_measured_beside_that_of_all_runs(
     monkeypatch.setattr(peptide_subset, "_HELD_WINDOWS", 16)
     monkeypatch.setattr(peptide_subset, "_HEADER_BYTES", 15_000)
     out = tmp_path / "subset"
+    with pytest.raises(InputError, match="holds no runs"):
+        peptide_subset.main(["write", str(out), "--train", str(tmp_path / "nowhere")])
+    with pytest.raises(InputError, match="`write` it first"):
+        peptide_subset.main(["measure", str(out), "--train", str(runs)])
     peptide_subset.main(["write", str(out), "--train", str(runs), "--mib", "0.3"])
     files = sorted(out.rglob("*.h5"))
     assert [path.name for path in files] == ["fine.windows.h5", "wide.windows.h5"] * 2
