@@ -22,6 +22,7 @@ HERE = Path(__file__).resolve().parent
 TABLE = HERE.parent / "results" / "tables" / "effective_samples.json"
 CAUSES = TABLE.with_name("n_body_causes.json")
 KT_KJ_PER_MOL = 2.494
+COLOURS = {"peptides": "#d62728", "alanine-dipeptide": "#1f77b4"}
 # of the best polynomial on the 200 held-out trajectories of the study (docs/studies/n_body/n_body_causes.py)
 POLYNOMIAL_ADE = 0.503
 
@@ -32,28 +33,37 @@ def numbers(cell: str) -> list[float]:
 
 
 def draw_effective(table: dict[str, Any], out: Path) -> None:
-    """Draw distance to the truth against effective samples a second, of the surrogate's settings and of OpenMM."""
+    """Draw distance to the truth against effective samples a second, of the surrogates' settings and of MD, and the
+    front: what nothing beats in both."""
+    from surrogate.bench.cost_error.effective_samples import pareto_front
+
     rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    points = [(numbers(row["effective samples/s"])[0], numbers(row["distance"])[0]) for row in rows]
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    for row in rows:
-        rate, (y, *ends) = numbers(row["effective samples/s"])[0], numbers(row["distance"])
-        ours = row["what"].startswith("surrogate")
-        colour = "#d62728" if ours else "black"
+    front = np.array([points[k] for k in pareto_front(points)])
+    axes.plot(*front.T, color="grey", lw=0.8, zorder=0, label="front")
+    labelled = set()
+    for row, (rate, y) in zip(rows, points, strict=True):
+        whose, _, setting = row["what"].partition(", ")
+        colour = COLOURS.get(whose, "black")
+        ends = numbers(row["distance"])[1:]
         error = [[y - ends[0]], [ends[1] - y]] if ends else None
-        axes.errorbar(rate, y, error, color=colour, marker="o" if ours else "s", capsize=2, lw=1, ms=5)
-        name = row["what"].removeprefix("surrogate, ").removeprefix("OpenMM, ")
-        left, below = name.endswith("10"), name.startswith("fitted") or name.endswith("plain")
-        where = {"xytext": (-5 if left else 5, -12 if below else 5), "ha": "right" if left else "left"}
-        where |= {"textcoords": "offset points", "fontsize": 8, "va": "top" if "plain" in name else "baseline"}
-        axes.annotate(name.replace(", ", "\n"), (rate, y), color=colour, **where)
-    axes.plot([], [], "s", color="black", label="OpenMM, by time step")
-    axes.plot([], [], "o", color="#d62728", label="surrogate, by solver and steps")
+        label = None if whose in labelled else whose if whose in COLOURS else "MD"
+        labelled |= {whose} if whose in COLOURS else {"OpenMM", "MD in lanes"}
+        marker = "o" if whose in COLOURS else "s"
+        axes.errorbar(rate, y, error, color=colour, marker=marker, capsize=2, lw=1, ms=5, ls="", label=label)
+        name = setting if whose in ("OpenMM", *COLOURS) else f"in lanes, {setting}"
+        below = name.startswith(("fitted", "gaussian"))
+        where = {"xytext": (3, -4) if below else (-3, 4), "ha": "right" if below else "left"}
+        where |= {"va": "top" if below else "bottom", "rotation": 60}
+        at = (ends[0] if below else ends[1]) if ends else y
+        axes.annotate(name, (rate, at), color=colour, fontsize=7.5, textcoords="offset points", **where)
     axes.set(
         xscale="log",
         xlabel="effective samples of cos ψ a processor second (one core)",
         ylabel="Jensen-Shannon distance of φ/ψ maps",
-        ylim=(0, 0.22),
-        xlim=(0.12, 130),
+        ylim=(0, 0.27),
+        xlim=(0.015, 2500),
     )
     axes.legend(frameon=False, fontsize=8, loc="lower left")
     figure.savefig(out, metadata={"Date": None})

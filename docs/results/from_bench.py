@@ -44,6 +44,7 @@ def reference_speed(measured: dict[str, Any]) -> dict[str, Any]:
 def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
     """Return the table of run time against error: the settings that were judged."""
     config, md = measured["config"], measured["md"]
+    names = list(dict.fromkeys(row["weights"] for row in measured["rows"]))
     rows = []
     for row in (row for row in measured["rows"] if "jsd" in row):
         solver, _, rest = row["label"].partition(" ")
@@ -51,8 +52,8 @@ def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
         valid = [row[key]["value"] for key in ("valid_half_angstrom_%", "bonds_20_percent_%")]
         rows.append(
             [
-                f"`{solver}`, {rest}",
-                f"{row['cpu_s_per_ns']['mean']:.2f}",
+                f"{row['weights']}: `{solver}`, {rest}" if len(names) > 1 else f"`{solver}`, {rest}",
+                significant(row["cpu_s_per_ns"]["mean"]),
                 interval(row["jsd"]),
                 f"> {md['errors'][0]:.2f}" if same is None else f"{same:.2f}",
                 row["worth"]["words"],
@@ -60,10 +61,9 @@ def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
                 " / ".join(f"{value:.2f}" for value in valid),
             ]
         )
-    asked = " ".join(dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"]))
     heads = ["solver, steps", "s/ns", "distance", "MD, same seconds", "worth of MD", "times faster", "0.5 Å / 20 %"]
     return {
-        "command": f"surromd bench cost-error HELD1 HELD2 {asked}",
+        "command": _asked(measured),
         "machine": measured["machine"]["name"],
         "note": f"{1e-3 * config['time_ps']:g} ns at each setting, against two held-out runs of "
         f"{1e-3 * md['length_ps']:g} ns, which are {md['floor']:.3f} apart; {config['threads']} thread(s).",
@@ -78,20 +78,28 @@ def effective_samples(measured: dict[str, Any]) -> dict[str, Any]:
     ns = 1e-3 * min(measured["config"]["time_ps"], md["lengths_ps"][-1])
     near = math.exp(_between(math.log(1e3 * ns), [math.log(x) for x in md["lengths_ps"]], md["errors"]))
     rates = {cost["label"]: 1e3 / cost["cpu_s_per_ns"]["mean"] / (2.0 * slow["tau_ps"]) for cost in md["cost"]}
-    best = max(rates.values())
-    rows = [[name, significant(rate), f"{rate / best:.2g}", f"{near:.3f}"] for name, rate in rates.items()]
+    best = max(rates[cost["label"]] for cost in md["cost"] if cost["way"] != "lanes")
+    rows = [[name, significant(rate), significant(rate / best), f"{near:.3f}"] for name, rate in rates.items()]
     for row in (row for row in measured["rows"] if row.get("effective_per_s")):
         rate = row["effective_per_s"]
-        rows.append([f"surrogate, {row['label']}", significant(rate), f"{rate / best:.2g}", interval(row["jsd"])])
-    asked = " ".join(dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"]))
+        rows.append(
+            [f"{row['weights']}, {row['label']}", significant(rate), significant(rate / best), interval(row["jsd"])]
+        )
     return {
-        "command": f"surromd bench cost-error HELD1 HELD2 {asked}",
+        "command": _asked(measured),
         "machine": measured["machine"].get("about", measured["machine"]["name"]),
         "note": f"Simulated time over 2 max(τ, τ of MD) of {slow['name']} ({slow['tau_ps']:.1f} ps in MD), a processor "
         f"second; distances of φ/ψ maps after {ns:g} ns. Plain: OpenMM's own files and defaults.",
-        "columns": ["what", "effective samples/s", "over the fastest MD", "distance"],
+        "columns": ["what", "effective samples/s", "over OpenMM at its fastest", "distance"],
         "rows": rows,
     }
+
+
+def _asked(measured: dict[str, Any]) -> str:
+    """Return the command of a benchmark of run time against error."""
+    names = dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"])
+    lag_ps = measured["config"]["lag_ps"]
+    return " ".join(["surromd bench cost-error HELD1 HELD2", *names, *([f"--lag {lag_ps:g}ps"] if lag_ps else [])])
 
 
 def _between(x: float, known: list[float], errors: list[float]) -> float:

@@ -20,33 +20,34 @@ if TYPE_CHECKING:
 def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple[Weights, str]:
     """Return the shipped weights that cover a scene, and why these.
 
-    Weights that were trained on the molecule come before those that know molecules like it, and those that draw frames
-    from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks. Only those
-    that cover it are loaded; of the others their headers are read.
+    Weights that were trained on the molecule come before those that know molecules like it; those that draw frames
+    from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks; those that
+    step as far as frames are saved before those for one lag. Headers tell all of this: only those chosen are loaded.
     Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
     """
     found, refusals = [], []
     for name, path in shipped_weights().items():
         header = read_header(path)
-        config = architecture(header.arch).config(header.config)
+        arch = architecture(header.arch)
+        config = arch.config(header.config)
         peptides = config if isinstance(config, PeptideConfig) else None
         try:
             match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
         except OutOfDomainError as error:
             refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
             continue
-        weights = load_weights(path)
-        found.append((not match.seen, weights.model.carries_velocities, name, weights))
+        carries_velocities = getattr(arch.model, "carries_velocities", False)
+        found.append((not match.seen, carries_velocities, not header.domain.jumps, name, path))
     if not found:
         nearest = min(refusals, key=lambda one: one[:3])[3] if refusals else OutOfDomainError("none are shipped.")
         raise OutOfDomainError(
             f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
         )
-    unseen, _, name, weights = min(found, key=lambda one: one[:3])
+    unseen, *_, name, path = min(found)
     others = sorted(other for *_, other, _ in found if other != name)
     why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
     beside = f"; {', '.join(others)} would do, too" if others else ""
-    return weights, f"weights not named, taken are the shipped {name}: {why}{beside}"
+    return load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
 
 
 def weights_to_go_on_from(scene: Scene) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from surrogate.data.shipped import weights_path
 from surrogate.verbs.compare import compare
@@ -29,14 +29,15 @@ def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Compari
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise InputError(f"{folder} is a file; name a folder with `out`.") from None
-    name = "alanine-dipeptide"
-    weights_path(name)  # missing weights are noticed before anything is simulated
+    name, weights = "alanine-dipeptide", "peptides"
+    weights_path(weights)  # missing weights are noticed before anything is simulated
     try:
-        shared = {"seed": options.seed, "quiet": options.quiet, "overwrite": True}
+        shared: dict[str, Any] = {"seed": options.seed, "quiet": options.quiet, "overwrite": True}
         out = folder / "reference.h5"
         truth, replicate = reference(name, out, time_ps=options.reference_ps, replicas=2, **shared)
         out, n = folder / "surrogate.h5", options.rollout_replicas
-        rolled = rollout(name, name, out, time_ps=options.rollout_ps, replicas=n, **shared)
+        saved = {"save_every_ps": options.rollout_save_every_ps}
+        rolled = rollout(name, weights, out, time_ps=options.rollout_ps, replicas=n, **saved, **shared)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
     return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)

@@ -80,19 +80,19 @@ def run_cost_error(
     """Measure weights at their settings and write cost_error.json, .md and .svg into `folder` after each.
 
     What an earlier run left there is kept, if it was of the same references and the same `config`. Raises InputError
-    for references that weights were trained on, for a folder of another benchmark, and for weights of several scenes;
+    for references that weights were trained on, for a folder of another benchmark, and for weights of other molecules;
     StorageError; KeyboardInterrupt says what is kept.
     """
     weights = [one for one, _ in chosen]
     prints = [refuse_trained_on(w, reference, replicate) for w in weights]
     fitted = [_fitted(w, reference, config.lag_ps) for w in weights]
-    if len({w.domain.scene.topology_hash for w in fitted}) != 1:
-        raise InputError("weights of several scenes cannot be measured by one reference; run them one by one.")
     header = {"references": prints[0], "config": asdict(config)}
     result = _earlier(folder, header)
     scene = fitted[0].domain.scene
+    scenes = {w.domain.scene.topology_hash: w.domain.scene for w in fitted}  # atoms may stand in another order
     report("reading the references")
-    truth = read_truth(scene, reference, replicate, config.lag_ps)
+    truths = {hashed: read_truth(of, reference, replicate, config.lag_ps) for hashed, of in scenes.items()}
+    truth = truths[scene.topology_hash]
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with torch_threads(config.threads):
@@ -100,10 +100,11 @@ def run_cost_error(
                 report("OpenMM")
                 result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
             for (one, settings), as_rolled in zip(chosen, fitted, strict=True):
+                of_these = truths[as_rolled.domain.scene.topology_hash]
                 for setting in settings:
                     if not any(row["weights_hash"] == one.hash and _is(row, setting) for row in result["rows"]):
                         report(f"{one.path.stem}: {setting.label}")
-                        row = measure_setting(as_rolled, setting, truth, config, result["md"].get("slowest"))
+                        row = measure_setting(as_rolled, setting, of_these, config, result["md"].get("slowest"))
                         result["rows"].append(row | _earned(row, one, result["md"]))
                         write_cost_error(result, folder)
     except KeyboardInterrupt:
