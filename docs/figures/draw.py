@@ -88,20 +88,22 @@ def draw_n_body(table: dict[str, Any], out: Path) -> None:
     plt.close(figure)
 
 
-def dihedrals(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ and ψ (n_frames,) in degrees of all frames of trajectories of one peptide with one residue of each."""
+def dihedrals(paths: list[Path]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return φ and ψ (n_frames,) in degrees of all frames of trajectories of one peptide with one residue of each, and
+    the time (ns) that they cover."""
     from systems.chemistry.geometry import torsion
     from systems.chemistry.graph import backbone_torsions
     from systems.trajectory.codec import open_trajectory
 
-    frames, quads = [], {}
+    frames, quads, ps = [], {}, 0.0
     for path in paths:
         trajectory = open_trajectory(path)
         quads = backbone_torsions(trajectory.scene)
         frames.append(trajectory.read())
+        ps += float(trajectory.time_ps[-1])
     positions = np.concatenate(frames)
     phi, psi = (np.degrees(torsion(positions, quads[name])[:, 0]) for name in ("phi", "psi"))
-    return phi, psi
+    return phi, psi, 1e-3 * ps
 
 
 def draw_overlay(demo: Path, out: Path) -> None:
@@ -110,11 +112,11 @@ def draw_overlay(demo: Path, out: Path) -> None:
     centres = 0.5 * (edges[1:] + edges[:-1])
     maps = {}
     for title, pattern in (("OpenMM", "reference_r*.h5"), ("surrogate", "surrogate_r*.h5")):
-        phi, psi = dihedrals(sorted(p for p in demo.glob(pattern) if not p.name.endswith(".meta.h5")))
+        phi, psi, ns = dihedrals(sorted(p for p in demo.glob(pattern) if not p.name.endswith(".meta.h5")))
         counts = np.histogram2d(phi, psi, bins=(edges, edges))[0].T
         with np.errstate(divide="ignore"):
             energy = -KT_KJ_PER_MOL * np.log(counts / counts.max())
-        maps[f"{title}, {1e-3 * len(phi):g} ns"] = np.where(counts > 0, energy, np.nan)
+        maps[f"{title}, {ns:.0f} ns"] = np.where(counts > 0, energy, np.nan)
     figure, panels = plt.subplots(1, 3, figsize=(9.2, 3.2), sharex=True, sharey=True, layout="constrained")
     for panel, (title, energy) in zip(panels, maps.items(), strict=False):
         image = panel.pcolormesh(edges, edges, energy, cmap="viridis", vmin=0, vmax=15, rasterized=True)

@@ -98,8 +98,9 @@ def effective_samples(measured: dict[str, Any]) -> dict[str, Any]:
 def _asked(measured: dict[str, Any]) -> str:
     """Return the command of a benchmark of run time against error."""
     names = dict.fromkeys(f"--weights {row['weights']}" for row in measured["rows"])
-    lag_ps = measured["config"]["lag_ps"]
-    return " ".join(["surromd bench cost-error HELD1 HELD2", *names, *([f"--lag {lag_ps:g}ps"] if lag_ps else [])])
+    lag_ps, ns = measured["config"]["lag_ps"], 1e-3 * measured["config"]["time_ps"]
+    lag = [f"--lag {lag_ps:g}ps"] if lag_ps else []
+    return " ".join(["surromd bench cost-error HELD1 HELD2", *names, *lag, f"--time {ns:g}ns"])
 
 
 def _between(x: float, known: list[float], errors: list[float]) -> float:
