@@ -171,8 +171,8 @@ class DemoOptions(Seeded, Quiet):
     """What `demo` can be told."""
 
     reference_ps: float = option("Of each of two OpenMM runs.", 3_000.0, words=None)
-    rollout_ps: float = option("Of each rollout.", 12_800.0, words=None)
-    rollout_save_every_ps: float = option("Between frames of it.", 10.0, words=None)
+    rollout_ps: float = option("Of each rollout.", 3_200.0, words=None)
+    rollout_save_every_ps: float = option("Between frames of it.", 2.0, words=None)
     rollout_replicas: int = option("Rollouts side by side.", 8, within=(1, None), words=None)
 
 
