@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _TEXT_BYTES = 512_000_000
 # HDF5's columns that are read whole: more than this, and more than so many times the file, is not believed.
 _COLUMN_BYTES, _PACKED = 64_000_000, 100
+# HDF5 2 would keep 8 MiB of each column in memory, which many replicas multiply.
+_CACHE_BYTES = 2**20
 # What zipfile, NumPy and h5py raise on files that are damaged, or made to harm.
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError, SystemError,
               MemoryError, OverflowError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
@@ -56,7 +58,7 @@ def open_checked(path: Path, mode: str = "r", source: Any = None) -> h5py.File:
     TrajectoryError for a file that leads to other files, or declares far more than it holds."""
     import h5py
 
-    file = h5py.File(source or path, mode)
+    file = h5py.File(source or path, mode, rdcc_nbytes=_CACHE_BYTES)
     try:
         _check(file, path)
     except BaseException:

@@ -218,6 +218,28 @@ def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
     assert row["curve"][-1][0] == pytest.approx(1e3 * row["ns"], rel=0.2) and row["ns"] < 2.0
 
 
+def test_weights_whose_atoms_stand_in_another_order_are_measured_beside_others(
+    tmp_path: Path, weights: Weights, alanine_dipeptide: Scene
+) -> None:
+    runs = [
+        write(
+            tmp_path / f"h{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k), seed=50 + k, timestep_ps=0.004
+        )
+        for k in range(2)
+    ]
+    tiny = tmp_path / "tiny.safetensors"
+    domain = replace(weights.domain, conditions={**CONDITIONS, "timestep_ps": 0.004})
+    save_weights(tiny, weights.model, domain, weights.provenance)
+    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
+    chosen = [(load_weights(weights_path("peptides")), [Setting("gaussian", 2, "fp32")]),
+              (load_weights(tiny), [Setting("fitted", 2, "fp32")])]  # fmt: skip
+    beside = run_cost_error(chosen, runs[:1], runs[1:], tmp_path / "both", config)["rows"]
+    for row, one in zip(beside, chosen, strict=True):
+        alone = run_cost_error([one], runs[:1], runs[1:], tmp_path / one[0].path.stem, config)["rows"][0]
+        for key in ("jsd", "correlation"):
+            assert row[key] == alone[key], "as if nothing else had been measured"
+
+
 def test_the_verb_says_in_one_line_what_it_cannot_use(
     tmp_path: Path, held: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
