@@ -19,7 +19,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
-from systems.chemistry.graph import bonded_graph, rotatable_torsions
+from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned
 from systems.errors import PreparationError, SimulationError
 from systems.parent_watch import end_with_parent
 from systems.scene import FloatArray, Scene
@@ -157,22 +157,11 @@ class Teacher:
         raise found[-1]
 
 
-def _turned(x: FloatArray, torsion: Any, graph: nx.Graph, angle: float) -> FloatArray:
-    """Return positions with what hangs beyond a torsion's middle bond turned about it, unless atoms then collide."""
-    _, b, c, _ = (int(k) for k in torsion)
-    cut = graph.copy()
-    cut.remove_edge(b, c)
-    side = np.array(sorted(nx.node_connected_component(cut, c)))
-    axis = (x[c] - x[b]) / np.linalg.norm(x[c] - x[b])
-    arm = x[side] - x[c]
-    turned = arm * np.cos(angle) + np.cross(axis, arm) * np.sin(angle)
-    turned += np.outer(arm @ axis, axis) * (1.0 - np.cos(angle))
-    out = x.copy()
-    out[side] = x[c] + turned
-    rest = np.setdiff1d(np.arange(len(x)), [*side.tolist(), b])
-    far = side[side != c]
-    apart = np.linalg.norm(out[far][:, None] - out[rest], axis=-1)
-    return x if apart.size and apart.min() < _CLASH_NM else out
+def _turned(x: FloatArray, quad: Any, graph: nx.Graph, angle: float) -> FloatArray:
+    """Return positions with a torsion turned, unless atoms that this moves against each other then collide."""
+    out = turned(x, quad, angle, graph)
+    before, apart = (np.linalg.norm(at[:, None] - at, axis=-1) for at in (x, out))
+    return x if apart[np.abs(apart - before) > 1e-9].min(initial=np.inf) < _CLASH_NM else out
 
 
 def _start(scene: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 
 import networkx as nx
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from systems.chemistry.geometry import torsion
 from systems.chemistry.matching import match_atoms
 from systems.chemistry.symmetry import classify, element_graph
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
 
 IntArray = npt.NDArray[np.int64]
 
@@ -148,6 +149,21 @@ def exclusions(scene: Scene, depth: int = 3) -> IntArray:
         if i < j
     ]
     return np.array(sorted(rows), dtype=np.int64).reshape(-1, 2)
+
+
+def turned(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: nx.Graph) -> FloatArray:
+    """Return positions `(n_atoms, 3)` with what hangs beyond a torsion's middle bond turned about it, so that the
+    torsion grows by `angle` (radian). `graph`: `bonded_graph`, which the bond must hold together."""
+    _, b, c, _ = (int(k) for k in quad)
+    cut = graph.copy()
+    cut.remove_edge(b, c)
+    side = sorted(nx.node_connected_component(cut, c))
+    axis = (positions_nm[c] - positions_nm[b]) / np.linalg.norm(positions_nm[c] - positions_nm[b])
+    arm = positions_nm[side] - positions_nm[c]
+    out = positions_nm.copy()
+    along = np.outer(arm @ axis, axis) * (1.0 - np.cos(angle))
+    out[side] = positions_nm[c] + arm * np.cos(angle) + np.cross(axis, arm) * np.sin(angle) + along
+    return out
 
 
 def rotatable_torsions(scene: Scene, *, rotors: bool = False) -> IntArray:

@@ -22,7 +22,7 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import platform_properties
 from systems.chemistry.geometry import torsion
-from systems.chemistry.graph import backbone_torsions, rotatable_torsions
+from systems.chemistry.graph import backbone_torsions, bonded_graph, rotatable_torsions, turned
 from systems.errors import InputError
 from systems.scene import Scene
 
@@ -184,13 +184,13 @@ def choose_seeds(scene: Scene, n: int, *, seed: int, platform: str) -> Seeds:
     positions = frames[chosen]
     prolines = [r for r in residues if r.name == "PRO" and r.omega is not None]
     if prolines:
-        turned = rng.choice(n, size=round(n * _CIS_SHARE), replace=False)
-        for i, k in enumerate(turned):
+        cis, graph = rng.choice(n, size=round(n * _CIS_SHARE), replace=False), bonded_graph(scene)
+        for i, k in enumerate(cis):
             quad = prolines[i % len(prolines)].omega
             assert quad is not None
-            positions[k] = _turned(scene, positions[k], quad)
+            positions[k] = turned(positions[k], quad, math.pi, graph)
             groups[k] = "cis"
-        positions = _relaxed(scene, positions, turned, platform)
+        positions = _relaxed(scene, positions, cis, platform)
     order = rng.permutation(n)
     return Seeds(positions[order], tuple(groups[k] for k in order))
 
@@ -229,23 +229,6 @@ def _evenly(pool: IntArray, cells: IntArray, n: int, rng: np.random.Generator) -
     _, inverse, counts = np.unique(cells[pool], return_inverse=True, return_counts=True)
     weights = 1.0 / counts[inverse.ravel()]
     return [int(k) for k in rng.choice(pool, size=n, replace=False, p=weights / weights.sum())]
-
-
-def _turned(scene: Scene, positions_nm: FloatArray, quad: Quad) -> FloatArray:
-    """Return positions with everything on the first side of the middle bond turned by half a circle about it."""
-    import networkx as nx
-
-    from systems.chemistry.graph import bonded_graph
-
-    graph = bonded_graph(scene)
-    graph.remove_edge(quad[1], quad[2])
-    moving = sorted(nx.node_connected_component(graph, quad[1]))
-    axis = positions_nm[quad[2]] - positions_nm[quad[1]]
-    axis = axis / np.linalg.norm(axis)
-    relative = positions_nm[moving] - positions_nm[quad[1]]
-    turned = positions_nm.copy()
-    turned[moving] = positions_nm[quad[1]] + 2.0 * (relative @ axis)[:, None] * axis - relative
-    return turned
 
 
 def _relaxed(scene: Scene, positions_nm: FloatArray, which: IntArray, platform: str) -> FloatArray:

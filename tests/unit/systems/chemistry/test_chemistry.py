@@ -26,6 +26,7 @@ from systems.chemistry.graph import (
     ring_bonds,
     rotatable_torsions,
     stereocentres,
+    turned,
 )
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load
@@ -273,6 +274,19 @@ def test_rotatable_torsions_and_rings(from_smiles: MAKE) -> None:
     assert len(rotatable_torsions(from_smiles("C=CC=C"))) == 1
     assert len(ring_bonds(from_smiles("C1CCCCC1CC"))) == 6
     assert len(ring_bonds(ALA2)) == 0
+
+
+def test_a_turned_torsion_grows_by_the_angle_and_nothing_else_changes() -> None:
+    graph, at = bonded_graph(ALA2), ALA2.positions_nm
+    for quad in rotatable_torsions(ALA2, rotors=True):
+        moved = turned(at, quad, 0.7, graph)
+        grown = float((torsion(moved, [quad]) - torsion(at, [quad]))[0])
+        assert grown % (2.0 * np.pi) == pytest.approx(0.7, abs=1e-9)
+        for pairs in (ALA2.bonds, exclusions(ALA2, 2)):
+            before, after = (np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) for x in (at, moved))
+            assert after == pytest.approx(before, abs=1e-12)
+        others = [q for q in rotatable_torsions(ALA2, rotors=True).tolist() if q != quad.tolist()]
+        assert torsion(moved, others) == pytest.approx(torsion(at, others), abs=1e-9)
 
 
 # ---- bond orders --------------------------------------------------------------------------------------------------
