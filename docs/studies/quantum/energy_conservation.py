@@ -29,7 +29,9 @@ from surrogate.models.painet.potential.model import PainetPotential
 from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
-REPLICAS, TEMPERATURE_K, SETTLE_PS, EVERY_PS, SHORT = 16, 300.0, 2.0, 0.005, 50
+REPLICAS, TEMPERATURE_K, SETTLE_PS, SHORT = 16, 300.0, 2.0, 50
+# Between energies of short runs, and of the long one.
+OFTEN_PS, SELDOM_PS = 0.005, 0.1
 
 
 class Run:
@@ -45,14 +47,14 @@ class Run:
         v = self.thermal * torch.randn(x.shape, generator=self.generator, dtype=x.dtype)
         self.start = model.langevin(x, v, molecule, self.masses, self.thermal, draw, timestep_ps=0.0005)
 
-    def energies(self, timestep_ps: float, time_ps: float) -> FloatArray:
-        """Return total energies `(n, replicas)` in kJ/mol, `EVERY_PS` apart, from the same states each time."""
+    def energies(self, timestep_ps: float, time_ps: float, every_ps: float) -> FloatArray:
+        """Return total energies `(n, replicas)` in kJ/mol, `every_ps` apart, from the same states each time."""
         self.model.config = replace(self.model.config, timestep_ps=timestep_ps, ensemble="nve")
         x, v = self.start
-        steps = round(EVERY_PS / timestep_ps)
+        steps = round(every_ps / timestep_ps)
         still = torch.zeros(REPLICAS, x.shape[1], steps, 3)
         found = []
-        for _ in range(round(time_ps / EVERY_PS)):
+        for _ in range(round(time_ps / every_ps)):
             found.append(self._total(x, v))
             x, v = self.model.verlet(x, v, self.molecule, self.masses, self.thermal, still)
         return np.stack(found)
@@ -75,9 +77,9 @@ def row(name: str, steps: list[float], time_ps: float) -> list[str]:
     assert isinstance(model, PainetPotential)
     model.config = replace(model.config, timestep_ps=steps[0], hydrogen_mass_da=None)
     run = Run(model.eval().requires_grad_(False), scene.positions_nm, Molecule.of(scene))
-    widths = [float(run.energies(step, time_ps / SHORT).std(0).mean()) for step in steps]
-    long = run.energies(steps[len(steps) // 2], time_ps)
-    drifts = np.polyfit(EVERY_PS * np.arange(len(long)), long / scene.n_atoms, 1)[0]
+    widths = [float(run.energies(step, time_ps / SHORT, OFTEN_PS).std(0).mean()) for step in steps]
+    long = run.energies(steps[len(steps) // 2], time_ps, SELDOM_PS)
+    drifts = np.polyfit(SELDOM_PS * np.arange(len(long)), long / scene.n_atoms, 1)[0]
     return [
         f"{Path(name).stem}, {scene.n_atoms} atoms",
         ", ".join(f"{width:.2g}" for width in widths),

@@ -1,0 +1,87 @@
+"""Studies of potentials: profiles against GFN2-xTB's, energy without a bath, and a rival that learns."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import energy_conservation
+import numpy as np
+import pytest
+import rivals
+import torch
+import torsion_profiles
+
+from surrogate.data.shipped import weights_path
+from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.models.interface import Molecule
+from surrogate.models.painet.potential.samples import Samples
+from systems.prepare.molecule import scene_from_smiles
+
+SHIPPED = "paracetamol-gfn2-xtb"
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Weights:
+    return load_weights(weights_path(SHIPPED))
+
+
+def test_profiles_tell_right_weights_from_shaken_ones(shipped: Weights, tmp_path: Path) -> None:
+    right = torsion_profiles.rows(SHIPPED)
+    assert [row[1] for row in right] == ["H11-C0-C1-O2", "C1-N3-C4-C5", "C6-C7-O8-H17"]
+    assert all(float(row[5]) < 1.0 for row in right)  # kJ/mol, the largest error of each
+    assert [float(row[2]) for row in right] == pytest.approx([4.3, 25.3, 23.6], abs=0.3)  # GFN2-xTB's barriers
+    wrong = tmp_path / "wrong.safetensors"
+    model = load_weights(weights_path(SHIPPED)).model
+    with torch.no_grad():
+        for p in model.parameters():
+            p.mul_(1.0 + 0.3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0)))
+    save_weights(wrong, model, shipped.domain, shipped.provenance)
+    assert max(float(row[5]) for row in torsion_profiles.rows(str(wrong))) > 2.0
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="by torch it takes minutes")
+def test_fluctuations_of_energy_go_with_the_square_of_the_step(
+    shipped: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(energy_conservation, "SETTLE_PS", 0.5)
+    model, scene = shipped.model, shipped.domain.scene
+    model.config = replace(model.config, timestep_ps=0.0005, hydrogen_mass_da=None)
+    run = energy_conservation.Run(model.eval().requires_grad_(False), scene.positions_nm, Molecule.of(scene))
+    steps = [0.0005, 0.001]
+    widths = [float(run.energies(step, 0.2, 0.005).std(0).mean()) for step in steps]
+    assert energy_conservation.slope(steps, widths) == pytest.approx(2.0, abs=0.25)
+    # Forces that are no energy's gradient heat or cool.
+    exact = model.forces
+    monkeypatch.setattr(model, "forces", lambda x, m: exact(x, m) + 0.02 * exact(x, m).roll(1, -1))
+    assert run.energies(0.0005, 0.2, 0.005).std(0).mean() > 5 * widths[0]
+
+
+def test_a_rival_learns_what_it_is_shown() -> None:
+    scene = scene_from_smiles("O")
+    molecule, rng = Molecule.of(scene), np.random.default_rng(0)
+    x = scene.positions_nm + 0.005 * rng.normal(size=(60, 3, 3))
+
+    def springs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        energy, forces = np.zeros(len(x)), np.zeros_like(x)
+        for i, j in scene.bonds.tolist():
+            apart = x[:, i] - x[:, j]
+            length = np.linalg.norm(apart, axis=-1, keepdims=True)
+            pull = 2e5 * (length - 0.096) * apart / length
+            energy += 1e5 * (length[:, 0] - 0.096) ** 2
+            forces[:, i] -= pull
+            forces[:, j] += pull
+        return energy, forces
+
+    energies, forces = springs(x)
+    torch.manual_seed(0)
+    network = rivals.EgnnEnergy(molecule, width=16, n_layers=2)
+    error = []
+    for budget_s in (0.05, 4.0):
+        _, scale, _ = rivals.learn(network, Samples(x, energies, forces, np.zeros(60, bool)), budget_s)
+        found = rivals.gradient_of(network)(torch.tensor(x))[1].double().numpy()
+        error.append(float(np.abs(-scale * found - forces).mean()))
+    assert error[1] < 0.5 * error[0] and error[1] < 0.4 * np.abs(forces).mean()
+    frames, forces_a_s = rivals.roll(network.eval(), scale, scene.positions_nm, molecule, 0.2, 60.0)
+    assert frames.shape == (2, 32, 3, 3) and forces_a_s > 0
