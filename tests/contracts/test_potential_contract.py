@@ -159,6 +159,19 @@ def test_steps_in_lanes_are_those_of_torch(timestep_ps: float, rows: int, monkey
 
 
 @needs_compiler
+@pytest.mark.parametrize("rows", [4, 5, 16, 32])
+def test_frames_stay_as_they_were_when_the_next_are_made(rows: int) -> None:
+    # A whole block of copies lies in memory as the program wants it: it must not be moved on in place.
+    molecule, model = branched_chain(9), lively(replace(SMALL, n_new=3))
+    start = walks(9, rows).float()[:, None]
+    noise = torch.randn(rows, *model.noise_shape(9), generator=torch.Generator().manual_seed(6))
+    frames = model.next_chunk(start, molecule, noise).frames_nm
+    assert (frames.diff(dim=1).abs().amax((2, 3)) > 1e-5).all()
+    one_more = model.next_chunk(start[:1], molecule, noise[:1]).frames_nm
+    torch.testing.assert_close(frames[:1], one_more, rtol=0, atol=1e-6)
+
+
+@needs_compiler
 def test_lanes_are_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     def in_lanes(model: PainetPotential, n_atoms: int) -> bool:
         x, molecule = walks(n_atoms), branched_chain(n_atoms)

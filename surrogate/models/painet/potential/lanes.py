@@ -203,11 +203,13 @@ def _width(rows: int) -> int:
 
 
 def _laid(values: Tensor, lanes: int) -> Tensor:
-    """`values` (rows, ..) -> (blocks, .., lanes); lanes without a row of their own hold the last."""
+    """`values` (rows, ..) -> (blocks, .., lanes), a copy, which the program moves in place; lanes without a row of their
+    own hold the last."""
     n_blocks = -(-len(values) // lanes)
     if n_blocks * lanes > len(values):
         values = values[torch.arange(n_blocks * lanes).clamp(max=len(values) - 1)]
-    return values.unflatten(0, (n_blocks, lanes)).movedim(1, -1).contiguous()
+    # One whole block that comes `_back` from here lies as it is wanted: `contiguous` would not copy it.
+    return values.unflatten(0, (n_blocks, lanes)).movedim(1, -1).clone(memory_format=torch.contiguous_format)
 
 
 def _back(laid: Tensor, rows: int) -> Tensor:
