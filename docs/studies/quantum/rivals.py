@@ -195,8 +195,8 @@ def main() -> None:
     rows = []
     for name in given.molecules.split(","):
         folder = given.folder / name
-        steps = load_weights(folder / "painet.safetensors").provenance
-        sys.stdout.write(f"{name}: PAINET's own training {steps.get('settings', {}).get('training_s')} s\n")
+        made = load_weights(folder / "painet.safetensors").provenance
+        sys.stdout.write(f"{name}: PAINET trained for {made['training_s']:g} s of wall time\n")
         for rival in given.rivals.split(","):
             rows.append(rival_row(rival, name, folder, parse_wall_s(given.budget), parse_wall_s(given.roll), given))
             sys.stdout.write(" | ".join(rows[-1]) + "\n")
