@@ -30,6 +30,7 @@ from systems.preparation import Preparation
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
+    from surrogate.judge.comparison import Comparison
     from systems.scene import Scene
 
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
@@ -259,6 +260,18 @@ def _burst(site: Site, record: RunRecord) -> RunRecord:
     return record
 
 
+def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs:
+    """Return what the trajectory that a comparison judges has cost, beside what `held_ps` of the run's own held-out MD
+    did."""
+    spent, rates = record.spent_in, _rates_and_decision(record)[0]
+    # The faster of what was measured before and what it came to: the gain is a lower bound.
+    md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
+    training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
+    # What reading weights takes is no part of it: a longer rollout does it once, too.
+    rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
+    return Costs(rolling_s, training_s, md_ps_per_s, record.settings["budget_s"])
+
+
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.judge.report.report import Foreword, write_report
 
@@ -270,17 +283,11 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
-    spent = record.spent_in
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
-    # The faster of what was measured before and what it came to: the gain is a lower bound.
-    md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
-    training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
+    costs = costs_of(record, comparison, held_ps)
     bursts_file = site.folder / BURSTS_NAME
     said = parsed(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
-    # What reading weights takes is no part of it: a longer rollout does it once, too.
-    rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
-    costs = Costs(rolling_s, training_s, md_ps_per_s, site.options.budget_s)
     found = outcome(decision.way, comparison, costs, said, notes)
     lines = [*table(rates, decision, site.options.budget_s), *(("note", note) for note in notes)]
     write_report(

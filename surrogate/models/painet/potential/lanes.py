@@ -203,8 +203,8 @@ def _width(rows: int) -> int:
 
 
 def _laid(values: Tensor, lanes: int) -> Tensor:
-    """`values` (rows, ..) -> (blocks, .., lanes), a copy, which the program moves in place; lanes without a row of their
-    own hold the last."""
+    """`values` (rows, ..) -> (blocks, .., lanes), a copy, which the program moves in place; lanes that have no row
+    hold the last."""
     n_blocks = -(-len(values) // lanes)
     if n_blocks * lanes > len(values):
         values = values[torch.arange(n_blocks * lanes).clamp(max=len(values) - 1)]
