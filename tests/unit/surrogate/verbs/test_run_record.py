@@ -24,6 +24,7 @@ from surrogate.verbs.run.run_record import (
     settings_of_run,
     write_run,
 )
+from surrogate.verbs.run.stages import costs_of
 from systems.errors import InputError, PreparationError
 
 RATES = Rates(22, 2, 1.0, False, "OBC2", 25e-6, 0.004, 320.0, "", Rolls("alanine-dipeptide", 1.0, 1600.0))
@@ -112,6 +113,17 @@ def test_the_headline_says_held_out_worth_and_least_gain() -> None:
     assert found.headline.startswith("12 ns of held-out MD; the 50 ns of the surrogate are worth 10 ns [8 ns, 12 ns]")
     assert found.gain == pytest.approx(8_000.0 / (200.0 * 10.0)) and "gain at least 4:" in found.headline
     assert found.headline.endswith("Beyond that, by bursts of MD, it moves as the truth does.")
+
+
+def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:
+    account = SimpleNamespace(wall_s=7.0)
+    comparison: Any = SimpleNamespace(judgements=(SimpleNamespace(account=account),))
+    spent = {"train": 100.0, "training md": 20.0, "rollout": 9.0, "held-out md": 10.0, "report": 50.0}
+    run = replace(record(), spent_in=spent)
+    assert costs_of(run, comparison, 1_000.0) == Costs(7.0, 120.0, RATES.md_ps_per_s, 600.0)
+    assert costs_of(run, comparison, 5_000.0).md_ps_per_s == 500.0, "MD came to more than was measured"
+    account.wall_s = None
+    assert costs_of(run, comparison, 1_000.0).rolling_s == 9.0
 
 
 def test_a_capped_worth_is_at_least_what_md_there_is() -> None:
