@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import energy_conservation
+import gain
 import numpy as np
 import pytest
 import rivals
@@ -15,6 +16,7 @@ import torsion_profiles
 
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.judge.worth import Worth
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.samples import Samples
 from systems.prepare.molecule import scene_from_smiles
@@ -56,6 +58,14 @@ def test_fluctuations_of_energy_go_with_the_square_of_the_step(
     exact = model.forces
     monkeypatch.setattr(model, "forces", lambda x, m: exact(x, m) + 0.02 * exact(x, m).roll(1, -1))
     assert run.energies(0.0005, 0.2, 0.005).std(0).mean() > 5 * widths[0]
+
+
+def test_gain_is_worth_over_what_the_time_buys() -> None:
+    worth = Worth("rotors", "distribution", "rotors", 4_000.0, 1_000.0, None, "at least", 0.1, (1e3, 4e3), (2.0, 1.0),
+                  (), ())  # fmt: skip
+    assert gain.gain_words(worth, 800.0) == "at least 5 [1.2, ...]"
+    assert gain.gain_words(replace(worth, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
+    assert gain.gain_words(replace(worth, low_ps=None), 800.0) == "at least 5"
 
 
 def test_a_rival_learns_what_it_is_shown() -> None:

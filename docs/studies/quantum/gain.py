@@ -5,8 +5,8 @@
 
 FOLDER gets a run of each budget, `surromd run SCENE --level gfn2-xtb --way surrogate`, and two runs of MD of `--time`
 each, from another seed, that judge them: one is the truth, the other its replicate. What is there is not made again,
-what was stopped goes on. Worth ends at `--time`. Gain is a lower bound as the runs' own reports have it: the least that
-the trajectory may be worth, over the MD on all cores in the wall time of training and rolling.
+what was stopped goes on. Worth ends at `--time`. Gain: worth over the MD on all cores in the wall time of training and
+of the part of the rollout that comes so near, with the 95 % interval of the worth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from surrogate.verbs.run.outcome_words import outcome
+from surrogate.judge.worth import Worth
 from surrogate.verbs.run.run_record import RUN_NAME, RunRecord, read_run
 from surrogate.verbs.run.stages import costs_of
 from systems.units import format_time_ps, format_wall, parse_time_ps, parse_wall_s
@@ -34,22 +34,32 @@ def made(scene: str, folder: Path, budget_s: float) -> RunRecord:
     return read_run(folder)
 
 
+def gain_words(worth: Worth, bought_ps: float) -> str:
+    """Return a worth over the MD that its cost buys, with the interval: 'at least 5.7 [1.9, ...]'."""
+    ends = [None if end is None else f"{end / bought_ps:.2g}" for end in (worth.low_ps, worth.high_ps)]
+    said = f"{worth.bound} {worth.worth_ps / bought_ps:.2g}".strip()
+    if ends == [None, None]:
+        return said
+    return f"{said} [{ends[0] or '...'}, {ends[1] or '...'}]"
+
+
 def row(folder: Path, record: RunRecord, long: list[Path]) -> list[str]:
     """Return a line of the table."""
     comparison = sm.compare(long[0], [[folder / file for file in record.trajectory]], replicate=long[1])
-    assert record.outcome is not None and record.decision is not None
-    costs = costs_of(record, comparison, record.outcome.held_out_ps)
-    found = outcome(record.decision.way, comparison, costs)
+    assert record.outcome is not None
+    judged, costs = comparison.judgements[0], costs_of(record, comparison, record.outcome.held_out_ps)
+    worth = next((w for w in judged.worth if w.kind == "distribution"), None) if judged.worth_words else None
+    share = worth.share if worth else 1.0
+    bought_ps = costs.md_ps_per_s * (costs.training_s + share * costs.rolling_s)
     return [
         format_wall(record.settings["budget_s"]),
         format_wall(costs.training_s),
-        format_wall(costs.rolling_s),
-        format_time_ps(found.rolled_ps, 2),
-        format_time_ps(costs.md_ps_per_s * (costs.training_s + costs.rolling_s), 2),
+        f"{format_time_ps(judged.account.total_ps, 2)} in {format_wall(costs.rolling_s)}",
         record.outcome.worth or "not told",
-        found.worth or "not told",
-        "not told" if found.gain is None else f"{found.gain:.2g}",
-        found.status,
+        worth.in_words() if worth else "not told",
+        format_time_ps(bought_ps, 2),
+        gain_words(worth, bought_ps) if worth else "not told",
+        judged.status,
     ]
 
 
@@ -77,8 +87,8 @@ def main() -> None:
             "command": f"python docs/studies/quantum/gain.py {given.scene!r} FOLDER",
             "machine": machine_name(),
             "note": f"{given.scene}, two runs of {format_time_ps(given.time)} of {LEVEL} from another seed.",
-            "columns": ["budget", "trained for", "rolled for", "rolled", "MD in that time", "worth told",
-                        "worth by long MD", "gain at least", "verdict by long MD"],
+            "columns": ["budget", "trained for", "rolled", "worth told", "worth by long MD", "MD for as much time",
+                        "gain", "verdict by long MD"],
             "rows": rows,
         }  # fmt: skip
         given.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
