@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import corrected_md
 import energy_conservation
 import gain
 import numpy as np
@@ -20,6 +21,7 @@ from surrogate.judge.worth import Worth
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.samples import Samples
 from systems.prepare.molecule import scene_from_smiles
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 SHIPPED = "paracetamol-gfn2-xtb"
 
@@ -58,6 +60,45 @@ def test_fluctuations_of_energy_go_with_the_square_of_the_step(
     exact = model.forces
     monkeypatch.setattr(model, "forces", lambda x, m: exact(x, m) + 0.02 * exact(x, m).roll(1, -1))
     assert run.energies(0.0005, 0.2, 0.005).std(0).mean() > 5 * widths[0]
+
+
+def test_a_corrected_chain_follows_the_truth_whatever_moves_it() -> None:
+    masses = torch.tensor([[12.0], [16.0]], dtype=torch.float64)
+    true, wrong = 4_000.0, 6_000.0  # kJ/mol/nm^2 of a spring of no length between two atoms
+
+    def springs(k: float) -> corrected_md.Energies:
+        return lambda x: 0.5 * k * (x[:, 0] - x[:, 1]).square().sum(-1)
+
+    def leapfrog(x: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        pull = torch.tensor([[-1.0], [1.0]], dtype=x.dtype)
+        for _ in range(6):
+            v = v + 0.005 * wrong * pull * (x[:, :1] - x[:, 1:]) / masses
+            x = x + 0.01 * v
+            v = v + 0.005 * wrong * pull * (x[:, :1] - x[:, 1:]) / masses
+        return x, v
+
+    def spread(k: float) -> float:
+        x = torch.zeros(2_000, 2, 3, dtype=torch.float64)
+        chain = corrected_md.Chain(x, masses, springs(k), leapfrog, lambda v, x: v, 0)
+        found = []
+        for step in range(120):
+            chain.step()
+            if step >= 60:
+                found.append((chain.x[:, 0] - chain.x[:, 1]).square().mean())
+        assert 0.5 < chain.accepted / chain.asked < 1.0
+        assert (masses * chain.v).sum(1).abs().max() < 1e-9, "the centre of mass stays at rest"
+        return float(torch.stack(found).mean())
+
+    kt = GAS_CONSTANT_KJ_MOL_K * corrected_md.TEMPERATURE_K
+    assert spread(true) == pytest.approx(kt / true, rel=0.01)
+    assert spread(wrong) == pytest.approx(kt / wrong, rel=0.01)
+
+
+def test_chains_start_all_over() -> None:
+    scene = scene_from_smiles("CC(=O)Nc1ccc(O)cc1")
+    found = corrected_md.starts(scene, 12, 0)
+    bonds = np.linalg.norm(found[:, scene.bonds[:, 0]] - found[:, scene.bonds[:, 1]], axis=-1)
+    assert np.ptp(bonds, axis=0).max() < 1e-6 and len({round(float(x), 6) for x in found[:, 17, 2]}) == 12
 
 
 def test_gain_is_worth_over_what_the_time_buys() -> None:
