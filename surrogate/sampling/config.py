@@ -20,8 +20,9 @@ class RolloutConfig:
     'auto' is bf16 where the processor multiplies it faster.
 
     `guard`: see `surrogate.sampling.interventions`. `energy_every`: k, the energy of every k-th model frame is
-    checked, after stiff bonds are relaxed; 0 checks none. `select` and `atoms` say which atoms are written; all are
-    computed. Raises InputError.
+    checked, after stiff bonds are relaxed; 0 checks none. `anneal_ps`: before its first frame each replica of a learned
+    potential moves for so long, from 600 K down to its temperature, so that torsions that turn seldom start all over.
+    `select` and `atoms` say which atoms are written; all are computed. Raises InputError.
     """
 
     time_ps: float = option("Simulated time, such as 100ns.")
@@ -45,6 +46,9 @@ class RolloutConfig:
     timestep_ps: float | None = option("Of a learned potential; above 2fs bonds to hydrogen are rigid.", None)
     hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
     ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
+    anneal_ps: float = option(
+        "Of a learned potential: replicas start from so much MD at 600 K, cooled.", 0.0, within=(0.0, None)
+    )
     solver: str | None = option(
         "multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.", None, unset="the one that suits",
         section="sampling",

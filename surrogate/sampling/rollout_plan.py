@@ -64,6 +64,8 @@ def settle_plan(
         kept = np.intersect1d(kept, select_atoms(scene, config.select))
     if not len(kept):
         raise InputError(f"the selection leaves no atom of {scene.name} to write.")
+    if config.anneal_ps and not weights.model.integrates:
+        raise InputError("`anneal_ps` is for learned potentials; these weights learned frames. Leave it out.")
     centre = scene.positions_nm.mean(axis=0)
     settings = {
         **asdict(config),
@@ -74,7 +76,7 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    for key in ("lag_ps", "compile", "stiff", "friction_per_ps", "timestep_ps", "ensemble"):
+    for key in ("lag_ps", "compile", "stiff", "friction_per_ps", "timestep_ps", "ensemble", "anneal_ps"):
         if settings[key] in (None, False):
             del settings[key]  # as checkpoints of earlier versions have it
     return Plan(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.sampling.chunks import ChunkSampler
+from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import GUARDS, RolloutConfig
 from surrogate.sampling.domain import fit_weights, in_bath
 from surrogate.sampling.guards import Guard
@@ -23,6 +23,7 @@ from surrogate.sampling.record import Speed, close_account, new_record, why_stop
 from surrogate.sampling.rollout_account import Clock, Tally
 from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
 from surrogate.sampling.rollout_plan import Plan, settle_plan
+from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError
 from systems.files.outside import check_disk
 from systems.interrupts import deferred_interrupt
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
     from surrogate.data.weights import Weights
 
 __all__ = ["GUARDS", "RolloutConfig", "rollout"]
+
+# Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
+HOT_K, HOT_STAGES, ANNEAL_STAGES = 600.0, 3, 10
 
 # (frames done, frames in all, account of speed and interventions) of one replica -> None
 ProgressFn = Callable[[int, int, str], None]
@@ -110,7 +114,10 @@ def rollout(
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
         kept = last_supported(state_path, outs) if resume and state_path.exists() else None
-        state = _start(plan, sampler, len(outs)) if kept is None else progress_of(state_path, kept, plan.settings)
+        if kept is None:
+            state = _start(plan, sampler, len(outs), asked_to_stop)
+        else:
+            state = progress_of(state_path, kept, plan.settings)
         header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
         checkpoint = CheckpointFile(state_path, kept)
         if plan.n_frames < header.get("n_frames_wanted", 0):
@@ -192,11 +199,40 @@ def rollout(
     return list(outs)
 
 
-def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int) -> Progress:
+def _start(plan: Plan, sampler: ChunkSampler, n_replicas: int, asked_to_stop: Callable[[], bool]) -> Progress:
     positions = plan.scene.positions_nm - plan.scene.positions_nm.mean(axis=0)
     start = positions.astype(np.float32)[plan.match.order]
     frames = np.broadcast_to(start, (n_replicas, sampler.n_conditioning, *start.shape)).copy()
-    return Progress(frames, tallies=[Tally() for _ in range(n_replicas)])
+    began = time.monotonic()
+    if plan.config.anneal_ps:
+        frames = _annealed(plan, frames, asked_to_stop)
+    return Progress(frames, wall_s=time.monotonic() - began, tallies=[Tally() for _ in range(n_replicas)])
+
+
+def _annealed(plan: Plan, start: npt.NDArray[np.float32], asked_to_stop: Callable[[], bool]) -> npt.NDArray[np.float32]:
+    """Return where replicas `(replicas, n_conditioning, n_atoms, 3)` nm of a potential come to rest after MD at a high
+    temperature that falls to theirs; one that flies apart on the way starts as it was."""
+    config, frames = plan.weights.model.config, start
+    falling = np.geomspace(max(HOT_K, config.temperature_k), config.temperature_k, ANNEAL_STAGES - HOT_STAGES + 1)
+    stages = [falling[0]] * (HOT_STAGES - 1) + list(falling)
+    chunks = max(1, round(plan.config.anneal_ps / len(stages) / (config.n_new * config.lag_ps)))
+    for stage, temperature_k in enumerate(stages):
+        sampler = ChunkSampler(in_bath(plan.weights, {"temperature_k": float(temperature_k), "ensemble": "nvt"}))
+        velocities = None
+        for k in range(chunks):
+            if asked_to_stop():
+                raise KeyboardInterrupt
+            # Chunks of the rollout count from 0.
+            seeds = [noise_seed(plan.config.seed, row, -1 - stage * chunks - k) for row in range(len(frames))]
+            drawn = sampler.draw(frames, seeds, velocities)
+            frames, velocities = drawn.frames_nm[:, -sampler.n_conditioning :].copy(), drawn.velocities_nm_ps
+            lost = ~np.isfinite(frames).all(axis=(1, 2, 3))
+            frames[lost] = start[lost]
+            if velocities is not None:
+                velocities[lost] = np.nan
+    lost = check_frames(frames[:, -1], Geometry.from_dict(plan.weights.domain.geometry)) & INVALID != 0
+    frames[lost] = start[lost]
+    return frames
 
 
 def _move_on(state: Progress, chunk: Chunk, sampler: ChunkSampler) -> None:

@@ -40,6 +40,8 @@ _LEAST_FRAMES = 20
 # read and encoded (of an atom in a frame), which may take so large a share.
 _OPTIMISING, _LEAST_OPTIMISING = 0.95, 0.1
 _BESIDE_STEPS_S, _ENCODING_S, _ENCODING = 9.0, 1.2e-5, 0.3
+# Of a potential's rollout goes into annealing, at most: what turns once in a ns would keep the state it was built in.
+_ANNEAL_PS, _ANNEAL = 50.0, 0.2
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
 # What a stage takes a third of its time, or ten seconds, to load when it is the first to.
@@ -234,6 +236,7 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
+            anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.dear else 0.0,
             # Of a potential only the truth could mend frames; a replica that flies apart must not end the others.
             guard="resample" if rates.dear else "repair",
             resume=True,

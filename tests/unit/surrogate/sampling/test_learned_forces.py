@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import mdtraj
 import numpy as np
 import pytest
 import torch
 
 from md_reference.forces.quantum import Potential
-from surrogate.data.weights import TrainingDomain, Weights
+from surrogate.data.shipped import weights_path
+from surrogate.data.weights import TrainingDomain, Weights, load_weights
 from surrogate.judge.read.ensemble import load_ensemble
 from surrogate.models.painet.config import PainetConfig
 from surrogate.models.painet.model import Painet
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
 from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces
 from surrogate.sampling.runner import RolloutConfig, rollout
@@ -108,6 +112,49 @@ def test_a_potential_is_rolled_in_the_bath_that_is_asked_for(tmp_path: Path) -> 
     assert potential.config.temperature_k == 300.0
     with pytest.raises(InputError, match="hydrogen"):
         RolloutConfig(time_ps=0.02, hydrogen_mass_da=50.0)
+
+
+def test_annealed_replicas_start_all_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_weights(weights_path("paracetamol-gfn2-xtb"))
+    scene, methyl = loaded.domain.scene, [11, 0, 1, 2]
+    asked: list[float] = []
+
+    def rolled(name: str, anneal_ps: float) -> Any:
+        outs = [tmp_path / f"{name}_r{k}.h5" for k in range(3)]
+        rollout(scene, loaded, outs, RolloutConfig(time_ps=0.1, guard="off", anneal_ps=anneal_ps))
+        frames = [scene.positions_nm, *(open_trajectory(out).read()[0] for out in outs)]
+        run = mdtraj.Trajectory(np.stack(frames), scene.to_mdtraj_topology())
+        turned = np.rad2deg(mdtraj.compute_dihedrals(run, [methyl])[:, 0])
+        return (turned[1:] - turned[0] + 180.0) % 360.0 - 180.0
+
+    def bath_of(weights: Weights, bath: dict[str, Any]) -> Weights:
+        asked.append(bath.get("temperature_k", 0.0))
+        return in_bath(weights, bath)
+
+    monkeypatch.setattr(runner, "in_bath", bath_of)
+    still = rolled("still", 0.0)
+    assert np.abs(still).max() < 60.0
+    turned = rolled("turned", 10.0)
+    assert np.abs(turned).max() > 90.0
+    hot = [kelvin for kelvin in asked if kelvin]
+    assert hot[:3] == [600.0] * 3 and hot[-1] == pytest.approx(300.0) and (np.diff(hot[2:]) < 0.0).all()
+    # One that flies apart starts as it was.
+    draw = runner.ChunkSampler.draw
+    calls = iter(range(100))
+
+    def flying(self: Any, *given: Any) -> Any:
+        drawn = draw(self, *given)
+        if next(calls) == 9:
+            drawn.frames_nm[1] = np.nan
+        return drawn
+
+    monkeypatch.setattr(runner.ChunkSampler, "draw", flying)
+    lost = rolled("lost", 10.0)
+    assert abs(lost[1]) < 60.0
+    assert abs(lost[0] - turned[0]) < 1e-3
+    other = weights(Painet(PainetConfig(n_new=2, width=16)))
+    with pytest.raises(InputError, match="learned potentials"):
+        rollout(other.domain.scene, other, [tmp_path / "x.h5"], RolloutConfig(time_ps=0.1, anneal_ps=1.0))
 
 
 def test_models_of_frames_take_no_other_bath() -> None:
