@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -244,7 +245,10 @@ def faults_of(kind: Kind, at_most: int) -> tuple[int, int, list[str]]:
     kind.read()
     n, refused, faults = 0, 0, []
     trials = [(place, value) for place in places(kind.record) for value in WRONG]
-    for place, value in trials[:: max(len(trials) // at_most, 1)]:
+    stride = max(len(trials) // at_most, 1)
+    while math.gcd(stride, len(WRONG)) > 1:
+        stride += 1  # one that shares a factor would try the same few values everywhere
+    for place, value in trials[::stride]:
         if value is None and isinstance(kind.record.get("temperatures"), list):
             continue  # TOML knows no null
         said = f"{place} = {'gone' if value is GONE else 'more' if value is MORE else value!r}"
