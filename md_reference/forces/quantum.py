@@ -5,7 +5,9 @@ GFN2-xTB: Bannwarth, Ehlert and Grimme, J. Chem. Theory Comput. 15, 1652 (2019).
 
 from __future__ import annotations
 
-import os
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,6 +113,28 @@ def _minimum_nm(scene: Scene, system: Any) -> FloatArray:
     return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
 
 
+def _openmp() -> Any:
+    """Return the OpenMP library whose threads tblite takes, torch's where that was loaded before; None without one."""
+    try:
+        return ctypes.CDLL("libgomp.so.1")
+    except OSError:
+        return None
+
+
+@contextmanager
+def _one_thread(openmp: Any) -> Iterator[None]:
+    """Molecules of this size only lose by more threads, which wait in a loop: twice the time, more on busy cores."""
+    if openmp is None:
+        yield
+        return
+    before = openmp.omp_get_max_threads()
+    openmp.omp_set_num_threads(1)
+    try:
+        yield
+    finally:
+        openmp.omp_set_num_threads(before)
+
+
 class Potential:
     """GFN2-xTB of one molecule: positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm.
 
@@ -121,8 +145,6 @@ class Potential:
     def __init__(self, scene: Scene) -> None:
         from openmm.app import Element
 
-        # Read when its libraries load; molecules of this size only lose by more threads.
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
         try:
             from tblite.interface import Calculator
         except ImportError as error:
@@ -144,6 +166,7 @@ class Potential:
         )
         self._calculator.set("verbosity", 0)
         self._scene = scene
+        self._openmp = _openmp()
 
     def __reduce__(self) -> tuple[type[Potential], tuple[Scene]]:
         return Potential, (self._scene,)
@@ -151,7 +174,8 @@ class Potential:
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         try:
             self._calculator.update(positions=positions_nm / NM_PER_BOHR)
-            result = self._calculator.singlepoint()
+            with _one_thread(self._openmp):
+                result = self._calculator.singlepoint()
         except (RuntimeError, ValueError) as error:
             name, reason = self._scene.name, str(error).splitlines()[0]
             raise PreparationError(

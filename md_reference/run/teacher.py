@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -166,7 +165,6 @@ def _turned(x: FloatArray, quad: Any, graph: nx.Graph, angle: float) -> FloatArr
 
 def _start(scene: dict[str, Any]) -> None:
     global _worker
-    os.environ["OMP_NUM_THREADS"] = "1"
     # Ctrl-C is the parent's to answer: a worker that it ends while it takes a task leaves the pool's queue locked.
     for name in ("SIGINT", "SIGHUP"):
         if hasattr(signal, name):

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -174,3 +179,21 @@ def test_stiff_bonds_of_a_frame_relax_on_a_copy_of_the_system() -> None:
         found = relaxer.relax(stretched)
     assert found.potential_kj_mol == pytest.approx(potential(found.positions_nm)[0], abs=1e-4)
     assert found.potential_kj_mol < potential(stretched)[0] - 10.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted by Linux's /proc")
+def test_one_thread_is_enough_wherever_openmp_was_loaded_first() -> None:
+    """Threads that OpenMP starts for torch, which is loaded first, wait in a loop while GFN2-xTB has one."""
+    code = (
+        "import os, torch\n"
+        "from md_reference.forces.quantum import Potential\n"
+        "from systems.prepare.molecule import scene_from_smiles\n"
+        "scene = scene_from_smiles('O')\n"
+        "potential = Potential(scene)\n"
+        "def threads(): return len(os.listdir('/proc/self/task')), torch.get_num_threads()\n"
+        "before = threads()\n"
+        "potential(scene.positions_nm)\n"
+        "assert threads() == before, (threads(), before)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"OMP_NUM_THREADS": "2"}, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
