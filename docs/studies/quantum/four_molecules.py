@@ -33,7 +33,7 @@ from systems.chemistry.validity import check_frames, geometry_from_frames
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
 from systems.trajectory.codec import open_trajectory
-from systems.units import format_time_ps, parse_time_ps, parse_wall_s
+from systems.units import format_time_ps, format_wall, parse_time_ps, parse_wall_s
 
 MOLECULES = {"ethanol": "CCO", "malonaldehyde": "O=CC=CO", "uracil": "O=c1cc[nH]c(=O)[nH]1",
              "aspirin": "CC(=O)Oc1ccccc1C(=O)O"}  # fmt: skip
@@ -128,14 +128,23 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
                    temperature_k=TEMPERATURE_K, timestep_ps=TIMESTEP_PS, hydrogen_mass_da=1.008, guard="off",
                    seed=ROLL_SEED, overwrite=True, quiet=True)  # fmt: skip
         spent_s.write_text(f"{time.process_time() - began:.3f}\n")
-    model = load_weights(file).model
+    weights = load_weights(file)
+    model, trained_s = weights.model, float(weights.provenance["training_s"])
     n_states = len(Samples.load(samples_path(file), scene.topology_hash))
     answer = model.evaluate(torch.tensor(truth.states), model.fabric(Molecule.of(scene))).forces_kj_mol_nm.numpy()
     forces_a_s = REPLICAS * time_ps / TIMESTEP_PS / float(spent_s.read_text())
     stable, far = truth.judge([frames_of(out) for out in outs], SAVE_PS)
     error = force_error(answer, truth.forces)
-    return [f"{name}, {scene.n_atoms}", f"{n_states:,}", f"{error:.2f}", stable, far, f"{truth.replicate:.3f}",
-            f"{forces_a_s:,.0f}", f"{truth.forces_a_s:,.0f}"]  # fmt: skip
+    return [
+        f"{name}, {scene.n_atoms}",
+        f"{n_states:,} in {format_wall(trained_s)}",
+        f"{error:.2f}",
+        stable,
+        far,
+        f"{truth.replicate:.3f} ({format_time_ps(md_ps)})",
+        f"{forces_a_s:,.0f}",
+        f"{truth.forces_a_s:,.0f}",
+    ]
 
 
 def main() -> None:
@@ -155,10 +164,9 @@ def main() -> None:
         sys.stdout.flush()
     if given.out is not None:
         table = {
-            "command": f"python docs/studies/quantum/four_molecules.py FOLDER --md {given.md} --budget {given.budget}",
+            "command": "python docs/studies/quantum/four_molecules.py FOLDER",
             "machine": machine_name(),
-            "note": f"At 500 K; two MD runs of {format_time_ps(md_ps)} by GFN2-xTB; {REPLICAS} replicas; processor "
-                    "time of one core.",
+            "note": f"At 500 K; two MD runs by GFN2-xTB; {REPLICAS} replicas; processor time of one core.",
             "columns": ["molecule, atoms", "states learned from", "force error, kcal/mol/Å", "stable",
                         "h(r) from each MD run", "one MD run from the other", "forces a second", "GFN2-xTB's"],
             "rows": rows,

@@ -1,37 +1,49 @@
-"""What potentials made by `surromd run` are worth by long MD of GFN2-xTB, and what that is of the MD their time buys.
+"""What a potential's rollout is worth by long sampling at GFN2-xTB's own law, over the MD that its time buys.
 
-    python docs/studies/quantum/gain.py SCENE FOLDER [--budgets 10min,20min] [--time 4ns]
+    python docs/studies/quantum/gain.py WEIGHTS FOLDER --truth 'CHAINS_r[0-7].h5'
+        --replicate 'CHAINS_r[89].h5,CHAINS_r1?.h5' [--time 1ns] [--replicas 32]
         [-o docs/results/tables/potential_gain.json]
 
-FOLDER gets a run of each budget, `surromd run SCENE --level gfn2-xtb --way surrogate`, and two runs of MD of `--time`
-each, from another seed, that judge them: one is the truth, the other its replicate. What is there is not made again,
-what was stopped goes on. Worth ends at `--time`. Gain: worth over the MD on all cores in the wall time of training and
-of the part of the rollout that comes so near, with the 95 % interval of the worth.
+Truth and replicate are chains of `corrected_md.py`; worth ends at the length of one of them. FOLDER gets the rollout,
+annealed first, and as much MD by GFN2-xTB, a process a core, as tells its speed: nothing else should run. What is there
+is not made again. Gain: worth over the MD on all cores in the wall time of training (with its answers of GFN2-xTB)
+and of the part of the rollout that comes so near, with the 95 % interval of the worth.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
+from corrected_md import SAVE_PS
+
 import surrogate as sm
 from md_reference.run.machine import machine_name
+from surrogate.data.shipped import weights_path
+from surrogate.data.weights import load_weights
 from surrogate.judge.worth import Worth
-from surrogate.verbs.run.run_record import RUN_NAME, RunRecord, read_run
-from surrogate.verbs.run.stages import costs_of
-from systems.units import format_time_ps, format_wall, parse_time_ps, parse_wall_s
+from systems.scene import Scene
+from systems.trajectory.codec import open_trajectory
+from systems.units import format_time_ps, format_wall, parse_time_ps
 
-LEVEL, SAVE_PS, SEED = "gfn2-xtb", 0.5, 77
+LEVEL, MD_PS, ANNEAL_PS, SEED = "gfn2-xtb", 10.0, 50.0, 77
 
 
-def made(scene: str, folder: Path, budget_s: float) -> RunRecord:
-    """Return the record of a run, made where it is not done."""
-    is_there = (folder / RUN_NAME).is_file()
-    if not is_there or read_run(folder).outcome is None:
-        sm.run(scene, folder, budget_s=budget_s, level=LEVEL, way="surrogate", quiet=True, resume=is_there)
-    return read_run(folder)
+def md_ps_per_s(scene: Scene, folder: Path) -> float:
+    """Return how much MD by GFN2-xTB all cores make in a second of wall time, a replica each."""
+    cores = os.cpu_count() or 1
+    runs = sm.reference(
+        scene, folder / "md.h5", time_ps=MD_PS, save_every_ps=0.1, equilibrate_ps=0.1, level=LEVEL, replicas=cores,
+        seed=SEED, resume=True, quiet=True,
+    )  # fmt: skip
+    walls = []
+    for run in runs:
+        with open_trajectory(run) as reader:
+            walls.append(float(reader.record["cost"]["wall_s"]))
+    return cores * MD_PS / max(walls)
 
 
 def gain_words(worth: Worth, bought_ps: float) -> str:
@@ -43,52 +55,52 @@ def gain_words(worth: Worth, bought_ps: float) -> str:
     return f"{said} [{ends[0] or '...'}, {ends[1] or '...'}]"
 
 
-def row(folder: Path, record: RunRecord, long: list[Path]) -> list[str]:
-    """Return a line of the table."""
-    comparison = sm.compare(long[0], [[folder / file for file in record.trajectory]], replicate=long[1])
-    assert record.outcome is not None
-    judged, costs = comparison.judgements[0], costs_of(record, comparison, record.outcome.held_out_ps)
-    worth = next((w for w in judged.worth if w.kind == "distribution"), None) if judged.worth_words else None
-    share = worth.share if worth else 1.0
-    bought_ps = costs.md_ps_per_s * (costs.training_s + share * costs.rolling_s)
-    return [
-        format_wall(record.settings["budget_s"]),
-        format_wall(costs.training_s),
-        f"{format_time_ps(judged.account.total_ps, 2)} in {format_wall(costs.rolling_s)}",
-        record.outcome.worth or "not told",
-        worth.in_words() if worth else "not told",
-        format_time_ps(bought_ps, 2),
-        gain_words(worth, bought_ps) if worth else "not told",
-        judged.status,
-    ]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene")
+    parser.add_argument("weights")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--budgets", default="10min,20min", help="of wall time, for a run each")
-    parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=4_000.0)
+    parser.add_argument("--truth", required=True)
+    parser.add_argument("--replicate", required=True)
+    parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=1_000.0)
+    parser.add_argument("--replicas", type=int, default=32)
     parser.add_argument("-o", "--out", type=Path)
     given = parser.parse_args()
-    runs = [given.folder / budget for budget in given.budgets.split(",")]
-    records = [made(given.scene, run, parse_wall_s(run.name)) for run in runs]
-    long = sm.reference(
-        given.scene, given.folder / "md.h5", time_ps=given.time, save_every_ps=SAVE_PS, level=LEVEL, replicas=2,
-        seed=SEED, resume=True, quiet=True,
+    weights = load_weights(weights_path(given.weights))
+    scene = weights.domain.scene
+    given.folder.mkdir(parents=True, exist_ok=True)
+    rolled = sm.rollout(
+        scene, given.weights, given.folder / "roll.h5", time_ps=given.time, save_every_ps=SAVE_PS, seed=SEED,
+        replicas=given.replicas, anneal_ps=ANNEAL_PS, guard="resample", resume=True, quiet=True,
     )  # fmt: skip
-    rows = []
-    for run, record in zip(runs, records, strict=True):
-        rows.append(row(run, record, long))
-        sys.stdout.write(" | ".join(rows[-1]) + "\n")
-        sys.stdout.flush()
+    speed = md_ps_per_s(scene, given.folder)
+    report = given.folder / "report.html"
+    comparison = sm.compare(given.truth, [rolled], report, replicate=given.replicate, overwrite=True)
+    judged = comparison.judgements[0]
+    training_s, rolling_s = float(weights.provenance["training_s"]), judged.account.wall_s
+    rolled_ps = judged.account.total_ps
+    rows = [
+        ["trained for", format_wall(training_s)],
+        ["rolled", f"{format_time_ps(rolled_ps, 2)} in {format_wall(rolling_s)}"],
+        ["MD by GFN2-xTB on all cores", f"{format_time_ps(3600.0 * speed, 3)} an hour"],
+        ["a rollout's speed over that", f"{rolled_ps / rolling_s / speed:.0f}"],
+        ["verdict", judged.status],
+    ]
+    for worth in judged.worth:
+        bought_ps = speed * (training_s + worth.share * rolling_s)
+        rows += [
+            [f"worth by {worth.measure}", f"{worth.in_words()} by {worth.share:.2g} of it"],
+            ["MD in as much time", format_time_ps(bought_ps, 2)],
+            ["gain", gain_words(worth, bought_ps)],
+        ]
+    for row in rows:
+        sys.stdout.write(" | ".join(row) + "\n")
     if given.out is not None:
         table = {
-            "command": f"python docs/studies/quantum/gain.py {given.scene!r} FOLDER",
+            "command": f"python docs/studies/quantum/gain.py {given.weights} FOLDER --truth ... --replicate ...",
             "machine": machine_name(),
-            "note": f"{given.scene}, two runs of {format_time_ps(given.time)} of {LEVEL} from another seed.",
-            "columns": ["budget", "trained for", "rolled", "worth told", "worth by long MD", "MD for as much time",
-                        "gain", "verdict by long MD"],
+            "note": f"{given.replicas} replicas of {format_time_ps(given.time)}; truth and replicate "
+                    f"{format_time_ps(comparison.reference.total_ps, 2)} each of corrected_md.py.",
+            "columns": ["of the potential", ""],
             "rows": rows,
         }  # fmt: skip
         given.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
