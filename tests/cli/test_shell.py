@@ -32,7 +32,7 @@ def completed(words: str) -> list[str]:
     [
         ("surromd roll", ["rollout"]),
         ("surromd rollout alanine-dip", ["alanine-dipeptide"]),
-        ("surromd rollout alanine-dipeptide --weights alanine-dipeptide-p", ["alanine-dipeptide-painet"]),
+        ("surromd rollout alanine-dipeptide --weights pa", ["paracetamol-gfn2-xtb"]),
         ("surromd rollout alanine-dipeptide --guard re", ["resample", "repair"]),
         ("surromd rollout alanine-dipeptide --save-e", ["--save-every"]),
         ("surromd rollout alanine-dipeptide --solv", []),

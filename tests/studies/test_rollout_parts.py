@@ -19,4 +19,4 @@ def test_parts_add_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert all(ms > 0 for ms in (whole, network, *found.values()))
     assert "batch of 2" in capsys.readouterr().out
     with pytest.raises(TypeError, match="parts are known of lam-slide"):
-        rollout_parts.main(["--weights", "alanine-dipeptide-painet", "--batch", "1", "--rounds", "1"])
+        rollout_parts.main(["--weights", "paracetamol-gfn2-xtb", "--batch", "1", "--rounds", "1"])

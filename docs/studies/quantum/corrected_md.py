@@ -32,7 +32,7 @@ from systems.scene import FloatArray, Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
-TEMPERATURE_K, FRICTION_PER_PS, TIMESTEP_PS, PIECE_PS = 300.0, 1.0, 0.003, 0.3
+TEMPERATURE_K, FRICTION_PER_PS, TIMESTEP_PS, PIECE_PS = 300.0, 1.0, 0.003, 0.6
 SAVE_PS, SETTLE_PS = 0.6, 250.0
 # Frames of a replica that are written at once.
 TOGETHER = 50

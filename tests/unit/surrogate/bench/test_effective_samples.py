@@ -78,8 +78,8 @@ def test_all_trainings_and_all_frames_that_weights_saw_are_counted_once() -> Non
     assert cost["training_s"] == pytest.approx(780.1 + 3120.1 + 5640.0 + 2700.2)
     assert cost["reference_ns"] == pytest.approx(942.0), "nine runs of 100 ns, however often, and 42 ns of stiff terms"
     assert cost["reference_s"] == pytest.approx(942.0 * 8.0)
-    painet = load_weights(weights_path("alanine-dipeptide-painet"))
-    assert training_cost(painet, 8.0)["training_s"] == pytest.approx(1260.1 + 601.3)
+    potential = load_weights(weights_path("paracetamol-gfn2-xtb"))
+    assert training_cost(potential, 8.0)["training_s"] == pytest.approx(2088.8)
     unknown = training_cost(replace(weights, provenance={}), 8.0)
     assert unknown["training_s"] is None and unknown["reference_ns"] == 0.0
 
