@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from systems.errors import InputError
+from systems.errors import InputError, first_line
 from systems.scene import IntArray, Scene
 
 
@@ -20,9 +20,9 @@ def select_atoms(scene: Scene, text: str) -> IntArray:
     except InputError:
         raise
     except Exception as error:  # the parser raises what its own libraries raise
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"the selection {text!r} cannot be read ({reason}); write it as MDTraj does, such as 'name CA or name CB'."
+            f"the selection {text!r} cannot be read ({first_line(error)}); write it as MDTraj does, such as "
+            "'name CA or name CB'."
         ) from error
     if not len(found):
         raise InputError(f"the selection {text!r} means no atom of {scene.name}.")

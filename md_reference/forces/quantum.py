@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from systems.errors import PreparationError
+from systems.errors import PreparationError, first_line
 from systems.scene import FloatArray, Scene
 
 # CODATA 2018.
@@ -177,9 +177,8 @@ class Potential:
             with _one_thread(self._openmp):
                 result = self._calculator.singlepoint()
         except (RuntimeError, ValueError) as error:
-            name, reason = self._scene.name, str(error).splitlines()[0]
             raise PreparationError(
-                f"GFN2-xTB finds no electronic ground state for scene {name!r} ({reason})."
+                f"GFN2-xTB finds no electronic ground state for scene {self._scene.name!r} ({first_line(error)})."
             ) from error
         energy = float(result.get("energy")) * KJ_MOL_PER_HARTREE
         gradient = np.asarray(result.get("gradient"), dtype=np.float64)

@@ -14,7 +14,7 @@ from md_reference.run.config import Conditions
 from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
-from systems.errors import SimulationError
+from systems.errors import SimulationError, first_line
 from systems.scene import FloatArray, Scene
 
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
@@ -50,7 +50,7 @@ def hottest_k(bath_k: float, n_dof: int) -> float:
 
 def one_line(error: Exception) -> str:
     """Return the first line of an OpenMM error, without the advice and the web address behind it."""
-    return str(error).splitlines()[0].split("  For more information")[0].rstrip(".")
+    return first_line(error).split("  For more information")[0].rstrip(".")
 
 
 class Engine:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.run.machine import machine_name, platform_properties
-from systems.errors import SurromdError
+from systems.errors import SurromdError, first_line
 from systems.files.native import cache_folder
 from systems.files.outside import content
 from systems.files.schema import parsed
@@ -88,7 +88,7 @@ def time_platforms(
             context.getIntegrator().step(1)  # kernels are compiled, neighbour lists built
             found[candidate], _ = _batch(context, candidate, 1)
         except openmm.OpenMMException as error:
-            notes[candidate] = str(error).splitlines()[0].rstrip(".")
+            notes[candidate] = first_line(error)
             continue
         if found[candidate] < max(_HOPELESS * min(found.values()), _BATCH_S / 10):
             contexts[candidate] = context
@@ -103,7 +103,7 @@ def time_platforms(
             try:
                 seconds, ratio = _batch(context, candidate, n_steps[candidate])
             except openmm.OpenMMException as error:
-                notes[candidate] = str(error).splitlines()[0].rstrip(".")
+                notes[candidate] = first_line(error)
                 found.pop(candidate, None)
                 del contexts[candidate]
                 continue

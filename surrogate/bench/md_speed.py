@@ -23,7 +23,7 @@ import numpy as np
 from md_reference.run.machine import available_cores
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.md_setups import CASES, Case, Setup, ours, plain
-from systems.errors import InputError, SimulationError, SurromdError, nearest
+from systems.errors import InputError, SimulationError, SurromdError, first_line, nearest
 from systems.parent_watch import end_with_parent
 
 MODES = ("ours", "plain, all cores", "plain, one a core", "ours, 4 fs and 3 Da")
@@ -220,7 +220,7 @@ def _serve(pipe: Any, number: int, n_workers: int) -> None:
                 answer = _run(setups[arguments[0]], arguments[1])
             pipe.send(("done", answer))
         except Exception as error:
-            pipe.send(("error", str(error).splitlines()[0]))
+            pipe.send(("error", first_line(error)))
 
 
 def _build(setups: dict[str, Setup], case: Case, number: int, n_workers: int) -> dict[str, Any]:

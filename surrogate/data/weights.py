@@ -198,7 +198,7 @@ def load_weights(path: str | Path) -> Weights:
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
-        raise WeightsError(f"{path} does not fit its own configuration: {str(error).splitlines()[0]}") from error
+        raise WeightsError(f"{path} does not fit its own configuration: {first_line(error)}") from error
     broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
     if broken:
         raise WeightsError(

@@ -20,7 +20,7 @@ from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
-from systems.errors import InputError, SimulationError
+from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 from systems.interrupts import stop_if_asked
@@ -306,7 +306,7 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
     try:
         module.load_state_dict(sub("model."))
     except RuntimeError as error:
-        raise InputError(f"training state {path} is of another configuration: {str(error).splitlines()[0]}") from error
+        raise InputError(f"training state {path} is of another configuration: {first_line(error)}") from error
     for name, tensor in sub("ema.").items():
         ema.shadow[name].copy_(tensor)
     state: dict[int, dict[str, Tensor]] = {}

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.residues import template_for
-from systems.errors import PreparationError, listed
+from systems.errors import PreparationError, first_line, listed
 from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_account
 from systems.prepare.read.records import AtomRecord
@@ -60,8 +60,7 @@ def complete(
             modeller = app.Modeller(fixer.topology, fixer.positions)
             modeller.addHydrogens(pH=ph, variants=variants, platform=reference)
     except Exception as error:  # PDBFixer and OpenMM raise bare Exceptions, KeyErrors and ValueErrors alike
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise PreparationError(f"PDBFixer could not complete the structure ({reason}).") from error
+        raise PreparationError(f"PDBFixer could not complete the structure ({first_line(error)}).") from error
     positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
     records, bonds = records_from_openmm(modeller.topology, positions_nm, [r.key for r in residues])
     _refuse_lost_bonds(records, bonds, atoms, bonding)

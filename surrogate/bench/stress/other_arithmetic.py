@@ -19,7 +19,7 @@ from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
 from systems.chemistry.validity import Geometry
-from systems.errors import SurromdError
+from systems.errors import SurromdError, first_line
 
 if TYPE_CHECKING:
     from md_reference.run.engine import Engine
@@ -52,7 +52,7 @@ def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> lis
             started = time.process_time()
             frames = draw()
         except (RuntimeError, OSError, ImportError) as error:
-            rows.append({"arithmetic": name, "outcome": f"not run: {str(error).strip().splitlines()[0][:120]}"})
+            rows.append({"arithmetic": name, "outcome": f"not run: {first_line(error)[:120]}"})
             return
         spent = max(time.process_time() - started, 1e-9)
         gap = np.abs(frames - truth)
