@@ -181,6 +181,19 @@ def test_stiff_bonds_of_a_frame_relax_on_a_copy_of_the_system() -> None:
     assert found.potential_kj_mol < potential(stretched)[0] - 10.0
 
 
+def test_an_scf_that_fails_without_a_word_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tblite.exceptions import TBLiteRuntimeError
+    from tblite.interface import Calculator
+
+    def fails(_: Calculator) -> None:
+        raise TBLiteRuntimeError("")
+
+    potential = Potential(scene_from_smiles("O"))
+    monkeypatch.setattr(Calculator, "singlepoint", fails)
+    with pytest.raises(PreparationError, match=r"no electronic ground state .*\(TBLiteRuntimeError\)"):
+        potential(scene_from_smiles("O").positions_nm)
+
+
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted by Linux's /proc")
 def test_one_thread_is_enough_wherever_openmp_was_loaded_first() -> None:
     """Threads that OpenMP starts for torch, which is loaded first, wait in a loop while GFN2-xTB has one."""
