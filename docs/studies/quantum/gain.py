@@ -85,7 +85,7 @@ def main() -> None:
         ["a rollout's speed over that", f"{rolled_ps / rolling_s / speed:.0f}"],
         ["verdict", judged.status],
     ]
-    for worth in judged.worth:
+    for worth in (w for w in judged.worth if w.kind == "distribution"):  # chains have no times of their own
         bought_ps = speed * (training_s + worth.share * rolling_s)
         rows += [
             [f"worth by {worth.measure}", f"{worth.in_words()} by {worth.share:.2g} of it"],
