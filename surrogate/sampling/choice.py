@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from surrogate.data.shipped import shipped_weights
 from surrogate.data.weights import load_weights, read_header
@@ -17,15 +18,18 @@ if TYPE_CHECKING:
     from systems.scene import Scene
 
 
-def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple[Weights, str]:
+def choose_weights(
+    scene: Scene, *, temperature_k: float | None = None, conditions: Mapping[str, Any] | None = None
+) -> tuple[Weights, str]:
     """Return the shipped weights that cover a scene, and why these.
 
     Weights that were trained on the molecule come before those that know molecules like it; those that draw frames
     from the ensemble before those that carry velocities, whose temperature is only refreshed between chunks; those that
     step as far as frames are saved before those for one lag. Headers tell all of this: only those chosen are loaded.
+    `conditions`: force field and solvent that they must have been trained under; all do where nothing is said.
     Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
     """
-    found, refusals = [], []
+    found, refusals, levels = [], [], {}
     for name, path in shipped_weights().items():
         header = read_header(path)
         arch = architecture(header.arch)
@@ -36,7 +40,13 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
         except OutOfDomainError as error:
             refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
             continue
+        try:
+            check_conditions(header.domain.conditions, conditions or {}, path.name)
+        except OutOfDomainError as error:
+            refusals.append((False, 0, name, error))  # nothing else is apart
+            continue
         carries_velocities = getattr(arch.model, "carries_velocities", False)
+        levels[name] = header.domain.conditions.get("force_field")
         found.append((not match.seen, carries_velocities, not header.domain.jumps, name, path))
     if not found:
         nearest = min(refusals, key=lambda one: one[:3])[3] if refusals else OutOfDomainError("none are shipped.")
@@ -44,10 +54,17 @@ def choose_weights(scene: Scene, *, temperature_k: float | None = None) -> tuple
             f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
         )
     unseen, *_, name, path = min(found)
-    others = sorted(other for *_, other, _ in found if other != name)
+    others = sorted(other for other, level in levels.items() if other != name and level == levels[name])
     why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
     beside = f"; {', '.join(others)} would do, too" if others else ""
     return load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
+
+
+def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: str) -> None:
+    """Raise OutOfDomainError where weights of that name say that they were trained under other conditions."""
+    apart = [f"{key} {known[key]}, not {value}" for key, value in asked.items() if known.get(key) not in (None, value)]
+    if apart:
+        raise OutOfDomainError(f"{name} was trained under other conditions: {', '.join(apart)}")
 
 
 def weights_to_go_on_from(scene: Scene) -> str | None:

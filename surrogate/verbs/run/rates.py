@@ -25,7 +25,6 @@ REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
 _LONGEST_STRETCH = 30.0
-_SAME = ("force_field", "solvent", "temperature_k")
 # Beyond this, lanes are not tried: they relax the scene on OpenMM's Reference platform, which takes minutes there.
 _MOST_ATOMS_IN_LANES = 500
 
@@ -184,30 +183,22 @@ def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple
     """Return the weights that cover the scene under these conditions, and why these or why none."""
     from surrogate.data.shipped import weights_path
     from surrogate.data.weights import load_weights
-    from surrogate.sampling.choice import choose_weights
+    from surrogate.sampling.choice import check_conditions, choose_weights
     from surrogate.sampling.domain import match_domain
 
-    if named is not None:
-        weights, why = load_weights(weights_path(named)), "asked for"
-        match_domain(scene, weights, temperature_k=config.temperature_k)
-    else:
+    asked = {"force_field": config.force.force_field, "solvent": config.force.solvent}
+    if named is None:
         try:
-            weights, why = choose_weights(scene, temperature_k=config.temperature_k)
+            return choose_weights(scene, temperature_k=config.temperature_k, conditions=asked)
         except OutOfDomainError as error:
             return None, error.brief
-    asked = {
-        "force_field": config.force.force_field,
-        "solvent": config.force.solvent,
-        "temperature_k": config.temperature_k,
-    }
-    known = weights.domain.conditions
-    apart = [f"{key} {known[key]}, not {asked[key]}" for key in _SAME if known.get(key) not in (None, asked[key])]
-    if apart:
-        reason = f"{weights.path.name} was trained under other conditions: {', '.join(apart)}"
-        if named is not None:
-            raise OutOfDomainError(f"{reason}; leave `weights` out, or ask for these conditions.")
-        return None, reason
-    return weights, why
+    weights = load_weights(weights_path(named))
+    match_domain(scene, weights, temperature_k=config.temperature_k)
+    try:
+        check_conditions(weights.domain.conditions, asked, weights.path.name)
+    except OutOfDomainError as error:
+        raise OutOfDomainError(f"{error}; leave `weights` out, or ask for these conditions.") from error
+    return weights, "asked for"
 
 
 def measured_stretch(cores: int, seconds: float = 1.0) -> float:

@@ -68,3 +68,12 @@ def test_the_nearest_weights_are_those_that_could_be_forced() -> None:
     ):
         with pytest.raises(OutOfDomainError, match=why):
             choose_weights(prepare(f"sequence:{sequence}"))
+
+
+def test_weights_of_another_force_field_are_no_choice_where_one_is_asked_for() -> None:
+    paracetamol, peptide = prepare("smiles:CC(=O)Nc1ccc(O)cc1"), load("alanine-dipeptide")
+    quantum, classical = {"force_field": "gfn2-xtb", "solvent": "vacuum"}, {"force_field": "ff14SB", "solvent": "obc2"}
+    assert choose_weights(paracetamol, conditions=quantum)[0].path.stem == "paracetamol-gfn2-xtb"
+    assert choose_weights(peptide, conditions=classical)[0].path.stem == "peptides"
+    with pytest.raises(OutOfDomainError, match="other conditions: force_field gfn2-xtb, not ff14SB"):
+        choose_weights(paracetamol, conditions=classical)
