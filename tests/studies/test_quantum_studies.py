@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import corrected_md
 import energy_conservation
@@ -107,6 +109,18 @@ def test_gain_is_worth_over_what_the_time_buys() -> None:
     assert gain.gain_words(worth, 800.0) == "at least 5 [1.2, ...]"
     assert gain.gain_words(replace(worth, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
     assert gain.gain_words(replace(worth, low_ps=None), 800.0) == "at least 5"
+
+
+def test_chains_that_forget_slowly_are_less_md() -> None:
+    def row(chains: float, rollout: float, key: str = "correlation_time:x") -> Any:
+        return SimpleNamespace(
+            key=key, reference=SimpleNamespace(value=chains), candidate=SimpleNamespace(value=rollout)
+        )
+
+    judged: Any = SimpleNamespace(rows=[row(0.8, 0.4), row(0.8, 0.6), row(8.0, 0.1, "torsion"), row(1.0, 3.0)])
+    assert gain.pace(judged) == pytest.approx(0.5)
+    judged.rows = [row(0.4, 0.8)]
+    assert gain.pace(judged) == 1.0
 
 
 def test_a_rival_learns_what_it_is_shown() -> None:

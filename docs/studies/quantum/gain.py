@@ -6,8 +6,10 @@
 
 Truth and replicate are chains of `corrected_md.py`; worth ends at the length of one of them. FOLDER gets the rollout,
 annealed first, and as much MD by GFN2-xTB, a process a core, as tells its speed: nothing else should run. What is there
-is not made again. Gain: worth over the MD on all cores in the wall time of training (with its answers of GFN2-xTB)
-and of the part of the rollout that comes so near, with the 95 % interval of the worth.
+is not made again. Chains that turn back now and then forget more slowly than MD does: a length of theirs is as much
+less MD as their torsions take longer to relax than those of the rollout, which moves as MD does. Gain: worth in MD over
+the MD that all cores make in the wall time of training (with its answers of GFN2-xTB) and of the part of the rollout
+that comes so near, with the 95 % interval of the worth.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
+from surrogate.judge.comparison import Judgement
 from surrogate.judge.worth import Worth
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -47,12 +50,18 @@ def md_ps_per_s(scene: Scene, folder: Path) -> float:
 
 
 def gain_words(worth: Worth, bought_ps: float) -> str:
-    """Return a worth over the MD that its cost buys, with the interval: 'at least 5.7 [1.9, ...]'."""
+    """Return a worth over the length that its cost buys, with the interval: 'at least 5.7 [1.9, ...]'."""
     ends = [None if end is None else f"{end / bought_ps:.2g}" for end in (worth.low_ps, worth.high_ps)]
     said = f"{worth.bound} {worth.worth_ps / bought_ps:.2g}".strip()
     if ends == [None, None]:
         return said
     return f"{said} [{ends[0] or '...'}, {ends[1] or '...'}]"
+
+
+def pace(judged: Judgement) -> float:
+    """Return how much MD a length of the chains is: the least ratio of relaxation times, and never more than 1."""
+    rows = [row for row in judged.rows if row.key.startswith("correlation_time:") and row.reference is not None]
+    return min([1.0, *(row.candidate.value / row.reference.value for row in rows if row.reference is not None)])
 
 
 def main() -> None:
@@ -76,21 +85,22 @@ def main() -> None:
     report = given.folder / "report.html"
     comparison = sm.compare(given.truth, [rolled], report, replicate=given.replicate, overwrite=True)
     judged = comparison.judgements[0]
-    training_s, rolling_s = float(weights.provenance["training_s"]), judged.account.wall_s
-    rolled_ps = judged.account.total_ps
+    training_s, rolled_ps = float(weights.provenance["training_s"]), judged.account.total_ps
+    rolling_s = judged.account.wall_s or 0.0
     rows = [
         ["trained for", format_wall(training_s)],
         ["rolled", f"{format_time_ps(rolled_ps, 2)} in {format_wall(rolling_s)}"],
         ["MD by GFN2-xTB on all cores", f"{format_time_ps(3600.0 * speed, 3)} an hour"],
         ["a rollout's speed over that", f"{rolled_ps / rolling_s / speed:.0f}"],
+        ["a ns of chains is so much MD", f"{pace(judged):.2f} ns"],
         ["verdict", judged.status],
     ]
     for worth in (w for w in judged.worth if w.kind == "distribution"):  # chains have no times of their own
         bought_ps = speed * (training_s + worth.share * rolling_s)
         rows += [
-            [f"worth by {worth.measure}", f"{worth.in_words()} by {worth.share:.2g} of it"],
+            [f"worth by {worth.measure}, of chains", f"{worth.in_words()} by {worth.share:.2g} of it"],
             ["MD in as much time", format_time_ps(bought_ps, 2)],
-            ["gain", gain_words(worth, bought_ps)],
+            ["gain", gain_words(worth, bought_ps / pace(judged))],
         ]
     for row in rows:
         sys.stdout.write(" | ".join(row) + "\n")
