@@ -64,6 +64,11 @@ def pace(judged: Judgement) -> float:
     return min([1.0, *(row.candidate.value / row.reference.value for row in rows if row.reference is not None)])
 
 
+def differing(judged: Judgement) -> list[str]:
+    """Return the metrics by which a rollout differs from the chains, but for those of time."""
+    return [row.metric for row in judged.rows if row.verdict == "differs" and row.group != "kinetics"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights")
@@ -93,7 +98,7 @@ def main() -> None:
         ["MD by GFN2-xTB on all cores", f"{format_time_ps(3600.0 * speed, 3)} an hour"],
         ["a rollout's speed over that", f"{rolled_ps / rolling_s / speed:.0f}"],
         ["a ns of chains is so much MD", f"{pace(judged):.2f} ns"],
-        ["verdict", judged.status],
+        ["differs from the chains in", ", ".join(differing(judged)) or "nothing but its pace"],
     ]
     for worth in (w for w in judged.worth if w.kind == "distribution"):  # chains have no times of their own
         bought_ps = speed * (training_s + worth.share * rolling_s)
