@@ -73,6 +73,8 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     if states and not (options.resume or options.overwrite):
         raise InputError(f"{states[0]} is the state of an interrupted training; add `resume=True` or `overwrite=True`.")
     if options.resume and out.exists() and not states:
+        if not options.quiet:
+            tell(out.name, "this training is done, and nothing was changed; overwrite it to train anew")
         return out
     if options.level is not None:
         with Claim(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):

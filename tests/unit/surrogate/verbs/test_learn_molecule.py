@@ -50,3 +50,10 @@ def test_an_interrupted_training_says_that_its_samples_are_kept(
         api.train("smiles:O", tmp_path / "w.safetensors", level="gfn2-xtb", steps=5, quiet=True)
     assert ("w.samples.safetensors" in str(caught.value)) is answered
     assert ("`resume=True`" in str(caught.value)) is answered
+
+
+def test_a_training_that_is_done_is_left_alone_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "w.safetensors"
+    out.write_bytes(b"weights")
+    api.train("smiles:O", out, level="gfn2-xtb", budget_s="1h", resume=True)
+    assert "w.safetensors: this training is done" in capsys.readouterr().err and out.read_bytes() == b"weights"
