@@ -1,12 +1,12 @@
-"""Long sampling at GFN2-xTB's own law: MD by a potential, accepted or refused by GFN2-xTB every 0.3 ps.
+"""Long sampling at GFN2-xTB's own law: MD by a potential, accepted or refused by GFN2-xTB every 0.6 ps.
 
     python docs/studies/quantum/corrected_md.py WEIGHTS OUT.h5 [--time 2.5ns] [--replicas 16] [--seed 1]
 
 Generalised hybrid Monte Carlo (Horowitz, Phys. Lett. B 268, 247 (1991)): velocities are refreshed as friction of 1/ps
-does it, RATTLE moves a molecule by the potential for 0.3 ps (3 fs, hydrogens of 3 Da, their bonds rigid), GFN2-xTB's
+does it, RATTLE moves a molecule by the potential for 0.6 ps (3 fs, hydrogens of 3 Da, their bonds rigid), GFN2-xTB's
 energy of both ends decides; what is refused turns back. Frames follow GFN2-xTB's Boltzmann law at 300 K whatever the
-potential is: a wrong one is refused more often. A ns costs a twentieth of MD by GFN2-xTB, so that truths of tens of ns
-can be had. Replicas start with torsions turned at random and settle for 0.25 ns. What is there goes on.
+potential is: a wrong one is refused more often. A ns costs a twentieth of MD by GFN2-xTB or less, so that truths of
+tens of ns can be had. Replicas start with torsions turned at random and settle for 0.25 ns. What is there goes on.
 """
 
 from __future__ import annotations
