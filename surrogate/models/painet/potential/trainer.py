@@ -45,8 +45,8 @@ _BAG = 0.75
 # Own rollouts: replicas, steps of a ps/1000, and frames kept of each.
 _REPLICAS, _OWN_STEPS, _OWN_FRAMES = 48, 120, 4
 _OWN_STEP_PS = 0.0005
-# Frames of cheap MD on which it is measured how far frames move.
-_MOVING_FRAMES = 400
+# Frames of cheap MD, at the own temperature and at the hottest each, on which it is measured how far frames move.
+_MOVING_FRAMES = 200
 
 
 class Answers(Protocol):
@@ -296,7 +296,8 @@ def learn_potential(
     if not resume:
         for path in (log, state, samples_path(out)):
             path.unlink(missing_ok=True)
-    moving = truth.motion(_MOVING_FRAMES, model_config.lag_ps, model_config.temperature_k, seed=config.seed)
+    baths_k = (model_config.temperature_k, max(config.temperatures_k))
+    moving = [truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed) for kelvin in baths_k]
     learner = Learner(model, truth, config, out, resume=resume)
     budget_s = config.budget_s
     if budget_s is not None:
@@ -332,16 +333,17 @@ def _line(learner: Learner) -> str:
     return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
 
 
-def domain_of(scene: Scene, samples: Samples, moving: Any, config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: the truth's quieter samples say what frames look like, frames of cheap MD,
-    `moving` (n, n_atoms, 3), how far they move from one to the next."""
+def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
+    """Return what the weights cover: the truth's quieter samples say what frames look like; runs of cheap MD, `moving`
+    (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own rate."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
         "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
     }  # fmt: skip
-    frames = TrainingFrames(scene, quantise(centre(moving)), np.array([0, len(moving)]), config.lag_ps, False,
-                            conditions, ())  # fmt: skip
+    starts = np.cumsum([0, *map(len, moving)])
+    frames = TrainingFrames(scene, quantise(centre(np.concatenate(moving))), starts, config.lag_ps, False, conditions,
+                            ())  # fmt: skip
     quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
     looks = limits_from_frames(scene, quiet, quiet)
     moves = training_domain(frames)

@@ -17,6 +17,7 @@ from surrogate.models.painet.potential import trainer
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
+from systems.chemistry.limits import Limits
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -112,7 +113,7 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(trainer, "run_stage", stage)
     config = replace(QUICK, steps=None, budget_s=200.0)
     learn_potential(Slow(), tmp_path / "a.safetensors", SMALL, config, before_s=15.0, after_s=20.0)
-    # 15 before, 400 frames of MD, 24 first labels, 20 for what comes after.
+    # 15 before, 400 frames of MD at two temperatures, 24 first labels, 20 for what comes after.
     assert stages[0].budget_s == pytest.approx(200.0 - 15.0 - 40.0 - 24.0 - 20.0)
     learn_potential(Slow(), tmp_path / "b.safetensors", SMALL, replace(config, budget_s=90.0), before_s=15.0)
     assert stages[1].budget_s == pytest.approx(0.3 * 90.0), "a share is for steps however short the budget"
@@ -172,3 +173,17 @@ def test_a_truth_without_answers_and_foreign_samples_are_refused(tmp_path: Path)
     for wrong in ({"first": 4}, {"batch": 0}, {"held_share": 0.0}, {"temperatures_k": ()}):
         with pytest.raises(InputError):
             replace(QUICK, **wrong)
+
+
+def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
+    scene, rng = scene_from_smiles("OCCO"), np.random.default_rng(0)
+    cold, hot = (scene.positions_nm + width * rng.normal(size=(50, scene.n_atoms, 3)) for width in (0.002, 0.02))
+    samples = Samples(cold, np.zeros(50), np.zeros_like(cold), np.zeros(50, bool))
+
+    def jumps(*moving: np.ndarray) -> tuple[float, float]:
+        limits = Limits.from_dict(trainer.domain_of(scene, samples, list(moving), SMALL).limits)
+        return limits.jump_min_nm, limits.jump_max_nm
+
+    both = jumps(cold, hot)
+    # Runs end where they end: from the last cold frame to the first hot one nothing moved.
+    assert both == pytest.approx((jumps(cold)[0], jumps(hot)[1])) and both[1] > 5.0 * jumps(cold)[1]
