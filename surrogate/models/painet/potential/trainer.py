@@ -133,8 +133,9 @@ class Learner:
             self._take()
         else:
             self._learn(truth.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share)
-            _, energies, forces = self.samples.tensors()
-            model.set_scales(energies, forces)
+        # Samples may be all that an interrupted training left; a state that it left brings its own.
+        _, energies, forces = self.samples.tensors()
+        model.set_scales(energies, forces)
 
     @property
     def share(self) -> float:

@@ -160,6 +160,18 @@ def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.train.safetensors"))
 
 
+def test_samples_alone_are_enough_to_go_on_from(tmp_path: Path) -> None:
+    from surrogate.models.painet.potential.model import PainetPotential
+
+    truth, models = Springs(), [PainetPotential(SMALL) for _ in range(2)]
+    for model, resume in zip(models, (False, True), strict=True):
+        Learner(model, truth, QUICK, tmp_path / "w.safetensors", resume=resume)
+    assert truth.asked == QUICK.first
+    scales = [float(model.energy_scale_kj_mol) for model in models]
+    assert scales[0] == scales[1] and scales[0] != float(PainetPotential(SMALL).energy_scale_kj_mol)
+    assert float(models[0].energy_offset_kj_mol) == float(models[1].energy_offset_kj_mol)
+
+
 def test_a_truth_without_answers_and_foreign_samples_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="no answer"):
         learn_potential(Springs(silent=True), tmp_path / "w.safetensors", SMALL, QUICK)
