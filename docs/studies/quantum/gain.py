@@ -1,7 +1,7 @@
 """What a potential's rollout is worth by long sampling at GFN2-xTB's own law, over the MD that its time buys.
 
     python docs/studies/quantum/gain.py WEIGHTS FOLDER --truth 'CHAINS_r[0-7].h5'
-        --replicate 'CHAINS_r[89].h5,CHAINS_r1?.h5' [--time 1ns] [--replicas 32]
+        --replicate 'CHAINS_r[89].h5,CHAINS_r1?.h5' [--time 510ps] [--replicas 32]
         [-o docs/results/tables/potential_gain.json]
 
 Truth and replicate are chains of `corrected_md.py`; worth ends at the length of one of them. FOLDER gets the rollout,
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--truth", required=True)
     parser.add_argument("--replicate", required=True)
-    parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=1_000.0)
+    parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=510.0)
     parser.add_argument("--replicas", type=int, default=32)
     parser.add_argument("-o", "--out", type=Path)
     given = parser.parse_args()
