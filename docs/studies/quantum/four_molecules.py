@@ -16,6 +16,7 @@ import argparse
 import json
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import samples_path
 from systems.chemistry.validity import check_frames, geometry_from_frames
+from systems.errors import SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
 from systems.trajectory.codec import open_trajectory
@@ -124,16 +126,18 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
     outs = [folder / f"roll_r{k}.h5" for k in range(REPLICAS)]
     if not spent_s.is_file():
         began = time.process_time()
-        sm.rollout(scene, file, folder / "roll.h5", time_ps=time_ps, save_every_ps=SAVE_PS, replicas=REPLICAS,
-                   temperature_k=TEMPERATURE_K, timestep_ps=TIMESTEP_PS, hydrogen_mass_da=1.008, guard="off",
-                   seed=ROLL_SEED, overwrite=True, quiet=True)  # fmt: skip
+        with suppress(SimulationError):  # one flew apart: what all of them did until then is judged
+            sm.rollout(scene, file, folder / "roll.h5", time_ps=time_ps, save_every_ps=SAVE_PS, replicas=REPLICAS,
+                       temperature_k=TEMPERATURE_K, timestep_ps=TIMESTEP_PS, hydrogen_mass_da=1.008, guard="off",
+                       seed=ROLL_SEED, overwrite=True, quiet=True)  # fmt: skip
         spent_s.write_text(f"{time.process_time() - began:.3f}\n")
     weights = load_weights(file)
     model, trained_s = weights.model, float(weights.provenance["training_s"])
     n_states = len(Samples.load(samples_path(file), scene.topology_hash))
     answer = model.evaluate(torch.tensor(truth.states), model.fabric(Molecule.of(scene))).forces_kj_mol_nm.numpy()
-    forces_a_s = REPLICAS * time_ps / TIMESTEP_PS / float(spent_s.read_text())
-    stable, far = truth.judge([frames_of(out) for out in outs], SAVE_PS)
+    runs = [frames_of(out) for out in outs]
+    forces_a_s = sum(map(len, runs)) * SAVE_PS / TIMESTEP_PS / float(spent_s.read_text())
+    stable, far = truth.judge(runs, SAVE_PS)
     error = force_error(answer, truth.forces)
     return [
         f"{name}, {scene.n_atoms}",
