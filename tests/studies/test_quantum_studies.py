@@ -16,6 +16,7 @@ import pytest
 import rivals
 import torch
 import torsion_profiles
+import torsion_states
 
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import Weights, load_weights, save_weights
@@ -121,6 +122,21 @@ def test_chains_that_forget_slowly_are_less_md() -> None:
     assert gain.pace(judged) == pytest.approx(0.5)
     judged.rows = [row(0.4, 0.8)]
     assert gain.pace(judged) == 1.0
+
+
+def test_states_of_a_torsion_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def frames(path: Path) -> np.ndarray:
+        angles = np.deg2rad([0.0, 100.0, -170.0, 80.0] if path.name == "a" else [-100.0] * 4)
+        x = np.zeros((4, 4, 3))
+        x[:, 2] = (0.0, 0.0, 1.0)
+        x[:, 3] = np.stack([np.cos(angles), np.sin(angles), np.ones(4)], axis=1)
+        x[:, 0] = (1.0, 0.0, 0.0)
+        return x
+
+    monkeypatch.setattr(torsion_states, "frames_of", frames)
+    monkeypatch.setattr("sys.argv", ["torsion_states.py", "0,1,2,3", "90", "a", "b"])
+    torsion_states.main()
+    assert capsys.readouterr().out == "2 trajectories: 75 ± 25 % of frames, 2 crossings\n"
 
 
 def test_a_rival_learns_what_it_is_shown() -> None:
