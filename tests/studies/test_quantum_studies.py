@@ -97,6 +97,37 @@ def test_a_corrected_chain_follows_the_truth_whatever_moves_it() -> None:
     assert spread(wrong) == pytest.approx(kt / wrong, rel=0.01)
 
 
+def test_a_turn_that_is_offered_leaves_the_law_alone() -> None:
+    masses = torch.tensor([[12.0], [16.0]], dtype=torch.float64)
+    spring, pull = 4_000.0, 60.0  # kJ/mol/nm^2, kJ/mol/nm along x
+
+    def energies(x: torch.Tensor) -> torch.Tensor:
+        apart = x[:, 0] - x[:, 1]
+        return 0.5 * spring * apart.square().sum(-1) + pull * apart[:, 0]
+
+    def still(x: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return x + 0.005 * v, v
+
+    x = torch.zeros(2_000, 2, 3, dtype=torch.float64)
+    chain = corrected_md.Chain(x, masses, energies, still, lambda v, x: v, 0, lambda x: x.flip(1))
+    found = []
+    for step in range(400):
+        chain.step()
+        if step >= 100:
+            found.append((chain.x[:, 0] - chain.x[:, 1])[:, 0].mean())
+    assert 0.2 < chain.turned / chain.asked < 0.7
+    assert float(torch.stack(found).mean()) == pytest.approx(-pull / spring, rel=0.02)
+
+
+def test_half_a_turn_twice_is_none_and_keeps_bonds() -> None:
+    scene = scene_from_smiles("CC(=O)Nc1ccc(O)cc1")
+    turn, x = corrected_md.half_turn(scene, [6, 7, 8, 17]), torch.tensor(scene.positions_nm)[None]
+    assert torch.allclose(turn(turn(x)), x, atol=1e-12)
+    moved = torch.nonzero((turn(x) - x)[0].abs().amax(-1) > 1e-6).flatten().tolist()
+    assert moved == [17]
+    assert (turn(x)[0, 17] - x[0, 8]).norm() == pytest.approx(float((x[0, 17] - x[0, 8]).norm()))
+
+
 def test_chains_start_all_over() -> None:
     scene = scene_from_smiles("CC(=O)Nc1ccc(O)cc1")
     found = corrected_md.starts(scene, 12, 0)

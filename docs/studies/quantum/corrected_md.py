@@ -1,12 +1,15 @@
 """Long sampling at GFN2-xTB's own law: MD by a potential, accepted or refused by GFN2-xTB every 0.6 ps.
 
     python docs/studies/quantum/corrected_md.py WEIGHTS OUT.h5 [--time 2.5ns] [--replicas 16] [--seed 1]
+        [--turn 6,7,8,17]
 
 Generalised hybrid Monte Carlo (Horowitz, Phys. Lett. B 268, 247 (1991)): velocities are refreshed as friction of 1/ps
 does it, RATTLE moves a molecule by the potential for 0.6 ps (3 fs, hydrogens of 3 Da, their bonds rigid), GFN2-xTB's
 energy of both ends decides; what is refused turns back. Frames follow GFN2-xTB's Boltzmann law at 300 K whatever the
 potential is: a wrong one is refused more often. A ns costs a twentieth of MD by GFN2-xTB or less, so that truths of
 tens of ns can be had. Replicas start with torsions turned at random and settle for 0.25 ns. What is there goes on.
+With `--turn` half a turn about the middle bond of four atoms is offered after each piece, too: such chains know the
+sides of a torsion that seldom turns, and have no times of their own.
 """
 
 from __future__ import annotations
@@ -42,19 +45,22 @@ _OUT_OF_REACH = 1e9
 Move = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Allow = Callable[[Tensor, Tensor], Tensor]
 Energies = Callable[[Tensor], Tensor]
+# Positions -> others of the same law of volume; done twice it leads back
+Turn = Callable[[Tensor], Tensor]
 
 
 class Chain:
     """Replicas `(rows, n_atoms, 3)` nm, of `masses` (n_atoms, 1) Da, that follow the Boltzmann law of `energies`."""
 
-    def __init__(self, x: Tensor, masses: Tensor, energies: Energies, move: Move, allow: Allow, seed: int) -> None:
-        self.energies, self.move, self.allow, self.masses = energies, move, allow, masses
+    def __init__(self, x: Tensor, masses: Tensor, energies: Energies, move: Move, allow: Allow, seed: int,
+                 turn: Turn | None = None) -> None:  # fmt: skip
+        self.energies, self.move, self.allow, self.masses, self.turn = energies, move, allow, masses, turn
         self.kt = GAS_CONSTANT_KJ_MOL_K * TEMPERATURE_K
         self.generator = torch.Generator().manual_seed(seed)
         self.kept = float(np.exp(-FRICTION_PER_PS * PIECE_PS))
         self.x, self.energy = x, energies(x)
         self.v = self._drawn()
-        self.accepted = self.asked = 0
+        self.accepted = self.asked = self.turned = 0
 
     def _drawn(self) -> Tensor:
         drawn = torch.randn(self.x.shape, generator=self.generator, dtype=self.x.dtype)
@@ -70,13 +76,25 @@ class Chain:
         v = self.kept * self.v + (1.0 - self.kept**2) ** 0.5 * self._drawn()
         x, moved = self.move(self.x, v)
         energy = self.energies(x)
-        rise = energy + self._kinetic(moved) - self.energy - self._kinetic(v)
-        chance = torch.rand(len(x), generator=self.generator, dtype=x.dtype)
-        taken = chance.log() < -rise / self.kt
-        self.x = torch.where(taken[:, None, None], x, self.x)
-        self.v = torch.where(taken[:, None, None], moved, -v)
-        self.energy = torch.where(taken, energy, self.energy)
+        taken = self._taken(energy + self._kinetic(moved) - self.energy - self._kinetic(v))
+        self._put(taken, x, energy, moved, -v)
         self.accepted, self.asked = self.accepted + int(taken.sum()), self.asked + len(taken)
+        if self.turn is not None:
+            x = self.turn(self.x)
+            energy = self.energies(x)
+            taken = self._taken(energy - self.energy)
+            self._put(taken, x, energy, self.v, self.v)
+            self.v = torch.where(taken[:, None, None], self._drawn(), self.v)
+            self.turned += int(taken.sum())
+
+    def _taken(self, rise: Tensor) -> Tensor:
+        chance = torch.rand(len(rise), generator=self.generator, dtype=rise.dtype)
+        return chance.log() < -rise / self.kt
+
+    def _put(self, taken: Tensor, x: Tensor, energy: Tensor, v: Tensor, otherwise: Tensor) -> None:
+        self.x = torch.where(taken[:, None, None], x, self.x)
+        self.v = torch.where(taken[:, None, None], v, otherwise)
+        self.energy = torch.where(taken, energy, self.energy)
 
 
 def energies_of(scene: Scene) -> Energies:
@@ -92,8 +110,14 @@ def energies_of(scene: Scene) -> Energies:
     return lambda x: torch.tensor([energy(at) for at in x.numpy()], dtype=x.dtype)
 
 
-def chain_of(weights: Weights, x: FloatArray, seed: int) -> Chain:
-    """Return replicas of a potential's molecule from positions `(rows, n_atoms, 3)` nm."""
+def half_turn(scene: Scene, quad: list[int]) -> Turn:
+    """Return half a turn about the middle bond of `quad`, which must be in no ring."""
+    graph = bonded_graph(scene)
+    return lambda x: torch.from_numpy(np.stack([turned(at, quad, np.pi, graph) for at in x.numpy()]))
+
+
+def chain_of(weights: Weights, x: FloatArray, seed: int, quad: list[int] | None = None) -> Chain:
+    """Return replicas of a potential's molecule from positions `(rows, n_atoms, 3)` nm; `quad`: a torsion to turn."""
     scene, model = weights.domain.scene, weights.model
     assert isinstance(model, PainetPotential)
     model = model.eval().requires_grad_(False)
@@ -108,7 +132,8 @@ def chain_of(weights: Weights, x: FloatArray, seed: int) -> Chain:
         return model.verlet(x, v, molecule, masses, masses, still)
 
     placed = rigid.place(torch.tensor(x), torch.tensor(x))
-    return Chain(placed, masses, energies_of(scene), move, rigid.project, seed)
+    turn = None if quad is None else half_turn(scene, quad)
+    return Chain(placed, masses, energies_of(scene), move, rigid.project, seed, turn)
 
 
 def starts(scene: Scene, replicas: int, seed: int) -> FloatArray:
@@ -133,6 +158,7 @@ def main() -> None:
     parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=2_500.0)
     parser.add_argument("--replicas", type=int, default=16)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--turn", type=lambda text: [int(atom) for atom in text.split(",")])
     given = parser.parse_args()
     torch.set_num_threads(1)
     weights = load_weights(weights_path(given.weights))
@@ -144,9 +170,9 @@ def main() -> None:
         for path in paths:
             with open_trajectory(path) as reader:
                 lasts.append(reader.read()[-1].astype(np.float64))
-        chain = chain_of(weights, np.stack(lasts), given.seed + 1_000)
+        chain = chain_of(weights, np.stack(lasts), given.seed + 1_000, given.turn)
     else:
-        chain = chain_of(weights, starts(scene, given.replicas, given.seed), given.seed)
+        chain = chain_of(weights, starts(scene, given.replicas, given.seed), given.seed, given.turn)
         for _ in range(round(SETTLE_PS / PIECE_PS)):
             chain.step()
     record = {"made_by": "docs/studies/quantum/corrected_md.py", "lag_ps": SAVE_PS, "temperature_k": TEMPERATURE_K}
@@ -164,7 +190,8 @@ def main() -> None:
         for writer, run in zip(writers, np.stack(frames, axis=1), strict=True):
             writer.append(run, times_ps)
         n_frames += TOGETHER
-        sys.stdout.write(f"{n_frames * SAVE_PS:.0f} ps: {chain.accepted / chain.asked:.1%} accepted\n")
+        taken, turned_ = chain.accepted / chain.asked, chain.turned / chain.asked
+        sys.stdout.write(f"{n_frames * SAVE_PS:.0f} ps: {taken:.1%} accepted, {turned_:.1%} turned\n")
         sys.stdout.flush()
     for writer in writers:
         writer.close()
