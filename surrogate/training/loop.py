@@ -20,6 +20,7 @@ from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
+from surrogate.training.muon import Muon
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 # Seeds of one training's processes lie further apart than those of its stages.
 SEEDS_APART = 1_000_003
+# Matrices with fewer rows or columns are no business of Muon's.
+LEAST_MATRIX = 8
 
 # (stage, share of the budget done, latest metrics) -> None
 ProgressFn = Callable[[str, float, dict[str, float]], None]
@@ -38,7 +41,8 @@ ProgressFn = Callable[[str, float, dict[str, float]], None]
 @dataclass(frozen=True)
 class StageConfig:
     """One stage's optimisation. Ends at `budget_s` of training time (summed over resumes) or at `steps`, whichever is
-    first; the learning rate follows the share of that budget which is spent. `bf16`: where it is faster."""
+    first; the learning rate follows the share of that budget which is spent. `matrix_rate`: that of linear layers'
+    matrices, by Muon; all by AdamW if None. `bf16`: where it is faster."""
 
     name: str
     batch: int
@@ -47,6 +51,7 @@ class StageConfig:
     steps: int | None = None
     warmup_steps: int = 200
     weight_decay: float = 0.01
+    matrix_rate: float | None = None
     clip_norm: float = 1.0
     ema_decay: float = 0.999
     seed: int = 0
@@ -136,21 +141,14 @@ def run_stage(
     device = place.device
     fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
     watch = Watch()
-    decay: list[nn.Parameter] = []
-    plain: list[nn.Parameter] = []
-    for p in (p for p in module.parameters() if p.requires_grad):
-        (decay if p.ndim >= 2 else plain).append(p)
-    optimiser = torch.optim.AdamW(
-        [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
-        lr=config.learning_rate,
-        betas=(0.9, 0.99),
-    )
+    optimisers = optimisers_of(module, config)
+    rates = [[group["lr"] for group in optimiser.param_groups] for optimiser in optimisers]
     ema = Ema(module, config.ema_decay)
     generator = torch.Generator().manual_seed(config.seed + SEEDS_APART * fabric.global_rank)
     step, spent_s = 0, 0.0
     if place.resume and place.state.exists():
         step, spent_s = load_state(
-            place.state, module, ema, optimiser, generator, config, process=(fabric.global_rank, fabric.world_size)
+            place.state, module, ema, optimisers, generator, config, process=(fabric.global_rank, fabric.world_size)
         )
     last = time.monotonic()
     next_validation = spent_s + config.validate_every_s
@@ -159,11 +157,12 @@ def run_stage(
     while (share := config.share_done(step, spent_s)) < 1.0:
         stop_if_asked()
         factor = learning_rate_factor(step, share, config.warmup_steps)
-        for group in optimiser.param_groups:
-            group["lr"] = config.learning_rate * factor
+        for optimiser, full in zip(optimisers, rates, strict=True):
+            for group, rate in zip(optimiser.param_groups, full, strict=True):
+                group["lr"] = rate * factor
         with fabric.autocast():
             loss, terms = loss_fn(generator)
-        optimiser.zero_grad(set_to_none=True)
+        module.zero_grad(set_to_none=True)
         loss.backward()
         now = time.monotonic()
         # The first process's clock decides for all when to validate and to end.
@@ -178,7 +177,8 @@ def run_stage(
             )
         if (warning := watch.see(step, float(norm))) and fabric.is_global_zero:
             (warn or _to_stderr)(f"training stage {config.name!r}: {warning}")
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         ema.update(module, step)
         for key, value in {**terms, "gradient_norm": norm.detach()}.items():
             sums[key] = sums.get(key, torch.zeros(())) + value.float().cpu()
@@ -199,7 +199,7 @@ def run_stage(
             append_row(place.log, {"stage": config.name, "step": step, "spent_s": round(spent_s, 1),
                                   "learning_rate": config.learning_rate * factor, **metrics,
                                   "warnings": watch.n_warnings})  # fmt: skip
-            save_state(place.state, module, ema, optimiser, generators, step, spent_s, config)
+            save_state(place.state, module, ema, optimisers, generators, step, spent_s, config)
             if progress is not None:
                 progress(config.name, config.share_done(step, spent_s), metrics)
             # Validation is not training: it is left out of the budget.
@@ -208,6 +208,28 @@ def run_stage(
             progress(config.name, config.share_done(step, spent_s), {})
     ema.copy_to(module)
     return spent_s
+
+
+def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:
+    """Return AdamW and, with `matrix_rate`, Muon, which share a module's parameters."""
+    matrices: list[nn.Parameter] = []
+    decay: list[nn.Parameter] = []
+    plain: list[nn.Parameter] = []
+    if config.matrix_rate is not None:
+        layers = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
+        weights: list[nn.Parameter] = [layer.weight for layer in layers if layer.weight.requires_grad]  # type: ignore[misc]
+        matrices = [p for p in weights if min(p.shape) >= LEAST_MATRIX]
+    taken = {id(p) for p in matrices}
+    for p in (p for p in module.parameters() if p.requires_grad and id(p) not in taken):
+        (decay if p.ndim >= 2 else plain).append(p)
+    adam = torch.optim.AdamW(
+        [{"params": decay, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+        lr=config.learning_rate,
+        betas=(0.9, 0.99),
+    )
+    if config.matrix_rate is None or not matrices:
+        return [adam]
+    return [adam, Muon(matrices, config.matrix_rate, config.weight_decay)]
 
 
 def _to_stderr(line: str) -> None:
@@ -259,25 +281,33 @@ class StateHeader:
     stage: str
     seed: int
     batch: int
+    matrix_rate: float | None = None
 
 
-def save_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generators: Tensor,
+def _prefix(number: int) -> str:
+    """Return what the tensors of an optimiser are called by; the first has no number."""
+    return f"optimiser{number or ''}."
+
+
+def save_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer], generators: Tensor,
                step: int, spent_s: float, config: StageConfig) -> None:  # fmt: skip
     """Write the training state (safetensors, JSON in its metadata) whole or not at all."""
     from safetensors.torch import save_file
 
     tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
     tensors |= {f"ema.{k}": v.cpu().contiguous() for k, v in ema.shadow.items()}
-    for index, state in optimiser.state_dict()["state"].items():
-        tensors |= {f"optimiser.{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
+    for number, optimiser in enumerate(optimisers):
+        for index, state in optimiser.state_dict()["state"].items():
+            tensors |= {f"{_prefix(number)}{index}.{k}": v.detach().cpu().contiguous() for k, v in state.items()}
     tensors["generator"] = generators.contiguous()
-    text = json.dumps(asdict(StateHeader(step, spent_s, config.name, config.seed, config.batch)))
+    text = json.dumps(asdict(StateHeader(step, spent_s, config.name, config.seed, config.batch, config.matrix_rate)))
     metadata = {"surromd_training": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
 
 
-def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.Optimizer, generator: torch.Generator,
-               config: StageConfig, *, process: tuple[int, int] = (0, 1)) -> tuple[int, float]:  # fmt: skip
+def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.optim.Optimizer],
+               generator: torch.Generator, config: StageConfig, *, process: tuple[int, int] = (0, 1)
+               ) -> tuple[int, float]:  # fmt: skip
     """Put a saved state back; return (step, spent_s). `process`: this one's number and that of all.
 
     Raises InputError when the state is damaged, of another run or of another number of processes.
@@ -299,7 +329,8 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
             f"training state {path} is damaged: it is not what was written (checksum); restore it from a whole copy, "
             "or train again without `resume`."
         )
-    for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch)):
+    for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
+                          ("matrix_rate", config.matrix_rate)):  # fmt: skip
         if getattr(header, key) != expected:
             raise InputError(f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}.")
     sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
@@ -309,11 +340,12 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimiser: torch.optim.O
         raise InputError(f"training state {path} is of another configuration: {first_line(error)}") from error
     for name, tensor in sub("ema.").items():
         ema.shadow[name].copy_(tensor)
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in sub("optimiser.").items():
-        index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = tensor
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    for number, optimiser in enumerate(optimisers):
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, tensor in sub(_prefix(number)).items():
+            index, name = key.split(".", 1)
+            state.setdefault(int(index), {})[name] = tensor
+        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     states = tensors["generator"]
     states = states[None] if states.ndim == 1 else states
     if len(states) != process[1]:

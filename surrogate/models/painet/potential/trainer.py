@@ -36,14 +36,18 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 # The share of the budget after which no more states are asked for.
 _ASKING_SHARE = 0.6
-# Most of the budget that answers may take.
+# Most of the budget that new states and their answers may take.
 _ANSWERING_SHARE = 0.3
 # Least share of it that is for steps, whatever stands before and after them.
 _LEARNING_SHARE = 0.3
 # A sample is learned by a member with this chance.
 _BAG = 0.75
-# Own rollouts: replicas, steps of a ps/1000, and frames kept of each.
+# Own rollouts: replicas at least, steps, and frames kept of each.
 _REPLICAS, _OWN_STEPS, _OWN_FRAMES = 48, 120, 4
+# Rounds the length of an error at zero, in units of the typical force squared.
+_ROUND = 1e-8
+# Held-out states at which the error is measured again and again, at most.
+_MEASURED = 500
 _OWN_STEP_PS = 0.0005
 # Frames of cheap MD, at the own temperature and at the hottest each, on which it is measured how far frames move.
 _MOVING_FRAMES = 200
@@ -77,16 +81,17 @@ class Truth(Protocol):
 class PotentialTraining:
     """Training settings. `first` states are asked for at once, then more in `rounds` up to `most`, until the mean
     absolute error of held-out forces is below `tolerance_kj_mol_nm`; `held_share` of them is never learned. `budget_s`:
-    of wall time for all that it takes, from the first states to the weights.
-    `temperatures_k`: of hot MD and own rollouts. `energy_weight`: of energies beside forces in the loss."""
+    of wall time for all that it takes, from the first states to the weights. `matrix_rate`: learning rate of matrices,
+    by Muon. `energy_weight`: of energies beside forces in the loss. `temperatures_k`: of hot MD and own rollouts."""
 
     budget_s: float | None = None
     steps: int | None = None
     batch: int = 16
     learning_rate: float = 2e-3
-    energy_weight: float = 0.1
+    matrix_rate: float = 0.01
+    energy_weight: float = 1.0
     first: int = 200
-    most: int = 4000
+    most: int = 16_000
     rounds: int = 8
     held_share: float = 0.1
     tolerance_kj_mol_nm: float = 10.0
@@ -128,7 +133,7 @@ class Learner:
             self.rounds_path.unlink(missing_ok=True)
         self._budget_s, self._started = config.budget_s, time.monotonic()
         self._asking = True
-        self._label_s = 0.0
+        self._asking_s = 0.0
         if len(self.samples):
             self._take()
         else:
@@ -151,30 +156,32 @@ class Learner:
         self._budget_s, self._started = budget_s, time.monotonic()
 
     def loss(self, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean square error of the members' forces, in units of the typical force, and of their energies; each sample
-        of a batch is answered by one member, which learns from it or, for some, never does."""
+        """Mean length of the error of an atom's force, in units of the typical force, and mean square error of
+        energies. A length, since squares would have a few strained states outweigh all others. Each sample of a batch
+        is answered by one of the members that learn from it."""
         self._ask_if_due(generator)
         self._steps += 1
         model, c = self.model, self.config
         x, energies, forces = self._tensors
         k = torch.randint(len(x), (c.batch,), generator=generator)
-        member = torch.randint(model.config.n_members, (c.batch,), generator=generator)
-        weight = self._bags[k, member]
+        member = torch.multinomial(self._bags[k], 1, generator=generator)[:, 0]
         at = x[k].requires_grad_(True)
         with torch.autocast(at.device.type, enabled=False):
             found = model.members(at, self.fabric).gather(1, member[:, None])[:, 0]
             (gradient,) = torch.autograd.grad(found.sum(), at, create_graph=True)
         scale = model.energy_scale_kj_mol.double()
-        total = weight.sum().clamp(min=1.0)
-        force = (((gradient + forces[k]) / (10.0 * scale)).square().mean((1, 2)) * weight).sum() / total
-        energy = (((found - energies[k]) / scale).square() * weight).sum() / total
+        wrong = (gradient + forces[k]) / (10.0 * scale)
+        force = (wrong.square().sum(-1) + _ROUND).sqrt().mean()
+        energy = ((found - energies[k]) / scale).square().mean()
         return force + c.energy_weight * energy, {"force": force.detach(), "energy": energy.detach()}
 
     def errors(self) -> dict[str, float]:
         """Errors on held-out states: of forces in kJ/mol/nm, mean absolute and root mean square, beside the mean
         absolute force, and of energies (less their mean) in kJ/mol, beside the members' spread there; how many states
         have been asked for."""
-        held = self.samples.where(self.samples.held)
+        numbers = np.flatnonzero(self.samples.held)
+        some = np.linspace(0, len(numbers) - 1, min(len(numbers), _MEASURED)).astype(int)
+        held = self.samples.where(numbers[some])
         found = self._measured(held)
         self.error_kj_mol_nm = found["force_mae"]
         return {f"validation_{k}": v for k, v in found.items()} | {"evaluations": float(len(self.samples))}
@@ -201,16 +208,18 @@ class Learner:
         have = len(self.samples)
         if due < min(have * growth, c.most) or have >= c.most:
             return
-        if self._budget_s is not None and self._label_s > _ANSWERING_SHARE * self._budget_s:
+        if self._budget_s is not None and self._asking_s > _ANSWERING_SHARE * self._budget_s:
             self._asking = False
             return
         self._ask(round(due) - have, generator)
 
     def _ask(self, n: int, generator: torch.Generator) -> None:
-        """Ask about `n` states: half those of own rollouts and of hot MD where members spread most, half any."""
+        """Ask about `n` states of own rollouts and, fewer, of hot MD: any of them, and as many where members spread
+        most."""
+        began = time.monotonic()
         seed = int(torch.randint(2**31, (), generator=generator))
-        own = self._own_states(seed)
-        hot = self.truth.explore(max(n // 2, 8), self.config.temperatures_k, seed=seed)
+        own = self._own_states(max(_REPLICAS, n // _OWN_FRAMES), seed)
+        hot = self.truth.explore(max(n // 4, 8), self.config.temperatures_k, seed=seed)
         pool = np.concatenate([own, hot])
         order = np.random.default_rng(seed).permutation(len(pool))
         any_ = pool[order[: n // 2]]
@@ -219,6 +228,7 @@ class Learner:
         unsure = rest[np.argsort(-spread)[: n - len(any_)]]
         self._learn(any_, held=2 * self.config.held_share, measured=True)
         self._learn(unsure, held=0.0)
+        self._asking_s += time.monotonic() - began
 
     def spread(self, positions_nm: Tensor) -> Any:
         """Root mean square deviation of the members' forces from their mean, the largest of a state's atoms, `(n,)` in
@@ -227,11 +237,11 @@ class Learner:
         deviation = torch.cat([(p - p.mean(0)).square().sum(-1).mean(0).sqrt().amax(-1) for p in parts])
         return torch.nan_to_num(deviation, nan=0.0).numpy()
 
-    def _own_states(self, seed: int) -> Any:
+    def _own_states(self, replicas: int, seed: int) -> Any:
         """Return finite states `(n, n_atoms, 3)` of short rollouts from samples, at the temperatures of hot MD."""
         rng, model = np.random.default_rng(seed), self.model
-        start = rng.integers(len(self.samples), size=_REPLICAS)
-        temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=_REPLICAS))
+        start = rng.integers(len(self.samples), size=replicas)
+        temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=replicas))
         masses = self.molecule.masses_da.double()[:, None]
         thermal = (GAS_CONSTANT_KJ_MOL_K * temperatures[:, None, None] / masses).sqrt()
         x = torch.from_numpy(self.samples.positions_nm[start])
@@ -249,9 +259,7 @@ class Learner:
 
     def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
         """Ask about states and take the answers; `measured`: note the error before they are learned."""
-        began = time.monotonic()
         answers = self.truth.label(states)
-        self._label_s += time.monotonic() - began
         n = len(answers.energies_kj_mol)
         if not n:
             if not len(self.samples):
@@ -271,8 +279,10 @@ class Learner:
         if len(learned) < 2 or not self.samples.held.any():
             raise SimulationError(f"too few states of {self.truth.scene.name!r} have an answer to learn from.")
         self._tensors = learned.tensors()
-        bags = torch.rand(len(learned), self.model.config.n_members, generator=torch.Generator().manual_seed(1)) < _BAG
-        self._bags = bags.float()
+        members = self.model.config.n_members
+        draw = torch.rand(len(learned), members, generator=torch.Generator().manual_seed(1))
+        # Each sample is somebody's.
+        self._bags = ((draw < _BAG) | (draw == draw.amin(1, keepdim=True))).float()
         self.model.network.set_walls(self._tensors[0], self.fabric)
 
 
@@ -305,7 +315,8 @@ def learn_potential(
         left_s = budget_s - (time.monotonic() - began) - after_s
         budget_s = max(left_s, _LEARNING_SHARE * budget_s)
     stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, config.steps,
-                        seed=config.seed, bf16=False, validate_every_s=config.validate_every_s)  # fmt: skip
+                        matrix_rate=config.matrix_rate, seed=config.seed, bf16=False,
+                        validate_every_s=config.validate_every_s)  # fmt: skip
 
     def advance(name: str, share: float, metrics: dict[str, float]) -> None:
         if progress is not None:

@@ -68,7 +68,7 @@ class Springs:
 
 def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
     truth, out = Springs(), tmp_path / "w.safetensors"
-    config = replace(QUICK, steps=100, learning_rate=5e-3)
+    config = replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05)
     learn_potential(truth, out, SMALL, config)
     weights = load_weights(out)
     found = weights.provenance

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,29 +15,30 @@ from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from systems.errors import InputError
 
 STAGE = StageConfig("toy", 4, 1e-2, steps=6, bf16=False, validate_every_s=0.0)
+BY_MUON = replace(STAGE, matrix_rate=0.02)
 
 
 class Stop(Exception):
     pass
 
 
-def train(folder: Path, *, resume: bool, stop_at: int | None = None) -> torch.Tensor:
+def train(folder: Path, *, resume: bool, stop_at: int | None = None, stage: StageConfig = STAGE) -> torch.Tensor:
     """Return the weights after a toy training, or raise Stop once the state of step `stop_at` is on disk."""
     torch.manual_seed(0)
-    module = torch.nn.Linear(3, 1)
+    module = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.Linear(8, 1))
 
     def loss_fn(generator: torch.Generator) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        x = torch.randn((4, 3), generator=generator)
+        x = torch.randn((4, 8), generator=generator)
         return (module(x) - x.sum(1, keepdim=True)).square().mean(), {}
 
-    def progress(stage: str, share: float, metrics: dict[str, float]) -> None:
+    def progress(name: str, share: float, metrics: dict[str, float]) -> None:
         if stop_at is not None and share >= stop_at / 6:
             raise Stop
 
-    run_stage(module, STAGE, loss_fn, dict,
+    run_stage(module, stage, loss_fn, dict,
               StagePlace(folder / "s.train.safetensors", folder / "l.csv", torch.device("cpu"), resume),
               progress=progress)  # fmt: skip
-    return module.weight.detach().clone()
+    return module[0].weight.detach().clone()
 
 
 @pytest.fixture
@@ -63,6 +65,23 @@ def test_a_whole_state_and_one_of_an_earlier_version_go_on(tmp_path: Path, stopp
     stopped.write_bytes(kept)
     rewrite(stopped, {"sha256": None})
     assert torch.equal(train(tmp_path, resume=True), whole)
+
+
+def test_muon_goes_on_where_it_was_and_from_no_state_of_adam(tmp_path: Path, stopped: Path) -> None:
+    with pytest.raises(InputError, match=r"has matrix_rate None, this run 0\.02"):
+        train(tmp_path, resume=True, stage=BY_MUON)
+    (tmp_path / "whole").mkdir()
+    whole = train(tmp_path / "whole", resume=False, stage=BY_MUON)
+    with pytest.raises(Stop):
+        train(tmp_path, resume=False, stop_at=3, stage=BY_MUON)
+    with safe_open(stopped, framework="pt") as handle:
+        tensors = {key: handle.get_tensor(key) for key in handle.keys()}  # noqa: SIM118
+        metadata = handle.metadata()
+    assert torch.equal(train(tmp_path, resume=True, stage=BY_MUON), whole)
+    # Without its momentum it would go elsewhere.
+    forgotten = {k: torch.zeros_like(v) if k.startswith("optimiser1.") else v for k, v in tensors.items()}
+    save_file(forgotten, stopped, metadata={k: v for k, v in metadata.items() if k != "sha256"})
+    assert not torch.equal(train(tmp_path, resume=True, stage=BY_MUON), whole)
 
 
 @pytest.mark.parametrize("where", ["first tensor", "last byte"])
