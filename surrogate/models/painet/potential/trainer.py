@@ -35,7 +35,7 @@ from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 # The share of the budget after which no more states are asked for.
-_ASKING_SHARE = 0.6
+_ASKING_SHARE = 0.4
 # Most of the budget that new states and their answers may take.
 _ANSWERING_SHARE = 0.3
 # Least share of it that is for steps, whatever stands before and after them.
