@@ -1,6 +1,6 @@
 """Muon: momentum of matrices, made orthogonal before it is a step (Jordan et al., kellerjordan.github.io/posts/muon).
 
-Potentials learn forces in half the steps that AdamW needs (docs/training.md). torch has one of its own from 2.9 on,
+Potentials learn more by it in the same time (docs/studies/quantum/optimisers.py). torch has one of its own from 2.9 on,
 matrix by matrix; this one takes matrices of one shape together, since those of a small network cost little but calls.
 """
 

@@ -6,7 +6,7 @@
 FOLDER is that of `four_molecules.py`, which comes first. EGNN (Satorras 2021): four layers of the decoder's, all pairs,
 positions that move, the energy read from the last embeddings. MACE (Batatia 2022) is the package's own
 (`pip install mace-torch`, of no use to surromd otherwise): two layers of 64 scalars and vectors, correlation 3, 5 Å.
-All of them: one core, Adam, batches of 16, the same loss. Each is rolled for `--roll` of that core, or as long as
+All of them: one core, Adam, batches of 16, mean square errors of forces and energies. Each is rolled for `--roll` of that core, or as long as
 PAINET was. What is there is not made again.
 """
 
@@ -107,7 +107,7 @@ RIVALS: dict[str, Callable[[Molecule], nn.Module]] = {"egnn": EgnnEnergy, "mace"
 
 
 def learn(network: nn.Module, samples: Samples, budget_s: float) -> tuple[int, float, float]:
-    """Train as PAINET is for so much processor time; return the steps, and scale and zero of energies in kJ/mol."""
+    """Train for so much processor time; return the steps, and scale and zero of energies in kJ/mol."""
     x, energies, forces = samples.where(~samples.held).tensors()
     scale, zero = 0.1 * float(forces.square().mean().sqrt()), float(energies.mean())
     optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE)
