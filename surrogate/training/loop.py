@@ -332,7 +332,10 @@ def load_state(path: Path, module: nn.Module, ema: Ema, optimisers: list[torch.o
     for key, expected in (("stage", config.name), ("seed", config.seed), ("batch", config.batch),
                           ("matrix_rate", config.matrix_rate)):  # fmt: skip
         if getattr(header, key) != expected:
-            raise InputError(f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}; remove it to train anew.")
+            raise InputError(
+                f"training state {path} has {key} {getattr(header, key)!r}, this run {expected!r}; "
+                "remove it to train anew."
+            )
     sub = lambda prefix: {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     try:
         module.load_state_dict(sub("model."))

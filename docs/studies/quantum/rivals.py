@@ -4,10 +4,10 @@
         [-o docs/results/tables/potential_rivals.json]
 
 FOLDER is that of `four_molecules.py`, which comes first. EGNN (Satorras 2021): four layers of the decoder's, all pairs,
-positions that move, the energy read from the last embeddings. MACE (Batatia 2022) is the package's own
-(`pip install mace-torch`, of no use to surromd otherwise): two layers of 64 scalars and vectors, correlation 3, 5 Å.
-All of them: one core, Adam, batches of 16, mean square errors of forces and energies. Each is rolled for `--roll` of that core, or as long as
-PAINET was. What is there is not made again.
+positions that move, the energy read from the last embeddings. MACE (Batatia 2022) is the package's own (`pip install
+mace-torch`, of no use to surromd otherwise): two layers of 64 scalars and vectors, correlation 3, 5 Å. All of them: one
+core, Adam, batches of 16, mean square errors of forces and energies. Each is rolled for `--roll` of that core, or as
+long as PAINET was. What is there is not made again.
 """
 
 from __future__ import annotations
