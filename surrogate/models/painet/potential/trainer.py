@@ -38,6 +38,8 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K
 _ASKING_SHARE = 0.4
 # Most of the budget that new states and their answers may take.
 _ANSWERING_SHARE = 0.3
+# Fewer new states than this are not worth a round.
+_FEWEST = 8
 # Least share of it that is for steps, whatever stands before and after them.
 _LEARNING_SHARE = 0.3
 # A sample is learned by a member with this chance.
@@ -133,11 +135,13 @@ class Learner:
             self.rounds_path.unlink(missing_ok=True)
         self._budget_s, self._started = config.budget_s, time.monotonic()
         self._asking = True
-        self._asking_s = 0.0
+        self._asking_s, self._asked = 0.0, 0
         if len(self.samples):
             self._take()
         else:
+            began = time.monotonic()
             self._learn(truth.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share)
+            self._asking_s, self._asked = time.monotonic() - began, config.first
         # Samples may be all that an interrupted training left; a state that it left brings its own.
         _, energies, forces = self.samples.tensors()
         model.set_scales(energies, forces)
@@ -208,10 +212,15 @@ class Learner:
         have = len(self.samples)
         if due < min(have * growth, c.most) or have >= c.most:
             return
-        if self._budget_s is not None and self._asking_s > _ANSWERING_SHARE * self._budget_s:
+        n = round(due) - have
+        if self._budget_s is not None and self._asking_s:
+            # As many as the time that is left for them allows, at the pace so far.
+            left_s = _ANSWERING_SHARE * self._budget_s - self._asking_s
+            n = min(n, round(left_s / self._asking_s * self._asked))
+        if n < _FEWEST:
             self._asking = False
             return
-        self._ask(round(due) - have, generator)
+        self._ask(n, generator)
 
     def _ask(self, n: int, generator: torch.Generator) -> None:
         """Ask about `n` states of own rollouts and, fewer, of hot MD: any of them, and as many where members spread
@@ -228,7 +237,7 @@ class Learner:
         unsure = rest[np.argsort(-spread)[: n - len(any_)]]
         self._learn(any_, held=2 * self.config.held_share, measured=True)
         self._learn(unsure, held=0.0)
-        self._asking_s += time.monotonic() - began
+        self._asking_s, self._asked = self._asking_s + time.monotonic() - began, self._asked + n
 
     def spread(self, positions_nm: Tensor) -> Any:
         """Root mean square deviation of the members' forces from their mean, the largest of a state's atoms, `(n,)` in
