@@ -43,7 +43,8 @@ class Limits(Recorded):
     `flat_idx (k, 4)` rows (centre, a, b, c) no farther than `flat_max_nm (k,)` from the plane of a, b, c. Jumps:
     `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next, `lag_ps` later, by no more than
     `jump_max_nm`, root mean square, and no less than `jump_min_nm` (0 in files of older versions). The middle of those
-    atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift.
+    atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift; or no
+    farther than `drift_max_nm`, if that is more, where frames turn about a centre of mass that is elsewhere.
     """
 
     angle_idx: Annotated[IntArray, (-1, 3)]
@@ -54,6 +55,7 @@ class Limits(Recorded):
     jump_idx: Annotated[IntArray, (-1, 2)]
     jump_max_nm: float
     jump_min_nm: float = 0.0
+    drift_max_nm: float = 0.0
 
     @cached_property
     def angle_cosines(self) -> tuple[FloatArray, FloatArray]:
@@ -122,7 +124,8 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
                 part |= np.uint16(JUMP) * ~(jump <= limits.jump_max_nm)
                 part |= np.uint16(STILL) * ((jump < limits.jump_min_nm) & (jump > 0.0))
                 moved = columns[:, atoms].mean(axis=1) - before[:, atoms].mean(axis=1)
-                part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= limits.jump_max_nm)
+                far = max(limits.jump_max_nm, limits.drift_max_nm)
+                part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= far)
     return flags
 
 

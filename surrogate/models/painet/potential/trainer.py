@@ -28,7 +28,7 @@ from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_
 from surrogate.training.loss_curves import read_curves
 from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
-from systems.chemistry.limits import limits_from_frames
+from systems.chemistry.limits import WIDENING, limits_from_frames
 from systems.chemistry.validity import geometry_from_frames
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
@@ -369,7 +369,11 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     looks = limits_from_frames(scene, quiet, quiet)
     moves = training_domain(frames)
     assert moves.limits is not None
-    limits = replace(looks, **{key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")})
+    atoms = np.unique(moves.limits["jump_idx"])
+    middles = [run[:, atoms].mean(axis=1) for run in moving]
+    drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
+    jumps = {key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
+    limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
     geometry = geometry_from_frames(scene, quiet)
     return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict())
 

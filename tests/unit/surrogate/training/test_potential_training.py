@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
@@ -17,7 +18,8 @@ from surrogate.models.painet.potential import trainer
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
-from systems.chemistry.limits import Limits
+from systems.chemistry.limits import Limits, check_limits
+from systems.chemistry.validity import DRIFT
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
@@ -199,3 +201,24 @@ def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
     both = jumps(cold, hot)
     # Runs end where they end: from the last cold frame to the first hot one nothing moved.
     assert both == pytest.approx((jumps(cold)[0], jumps(hot)[1])) and both[1] > 5.0 * jumps(cold)[1]
+
+
+def test_a_small_molecule_may_turn_about_its_centre_of_mass_but_not_leave() -> None:
+    scene, rng = scene_from_smiles("CBr"), np.random.default_rng(0)
+    share = scene.masses_da / scene.masses_da.sum()
+    x = scene.positions_nm - share @ scene.positions_nm
+
+    def run(n: int, speed_nm: float = 0.0) -> np.ndarray:
+        """Turn by up to half a radian a frame, and leave along x."""
+        frames, turn = [], np.eye(3)
+        for k in range(n):
+            turn = turn @ Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3)).as_matrix()
+            frames.append(x @ turn.T + [speed_nm * k, 0.0, 0.0] + 1e-4 * rng.normal(size=x.shape))
+        return np.stack(frames)
+
+    samples = Samples(run(50), np.zeros(50), np.zeros((50, *x.shape)), np.zeros(50, bool))
+    limits = Limits.from_dict(trainer.domain_of(scene, samples, [run(200), run(200)], SMALL).limits)
+    turned, left = run(50), run(50, speed_nm=0.2)
+    assert not (check_limits(turned[1:], limits, turned[:-1]) & DRIFT).any()
+    assert ((check_limits(left[1:], limits, left[:-1]) & DRIFT) != 0).mean() > 0.9
+    assert (check_limits(turned[1:], replace(limits, drift_max_nm=0.0), turned[:-1]) & DRIFT).any()
