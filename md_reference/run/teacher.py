@@ -10,7 +10,6 @@ from functools import cached_property
 from types import TracebackType
 from typing import Any
 
-import networkx as nx
 import numpy as np
 
 from md_reference.forces.quantum import Potential
@@ -18,7 +17,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
-from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned
+from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned_apart
 from systems.errors import PreparationError, SimulationError
 from systems.parent_watch import end_with_parent
 from systems.scene import FloatArray, Scene
@@ -41,8 +40,6 @@ _CHEAP = _Pace(0.0005, None, 2.0, 0.25, 1.0)
 _DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
 # Every so many-th hot state has one of its torsions turned to any angle.
 _TURN_EVERY = 3
-# Atoms that a turned torsion brings nearer than this are no state of the molecule.
-_CLASH_NM = 0.14
 _worker: Potential | None = None
 
 
@@ -117,7 +114,9 @@ class Teacher:
         if len(torsions):
             graph = bonded_graph(self.scene)
             for k in range(0, len(states), _TURN_EVERY):
-                states[k] = _turned(states[k], torsions[rng.integers(len(torsions))], graph, rng.uniform(-np.pi, np.pi))
+                states[k] = turned_apart(
+                    states[k], torsions[rng.integers(len(torsions))], rng.uniform(-np.pi, np.pi), graph
+                )
         order: FloatArray = states[rng.permutation(len(states))[:n_states]]
         return order
 
@@ -154,13 +153,6 @@ class Teacher:
             except PreparationError as error:
                 found.append(error)
         raise found[-1]
-
-
-def _turned(x: FloatArray, quad: Any, graph: nx.Graph, angle: float) -> FloatArray:
-    """Return positions with a torsion turned, unless atoms that this moves against each other then collide."""
-    out = turned(x, quad, angle, graph)
-    before, apart = (np.linalg.norm(at[:, None] - at, axis=-1) for at in (x, out))
-    return x if apart[np.abs(apart - before) > 1e-9].min(initial=np.inf) < _CLASH_NM else out
 
 
 def _start(scene: dict[str, Any]) -> None:

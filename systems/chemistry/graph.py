@@ -17,6 +17,9 @@ from systems.scene import FloatArray, Scene
 
 IntArray = npt.NDArray[np.int64]
 
+# Atoms that a turned torsion brings nearer than this are no state of the molecule.
+_CLASH_NM = 0.14
+
 __all__ = [
     "atom_classes",
     "backbone_torsions",
@@ -164,6 +167,13 @@ def turned(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: n
     along = np.outer(arm @ axis, axis) * (1.0 - np.cos(angle))
     out[side] = positions_nm[c] + arm * np.cos(angle) + np.cross(axis, arm) * np.sin(angle) + along
     return out
+
+
+def turned_apart(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: nx.Graph) -> FloatArray:
+    """Return `turned` positions, unless atoms that this moves against each other then collide."""
+    out = turned(positions_nm, quad, angle, graph)
+    before, apart = (np.linalg.norm(at[:, None] - at, axis=-1) for at in (positions_nm, out))
+    return positions_nm if apart[np.abs(apart - before) > 1e-9].min(initial=np.inf) < _CLASH_NM else out
 
 
 def rotatable_torsions(scene: Scene, *, rotors: bool = False) -> IntArray:

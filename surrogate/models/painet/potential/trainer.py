@@ -28,6 +28,7 @@ from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_
 from surrogate.training.loss_curves import read_curves
 from surrogate.training.provenance import provenance_of, training_domain
 from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
+from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned_apart
 from systems.chemistry.limits import WIDENING, limits_from_frames
 from systems.chemistry.validity import geometry_from_frames
 from systems.errors import InputError, SimulationError
@@ -249,11 +250,11 @@ class Learner:
     def _own_states(self, replicas: int, seed: int) -> Any:
         """Return finite states `(n, n_atoms, 3)` of short rollouts from samples, at the temperatures of hot MD."""
         rng, model = np.random.default_rng(seed), self.model
-        start = rng.integers(len(self.samples), size=replicas)
+        start = self._turned(self.samples.positions_nm[rng.integers(len(self.samples), size=replicas)], rng)
         temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=replicas))
         masses = self.molecule.masses_da.double()[:, None]
         thermal = (GAS_CONSTANT_KJ_MOL_K * temperatures[:, None, None] / masses).sqrt()
-        x = torch.from_numpy(self.samples.positions_nm[start])
+        x = torch.from_numpy(start)
         generator = torch.Generator().manual_seed(seed)
         v = thermal * torch.randn(x.shape, generator=generator, dtype=x.dtype)
         frames = []
@@ -265,6 +266,15 @@ class Learner:
         model.train()
         found = torch.cat(frames)
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
+
+    def _turned(self, states: Any, rng: np.random.Generator) -> Any:
+        """Turn a torsion of every other state to any angle, unless atoms collide: barriers are seldom crossed."""
+        scene = self.truth.scene
+        torsions, graph = rotatable_torsions(scene, rotors=True), bonded_graph(scene)
+        for k in range(0, len(states) if len(torsions) else 0, 2):
+            quad = torsions[rng.integers(len(torsions))]
+            states[k] = turned_apart(states[k], quad, rng.uniform(-np.pi, np.pi), graph)
+        return states
 
     def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
         """Ask about states and take the answers; `measured`: note the error before they are learned."""
