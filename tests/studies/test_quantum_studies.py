@@ -119,6 +119,25 @@ def test_a_turn_that_is_offered_leaves_the_law_alone() -> None:
     assert float(torch.stack(found).mean()) == pytest.approx(-pull / spring, rel=0.02)
 
 
+def test_a_chain_that_never_moves_begins_where_another_is() -> None:
+    def energies(x: torch.Tensor) -> torch.Tensor:
+        return torch.where(
+            x[:, 0, 0] > 5.0, -1e9 * x[:, 0, 0], 0.0
+        )  # whatever leaves the first replica's start is refused
+
+    def away(x: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return x - 0.01, v
+
+    x = torch.zeros(3, 2, 3, dtype=torch.float64)
+    x[1] = 9.0
+    chain = corrected_md.Chain(x, torch.ones(2, 1, dtype=x.dtype), energies, away, lambda v, x: v, 0)
+    for _ in range(5):
+        chain.step()
+    assert chain.moves.tolist() == [True, False, True]
+    assert chain.free() == 1
+    assert torch.equal(chain.x[1], chain.x[0]) and chain.energy[1] == 0.0
+
+
 def test_half_a_turn_twice_is_none_and_keeps_bonds() -> None:
     scene = scene_from_smiles("CC(=O)Nc1ccc(O)cc1")
     turn, x = corrected_md.half_turn(scene, [6, 7, 8, 17]), torch.tensor(scene.positions_nm)[None]

@@ -61,6 +61,7 @@ class Chain:
         self.x, self.energy = x, energies(x)
         self.v = self._drawn()
         self.accepted = self.asked = self.turned = 0
+        self.moves = torch.zeros(len(x), dtype=torch.bool)
 
     def _drawn(self) -> Tensor:
         drawn = torch.randn(self.x.shape, generator=self.generator, dtype=self.x.dtype)
@@ -78,6 +79,7 @@ class Chain:
         energy = self.energies(x)
         taken = self._taken(energy + self._kinetic(moved) - self.energy - self._kinetic(v))
         self._put(taken, x, energy, moved, -v)
+        self.moves |= taken
         self.accepted, self.asked = self.accepted + int(taken.sum()), self.asked + len(taken)
         if self.turn is not None:
             x = self.turn(self.x)
@@ -86,6 +88,15 @@ class Chain:
             self._put(taken, x, energy, self.v, self.v)
             self.v = torch.where(taken[:, None, None], self._drawn(), self.v)
             self.turned += int(taken.sum())
+
+    def free(self) -> int:
+        """Put replicas that never moved, whose start is too strained, where others are; return how many."""
+        stuck = torch.nonzero(~self.moves).flatten()
+        free = torch.nonzero(self.moves).flatten()
+        others = free[torch.arange(len(stuck)) % len(free)]
+        for values in (self.x, self.v, self.energy):
+            values[stuck] = values[others]
+        return len(stuck)
 
     def _taken(self, rise: Tensor) -> Tensor:
         chance = torch.rand(len(rise), generator=self.generator, dtype=rise.dtype)
@@ -175,6 +186,7 @@ def main() -> None:
         chain = chain_of(weights, starts(scene, given.replicas, given.seed), given.seed, given.turn)
         for _ in range(round(SETTLE_PS / PIECE_PS)):
             chain.step()
+        sys.stdout.write(f"{chain.free()} of {given.replicas} replicas never left their start and begin elsewhere\n")
     record = {"made_by": "docs/studies/quantum/corrected_md.py", "lag_ps": SAVE_PS, "temperature_k": TEMPERATURE_K}
     writers = [open_writer(path, scene, record, append=goes_on) for path in paths]
     n_frames = min(writer.n_frames for writer in writers)
