@@ -35,8 +35,9 @@ from systems.errors import InputError, SimulationError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
-# The share of the budget after which no more states are asked for.
-_ASKING_SHARE = 0.4
+# The share of the budget in which states are asked for; what is missing then is asked for at once, unless a pause or a
+# resumption has brought the training so far that it would hardly learn them.
+_ASKING_SHARE, _LAST_ASKING_SHARE = 0.4, 0.7
 # Most of the budget that new states and their answers may take.
 _ANSWERING_SHARE = 0.3
 # Fewer new states than this are not worth a round.
@@ -206,20 +207,20 @@ class Learner:
 
     def _ask_if_due(self, generator: torch.Generator) -> None:
         c, share = self.config, self.share
-        if not self._asking or share > _ASKING_SHARE or self.error_kj_mol_nm < c.tolerance_kj_mol_nm:
+        have, last = len(self.samples), share >= _ASKING_SHARE
+        if not self._asking or have >= c.most or self.error_kj_mol_nm < c.tolerance_kj_mol_nm:
             return
         growth = (c.most / c.first) ** (1.0 / c.rounds)
-        due = c.first * growth ** (c.rounds * share / _ASKING_SHARE)
-        have = len(self.samples)
-        if due < min(have * growth, c.most) or have >= c.most:
+        due = c.most if last else c.first * growth ** (c.rounds * share / _ASKING_SHARE)
+        if due < min(have * growth, c.most):
             return
         n = round(due) - have
         if self._budget_s is not None and self._asking_s:
             # As many as the time that is left for them allows, at the pace so far.
             left_s = _ANSWERING_SHARE * self._budget_s - self._asking_s
             n = min(n, round(left_s / self._asking_s * self._asked))
-        if n < _FEWEST:
-            self._asking = False
+        self._asking = not last and n >= _FEWEST
+        if n < _FEWEST or share > _LAST_ASKING_SHARE:
             return
         self._ask(n, generator)
 

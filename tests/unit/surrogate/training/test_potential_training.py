@@ -240,3 +240,19 @@ def test_half_of_the_own_rollouts_start_with_a_torsion_turned_and_bonds_as_they_
     water: Any = SimpleNamespace(truth=SimpleNamespace(scene=scene_from_smiles("O")))
     still = np.zeros((2, 3, 3))
     assert Learner._turned(water, still, np.random.default_rng(0)) is still
+
+
+@pytest.mark.parametrize(("share", "asked"), [(0.1, False), (0.5, True), (0.8, False)])
+def test_states_that_a_pause_let_miss_their_time_are_asked_for_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, asked: bool
+) -> None:
+    from surrogate.models.painet.potential.model import PainetPotential
+
+    truth = Springs()
+    learner = Learner(PainetPotential(SMALL), truth, QUICK, tmp_path / "w.safetensors", resume=False)
+    monkeypatch.setattr(Learner, "share", property(lambda self: share))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        learner.loss(generator)
+    assert (len(learner.samples) > QUICK.first) == asked
+    assert len(learner.samples) <= QUICK.most
