@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,21 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames, centre, quantise
 from surrogate.data.references import References
-from surrogate.data.weights import TrainingDomain, save_weights
+from surrogate.data.weights import save_weights
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.covered import domain_of
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.precision import torch_threads
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
 from surrogate.training.loss_curves import read_curves
-from surrogate.training.provenance import provenance_of, training_domain
+from surrogate.training.provenance import provenance_of
 from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
 from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned_apart
-from systems.chemistry.limits import WIDENING, limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -363,30 +361,6 @@ def _line(learner: Learner) -> str:
     if not np.isfinite(learner.error_kj_mol_nm):
         return f"{n} evaluations"
     return f"{n} evaluations, force error {learner.error_kj_mol_nm:.3g} kJ/mol/nm"
-
-
-def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: the truth's quieter samples say what frames look like; runs of cheap MD, `moving`
-    (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own rate."""
-    conditions = {
-        "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
-        "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
-        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
-    }  # fmt: skip
-    starts = np.cumsum([0, *map(len, moving)])
-    frames = TrainingFrames(scene, quantise(centre(np.concatenate(moving))), starts, config.lag_ps, False, conditions,
-                            ())  # fmt: skip
-    quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
-    looks = limits_from_frames(scene, quiet, quiet)
-    moves = training_domain(frames)
-    assert moves.limits is not None
-    atoms = np.unique(moves.limits["jump_idx"])
-    middles = [run[:, atoms].mean(axis=1) for run in moving]
-    drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
-    jumps = {key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
-    limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
-    geometry = geometry_from_frames(scene, quiet)
-    return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict())
 
 
 class PotentialTrainer(Trainer):

@@ -17,6 +17,7 @@ from surrogate.data.weights import load_weights
 from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.painet.potential import trainer
 from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.covered import domain_of
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
 from systems.chemistry.limits import Limits, check_limits
@@ -196,7 +197,7 @@ def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
     samples = Samples(cold, np.zeros(50), np.zeros_like(cold), np.zeros(50, bool))
 
     def jumps(*moving: np.ndarray) -> tuple[float, float]:
-        limits = Limits.from_dict(trainer.domain_of(scene, samples, list(moving), SMALL).limits)
+        limits = Limits.from_dict(domain_of(scene, samples, list(moving), SMALL).limits)
         return limits.jump_min_nm, limits.jump_max_nm
 
     both = jumps(cold, hot)
@@ -218,7 +219,7 @@ def test_a_small_molecule_may_turn_about_its_centre_of_mass_but_not_leave() -> N
         return np.stack(frames)
 
     samples = Samples(run(50), np.zeros(50), np.zeros((50, *x.shape)), np.zeros(50, bool))
-    limits = Limits.from_dict(trainer.domain_of(scene, samples, [run(200), run(200)], SMALL).limits)
+    limits = Limits.from_dict(domain_of(scene, samples, [run(200), run(200)], SMALL).limits)
     turned, left = run(50), run(50, speed_nm=0.2)
     assert not (check_limits(turned[1:], limits, turned[:-1]) & DRIFT).any()
     assert ((check_limits(left[1:], limits, left[:-1]) & DRIFT) != 0).mean() > 0.9
