@@ -17,7 +17,7 @@ from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
-from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned_apart
+from systems.chemistry.graph import turn_torsions
 from systems.errors import PreparationError, SimulationError
 from systems.parent_watch import end_with_parent
 from systems.scene import FloatArray, Scene
@@ -110,13 +110,7 @@ class Teacher:
             seed = int(rng.integers(2**31))
             found.append(self._md(each, self._cheap[2].apart_ps, temperature_k, seed=seed))
         states = np.concatenate(found)
-        torsions = rotatable_torsions(self.scene, rotors=True)
-        if len(torsions):
-            graph = bonded_graph(self.scene)
-            for k in range(0, len(states), _TURN_EVERY):
-                states[k] = turned_apart(
-                    states[k], torsions[rng.integers(len(torsions))], rng.uniform(-np.pi, np.pi), graph
-                )
+        turn_torsions(self.scene, states, _TURN_EVERY, rng)
         order: FloatArray = states[rng.permutation(len(states))[:n_states]]
         return order
 

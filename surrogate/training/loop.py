@@ -217,8 +217,8 @@ def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Op
     plain: list[nn.Parameter] = []
     if config.matrix_rate is not None:
         layers = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
-        weights: list[nn.Parameter] = [layer.weight for layer in layers if layer.weight.requires_grad]  # type: ignore[misc]
-        matrices = [p for p in weights if min(p.shape) >= LEAST_MATRIX]
+        own = [p for layer in layers for p in layer.parameters(recurse=False) if p.requires_grad]
+        matrices = [p for p in own if p.ndim == 2 and min(p.shape) >= LEAST_MATRIX]
     taken = {id(p) for p in matrices}
     for p in (p for p in module.parameters() if p.requires_grad and id(p) not in taken):
         (decay if p.ndim >= 2 else plain).append(p)

@@ -20,7 +20,8 @@ _ITERATIONS = 5
 
 
 def orthogonalised(matrices: Tensor) -> Tensor:
-    """Matrices `(k, n, m)` -> of each U V^T of its singular value decomposition U S V^T, to within some 30 %."""
+    """Matrices `(k, n, m)` -> of each about U V^T of its singular value decomposition U S V^T: singular values come out
+    near one, the smallest of them below."""
     x = matrices / (matrices.norm(dim=(1, 2), keepdim=True) + 1e-12)
     tall = x.shape[1] > x.shape[2]
     if tall:

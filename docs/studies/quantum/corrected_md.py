@@ -93,6 +93,8 @@ class Chain:
         """Put replicas that never moved, whose start is too strained, where others are; return how many."""
         stuck = torch.nonzero(~self.moves).flatten()
         free = torch.nonzero(self.moves).flatten()
+        if not len(free):
+            raise SystemExit("No replica moves: these weights are too far from GFN2-xTB.")
         others = free[torch.arange(len(stuck)) % len(free)]
         for values in (self.x, self.v, self.energy):
             values[stuck] = values[others]

@@ -28,7 +28,7 @@ from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_
 from surrogate.training.loss_curves import read_curves
 from surrogate.training.provenance import provenance_of
 from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
-from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned_apart
+from systems.chemistry.graph import turn_torsions
 from systems.errors import InputError, SimulationError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
@@ -46,6 +46,8 @@ _LEARNING_SHARE = 0.3
 _BAG = 0.75
 # Own rollouts: replicas at least, steps, and frames kept of each.
 _REPLICAS, _OWN_STEPS, _OWN_FRAMES = 48, 120, 4
+# Every so many-th of them starts with a torsion turned to any angle.
+_TURN_EVERY = 2
 # Rounds the length of an error at zero, in units of the typical force squared.
 _ROUND = 1e-8
 # Held-out states at which the error is measured again and again, at most.
@@ -249,7 +251,9 @@ class Learner:
     def _own_states(self, replicas: int, seed: int) -> Any:
         """Return finite states `(n, n_atoms, 3)` of short rollouts from samples, at the temperatures of hot MD."""
         rng, model = np.random.default_rng(seed), self.model
-        start = self._turned(self.samples.positions_nm[rng.integers(len(self.samples), size=replicas)], rng)
+        start = self.samples.positions_nm[rng.integers(len(self.samples), size=replicas)]
+        # Barriers are seldom crossed.
+        turn_torsions(self.truth.scene, start, _TURN_EVERY, rng)
         temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=replicas))
         masses = self.molecule.masses_da.double()[:, None]
         thermal = (GAS_CONSTANT_KJ_MOL_K * temperatures[:, None, None] / masses).sqrt()
@@ -265,15 +269,6 @@ class Learner:
         model.train()
         found = torch.cat(frames)
         return found[torch.isfinite(found).all(-1).all(-1) & (found.abs().amax((1, 2)) < 10.0)].numpy()
-
-    def _turned(self, states: Any, rng: np.random.Generator) -> Any:
-        """Turn a torsion of every other state to any angle, unless atoms collide: barriers are seldom crossed."""
-        scene = self.truth.scene
-        torsions, graph = rotatable_torsions(scene, rotors=True), bonded_graph(scene)
-        for k in range(0, len(states) if len(torsions) else 0, 2):
-            quad = torsions[rng.integers(len(torsions))]
-            states[k] = turned_apart(states[k], quad, rng.uniform(-np.pi, np.pi), graph)
-        return states
 
     def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
         """Ask about states and take the answers; `measured`: note the error before they are learned."""

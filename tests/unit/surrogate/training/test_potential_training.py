@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -224,23 +223,6 @@ def test_a_small_molecule_may_turn_about_its_centre_of_mass_but_not_leave() -> N
     assert not (check_limits(turned[1:], limits, turned[:-1]) & DRIFT).any()
     assert ((check_limits(left[1:], limits, left[:-1]) & DRIFT) != 0).mean() > 0.9
     assert (check_limits(turned[1:], replace(limits, drift_max_nm=0.0), turned[:-1]) & DRIFT).any()
-
-
-def test_half_of_the_own_rollouts_start_with_a_torsion_turned_and_bonds_as_they_were() -> None:
-    scene = scene_from_smiles("CCO")
-    learner: Any = SimpleNamespace(truth=SimpleNamespace(scene=scene))
-    states = np.repeat(scene.positions_nm[None], 40, axis=0)
-    found = Learner._turned(learner, states.copy(), np.random.default_rng(0))
-    moved = np.abs(found - states).max((1, 2)) > 1e-3
-    assert not moved[1::2].any() and moved[::2].mean() > 0.8
-    first, second = scene.bonds.T
-    lengths = np.linalg.norm(found[:, first] - found[:, second], axis=-1)
-    assert np.ptp(lengths, axis=0).max() < 1e-9
-    apart = np.linalg.norm(found[:, :, None] - found[:, None], axis=-1) + np.eye(scene.n_atoms)
-    assert apart.min() > 0.09
-    water: Any = SimpleNamespace(truth=SimpleNamespace(scene=scene_from_smiles("O")))
-    still = np.zeros((2, 3, 3))
-    assert Learner._turned(water, still, np.random.default_rng(0)) is still
 
 
 @pytest.mark.parametrize(("share", "asked"), [(0.1, False), (0.5, True), (0.8, False)])

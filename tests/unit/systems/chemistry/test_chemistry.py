@@ -26,11 +26,12 @@ from systems.chemistry.graph import (
     ring_bonds,
     rotatable_torsions,
     stereocentres,
+    turn_torsions,
     turned,
 )
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load
-from systems.prepare.molecule import n_unpaired_electrons
+from systems.prepare.molecule import n_unpaired_electrons, scene_from_smiles
 from systems.scene import Scene
 from systems.selection import part_of
 
@@ -372,3 +373,19 @@ def test_missing_hydrogen_is_named(from_smiles: MAKE) -> None:
     with pytest.raises(ValenceError) as caught:
         perceive(scene.elements[:hydrogen], bonds)
     assert len(caught.value.atoms) == 1
+
+
+def test_torsions_are_turned_in_every_second_state_with_bonds_as_they_were() -> None:
+    scene = scene_from_smiles("CCO")
+    states = np.repeat(scene.positions_nm[None], 40, axis=0)
+    found = states.copy()
+    turn_torsions(scene, found, 2, np.random.default_rng(0))
+    moved = np.abs(found - states).max((1, 2)) > 1e-3
+    assert not moved[1::2].any() and moved[::2].mean() > 0.8
+    first, second = scene.bonds.T
+    assert np.ptp(np.linalg.norm(found[:, first] - found[:, second], axis=-1), axis=0).max() < 1e-9
+    apart = np.linalg.norm(found[:, :, None] - found[:, None], axis=-1) + np.eye(scene.n_atoms)
+    assert apart.min() > 0.09
+    still = np.zeros((2, 3, 3))  # water has no torsion
+    turn_torsions(scene_from_smiles("O"), still, 2, np.random.default_rng(0))
+    assert not still.any()
