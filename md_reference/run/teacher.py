@@ -5,13 +5,15 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.mixture import is_water, molecules_of
 from md_reference.forces.quantum import Potential
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
@@ -36,8 +38,9 @@ class _Pace:
 
 
 _CHEAP = _Pace(0.0005, None, 2.0, 0.25, 1.0)
-# Where every step is a dear force: as few as will do.
+# Where every step is a dear force: as few as will do. H2 has no heavy atom to make its hydrogens heavier.
 _DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
+_DEAR_LIGHT = replace(_DEAR, timestep_ps=0.0005, hydrogen_mass_da=None)
 # Every so many-th hot state has one of its torsions turned to any angle.
 _TURN_EVERY = 3
 _worker: Potential | None = None
@@ -101,8 +104,9 @@ class Teacher:
         )
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
-        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters; of every
-        third one torsion is turned. They are near the molecule's own, and as many at each temperature."""
+        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters and of
+        water, which is rigid beside it; of every third one torsion is turned. They are near the molecule's own, and as
+        many at each temperature."""
         rng = np.random.default_rng(seed)
         each = -(-n_states // len(temperatures_k))
         found = []
@@ -114,13 +118,21 @@ class Teacher:
         order: FloatArray = states[rng.permutation(len(states))[:n_states]]
         return order
 
-    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> FloatArray:
-        """Return frames `(n_frames, n_atoms, 3)` nm of MD, `lag_ps` apart, by GAFF2, or an eighth as many by GFN2-xTB
-        where GAFF2 has no parameters; the centre of mass stays where it is."""
-        return self._md(max(2, round(n_frames * self._cheap[2].share)), lag_ps, temperature_k, seed=seed)
+    def motion(
+        self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
+    ) -> FloatArray:
+        """Return frames `(n_frames, n_atoms, 3)` nm of MD as hot as asked, `lag_ps` apart, an eighth as many where
+        GFN2-xTB makes it; the centre of mass stays where it is."""
+        n_frames = max(2, round(n_frames * self._cheap[2].share))
+        return self._md(n_frames, lag_ps, temperature_k, seed=seed, constrain_hydrogens=constrain_hydrogens)
 
-    def _md(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> FloatArray:
+    def _md(
+        self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
+    ) -> FloatArray:
         spec, system, pace = self._cheap
+        if constrain_hydrogens:
+            spec = replace(spec, constrain_hydrogens=True)
+            system = build_system(self.scene, spec)
         conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=pace.timestep_ps, seed=seed,
                                 platform="Reference")  # fmt: skip
         frames = np.empty((n_frames, self.scene.n_atoms, 3))
@@ -137,10 +149,11 @@ class Teacher:
     @cached_property
     def _cheap(self) -> tuple[ForceFieldSpec, Any, _Pace]:
         """The forces of hot MD, their `openmm.System`, and how it goes."""
-        from md_reference.forces.forcefield import build_system
-
-        found = []
-        for name, pace in (("gaff2", _CHEAP), (QUANTUM, _DEAR)):
+        elements, found = self.scene.elements, []
+        ways = [("gaff2", _CHEAP), (QUANTUM, _DEAR if set(elements) != {"H"} else _DEAR_LIGHT)]
+        if any(is_water(elements, molecule) for molecule in molecules_of(self.scene)):
+            del ways[0]
+        for name, pace in ways:
             spec = ForceFieldSpec(name, "vacuum", pace.hydrogen_mass_da, constrain_hydrogens=False)
             try:
                 return spec, build_system(self.scene, spec), pace

@@ -65,14 +65,24 @@ def test_what_the_level_refuses_is_known_at_once() -> None:
 
 
 def test_a_molecule_that_gaff2_does_not_know_moves_by_the_level_itself() -> None:
-    # Borane; methyl, with one electron too many for a pair.
-    for smiles in ("B", "[CH3]"):
+    # Borane; methyl, with one electron too many for a pair; water, which is rigid beside GAFF2.
+    for smiles in ("B", "[CH3]", "O"):
         scene = scene_from_smiles(smiles)
         with Teacher(scene, workers=1) as teacher:
             states = teacher.explore(4, (300.0,), seed=0)
             assert teacher.label(states).failed == 0
             assert len(teacher.motion(16, 0.01, 300.0, seed=0)) == 2, "an eighth: each step is a dear force"
         assert states.shape == (4, scene.n_atoms, 3)
+        assert np.linalg.norm(states[:, 0] - states[:, 1], axis=-1).std() > 1e-4
+
+
+def test_hydrogen_without_a_heavy_atom_stays_whole() -> None:
+    scene = scene_from_smiles("[H][H]")
+    with Teacher(scene, workers=1) as teacher:
+        frames = teacher.motion(800, 0.1, 700.0, seed=0)
+        rigid = teacher.motion(80, 0.1, 300.0, seed=0, constrain_hydrogens=True)
+    flexible, fixed = (np.linalg.norm(x[:, 0] - x[:, 1], axis=-1) for x in (frames, rigid))
+    assert flexible.max() < 0.1 and flexible.std() > 1e-3 > 1e4 * fixed.std()
 
 
 def test_bad_molecules_are_refused_in_one_line() -> None:

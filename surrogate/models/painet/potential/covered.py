@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from surrogate.data.frames import TrainingFrames, centre, quantise
 from surrogate.data.weights import TrainingDomain
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.samples import Samples
-from surrogate.training.provenance import training_domain
 from systems.chemistry.limits import WIDENING, limits_from_frames
 from systems.chemistry.validity import geometry_from_frames
 from systems.scene import Scene
@@ -25,17 +23,13 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
         "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
     }  # fmt: skip
-    starts = np.cumsum([0, *map(len, moving)])
-    frames = TrainingFrames(scene, quantise(centre(np.concatenate(moving))), starts, config.lag_ps, False, conditions,
-                            ())  # fmt: skip
     quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
     looks = limits_from_frames(scene, quiet, quiet)
-    moves = training_domain(frames)
-    assert moves.limits is not None
-    atoms = np.unique(moves.limits["jump_idx"])
-    middles = [run[:, atoms].mean(axis=1) for run in moving]
+    before, after = (np.concatenate([run[part] for run in moving]) for part in (slice(-1), slice(1, None)))
+    moves = limits_from_frames(scene, before, after)
+    middles = [run[:, np.unique(moves.jump_idx)].mean(axis=1) for run in moving]
     drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
-    jumps = {key: moves.limits[key] for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
+    jumps = {key: getattr(moves, key) for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
     limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
     geometry = geometry_from_frames(scene, quiet)
-    return replace(moves, geometry=geometry.to_dict(), limits=limits.to_dict())
+    return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())

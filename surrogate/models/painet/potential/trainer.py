@@ -76,7 +76,9 @@ class Truth(Protocol):
 
     def explore(self, n_states: int, temperatures_k: tuple[float, ...], *, seed: int) -> Any: ...
 
-    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any: ...
+    def motion(
+        self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
+    ) -> Any: ...
 
     def label(self, positions_nm: Any) -> Answers: ...
 
@@ -320,8 +322,12 @@ def learn_potential(
     if not resume:
         for path in (log, state, samples_path(out)):
             path.unlink(missing_ok=True)
-    baths_k = (model_config.temperature_k, max(config.temperatures_k))
-    moving = [truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed) for kelvin in baths_k]
+    # Frames change least in the own bath, with bonds as rigid as rollouts have them, and most when hot.
+    moving = [
+        truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed, constrain_hydrogens=rigid)
+        for kelvin, rigid in ((model_config.temperature_k, model_config.constrain_hydrogens),
+                              (max(config.temperatures_k), False))
+    ]  # fmt: skip
     learner = Learner(model, truth, config, out, resume=resume)
     budget_s = config.budget_s
     if budget_s is not None:

@@ -52,7 +52,7 @@ class Springs:
         rng = np.random.default_rng(seed)
         return self.scene.positions_nm + 0.006 * rng.normal(size=(n_states, 3, 3))
 
-    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any:
+    def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, **_: bool) -> Any:
         return self.explore(n_frames, (temperature_k,), seed=seed)
 
     def label(self, positions_nm: Any) -> Answers:
@@ -100,7 +100,7 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
     clock, stages = [0.0], []
 
     class Slow(Springs):
-        def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int) -> Any:
+        def motion(self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, **_: bool) -> Any:
             clock[0] += 0.1 * n_frames
             return super().motion(n_frames, lag_ps, temperature_k, seed=seed)
 
@@ -202,6 +202,8 @@ def test_frames_may_move_as_far_as_those_of_hot_md() -> None:
     both = jumps(cold, hot)
     # Runs end where they end: from the last cold frame to the first hot one nothing moved.
     assert both == pytest.approx((jumps(cold)[0], jumps(hot)[1])) and both[1] > 5.0 * jumps(cold)[1]
+    # Turned about only, nothing changes but for rounding, which is no more than is told.
+    assert jumps(np.stack([Rotation.random(rng=k).apply(cold[0]) for k in range(9)]))[1] < 1e-9
 
 
 def test_a_small_molecule_may_turn_about_its_centre_of_mass_but_not_leave() -> None:
