@@ -16,8 +16,8 @@ from surrogate.data.descriptions import describe
 from surrogate.models.compiling import with_compiled_parts
 from surrogate.models.interface import Surrogate, draw_noise
 from surrogate.models.lean import with_lean_parts
+from surrogate.models.memory import keep_freed_memory
 from surrogate.models.precision import choose_precision, torch_threads
-from surrogate.sampling.memory import keep_freed_memory
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
 

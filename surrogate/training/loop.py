@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.data.tensor_checksums import tensor_checksum
+from surrogate.models.memory import keep_freed_memory
 from surrogate.models.precision import bf16_pays
 from surrogate.training.devices import average_gradients, open_fabric
 from surrogate.training.health import Watch, first_not_finite
@@ -138,6 +139,7 @@ def run_stage(
     `warn` hears of a gradient that has outgrown all others (stderr if None). Raises SimulationError when the loss stops
     being finite; the last saved state stays.
     """
+    keep_freed_memory()
     device = place.device
     fabric = open_fabric(device.type, config.bf16 and bf16_pays(device.type))
     watch = Watch()

@@ -1,7 +1,7 @@
-"""Memory that a rollout frees is kept for the next chunk, where the C library lets a program say so (glibc).
+"""Memory that is freed is kept for the next chunk or training step, where the C library lets a program say so (glibc).
 
 It gives arrays of more than some hundred kB back to the kernel as soon as they are freed, and every chunk would have
-its pages made and zeroed anew: a tenth to a quarter of a rollout's time in a batch.
+its pages made and zeroed anew: a tenth to a quarter of a rollout's time in a batch, a tenth of a training step's.
 """
 
 from __future__ import annotations
