@@ -7,6 +7,7 @@ the limit between, so that a seed keeps its meaning on a machine. And on how man
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ _PAYS = 1.25
 # A layer of the shipped weights, times a batch: (rows, columns in, columns out).
 _PRODUCT = (64, 256, 1792)
 _ROUNDS = 7
+# Steps that are timed on each number of cores, and after how many it is asked again.
+_TIMED_STEPS, _STEPS_BETWEEN = 8, 500
 _UNITS = (("AMX", "_is_amx_tile_supported"), ("avx512_bf16", "_is_avx512_bf16_supported"))
 
 
@@ -122,3 +125,29 @@ def torch_threads(number: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+class StepThreads:
+    """Has the steps of a loop computed on as many cores as they are fastest on: one, two or four, at most `most`. It
+    is found out by timing, and again from time to time, since other programs come and go."""
+
+    def __init__(self, most: int) -> None:
+        self._numbers = [n for n in (1, 2, 4) if n <= max(most, 1)]
+        self._spent_s: dict[int, list[float]] = {}
+        self._step, self._began = 0, 0.0
+
+    def next_step(self) -> int:
+        """Say that a step begins, and return on how many cores. What takes long between steps now and then (a
+        validation) does not count."""
+        now, trial = time.perf_counter(), len(self._numbers) * _TIMED_STEPS
+        if len(self._numbers) > 1 and 0 < self._step <= trial:
+            self._spent_s.setdefault(torch.get_num_threads(), []).append(now - self._began)
+        if self._step < trial:
+            torch.set_num_threads(self._numbers[self._step // _TIMED_STEPS])
+        elif self._step == trial and len(self._numbers) > 1:
+            torch.set_num_threads(min(self._spent_s, key=lambda n: statistics.median(self._spent_s[n])))
+        self._step += 1
+        if self._step == trial + _STEPS_BETWEEN:
+            self._step, self._spent_s = 0, {}
+        self._began = now
+        return torch.get_num_threads()

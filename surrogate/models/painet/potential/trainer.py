@@ -23,7 +23,7 @@ from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.covered import domain_of
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.precision import torch_threads
+from surrogate.models.precision import StepThreads, torch_threads
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
 from surrogate.training.loss_curves import read_curves
 from surrogate.training.provenance import provenance_of
@@ -129,6 +129,8 @@ class Learner:
         self.key = truth.scene.topology_hash
         self.samples = Samples.none(truth.scene.n_atoms)
         self.error_kj_mol_nm = np.inf
+        # A budget is of wall time; so many steps are the same steps everywhere.
+        self._threads = StepThreads(1 if config.budget_s is None else torch.get_num_threads())
         self._spent_s, self._steps = 0.0, 0
         curves = out.with_suffix(".csv")
         if resume and curves.exists() and (rows := [row for rows in read_curves(curves).values() for row in rows]):
@@ -169,6 +171,7 @@ class Learner:
         is answered by one of the members that learn from it."""
         self._ask_if_due(generator)
         self._steps += 1
+        self._threads.next_step()
         model, c = self.model, self.config
         x, energies, forces = self._tensors
         k = torch.randint(len(x), (c.batch,), generator=generator)
@@ -343,7 +346,6 @@ def learn_potential(
 
     place = StagePlace(state, log, torch.device("cpu"), resume)
     learner.begin(budget_s)
-    # Arrays are small, and the truth has use for the other cores.
     with torch_threads(1):
         spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
     errors = learner.errors()

@@ -114,3 +114,24 @@ def test_measuring_leaves_random_numbers_alone() -> None:
     torch.manual_seed(3)
     product_speed.__wrapped__()
     assert torch.equal(torch.rand(2), expected)
+
+
+def test_steps_are_computed_on_the_number_of_cores_that_is_fastest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock of its own; one step in ten takes a second longer, as a validation does."""
+    clock, count, cost_s = [0.0], [1], {1: 0.03, 2: 0.02, 4: 0.05}
+    monkeypatch.setattr(precision.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: count.__setitem__(0, n))
+    monkeypatch.setattr(torch, "get_num_threads", lambda: count[0])
+
+    def run(threads: precision.StepThreads, n_steps: int) -> list[int]:
+        taken = []
+        for k in range(n_steps):
+            taken.append(threads.next_step())
+            clock[0] += cost_s[taken[-1]] + (1.0 if k % 10 == 3 else 0.0)
+        return taken
+
+    threads = precision.StepThreads(6)
+    assert set(run(threads, 24)) == {1, 2, 4} and set(run(threads, 400)) == {2}
+    cost_s[2] = 0.1  # another program has come
+    assert set(run(threads, 600)[-200:]) == {1}
+    assert set(run(precision.StepThreads(1), 50)) == {1}
