@@ -1,4 +1,4 @@
-"""What a potential learns in the same time by AdamW alone and with Muon for its matrices.
+"""What a potential learns in the same time by AdamW alone, with Muon for its matrices, and that on all cores.
 
     python docs/studies/quantum/optimisers.py WEIGHTS [--budget 3min] [--repeats 2]
 
@@ -50,11 +50,13 @@ def main() -> None:
     parser.add_argument("--budget", type=lambda text: parse_wall_s(text), default=180.0)
     parser.add_argument("--repeats", type=int, default=2)
     given = parser.parse_args()
-    torch.set_num_threads(1)
+    most = torch.get_num_threads()
     scene = load_weights(given.weights).domain.scene
     sys.stdout.write(f"{machine_name()}\n")
     for seed in range(given.repeats):
-        for name, rate in (("AdamW", None), ("Muon", PotentialTraining().matrix_rate)):
+        muon = PotentialTraining().matrix_rate
+        for name, rate, threads in (("AdamW", None, 1), ("Muon", muon, 1), (f"Muon, up to {most} cores", muon, most)):
+            torch.set_num_threads(threads)
             found = learned(scene, samples_path(given.weights), given.budget, seed, rate)
             sys.stdout.write(
                 f"{name}: {found['steps']:,.0f} steps, forces {found['validation_force_mae']:.1f} kJ/mol/nm, "
