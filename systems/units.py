@@ -11,6 +11,8 @@ from typing import Any, overload
 from systems.errors import UnitError
 
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
+# Minus the logarithm of how often chance may be taken for a blow-up.
+_UNLIKELINESS = 50.0
 # What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
 Quantity = float | str
 
@@ -188,3 +190,10 @@ def whole_steps(duration_ps: float, step_ps: float, what: str) -> int:
     if n < 1 or abs(ratio - n) > 1e-3:
         raise UnitError(f"{what}: {format_time_ps(duration_ps)} is not a whole multiple of {format_time_ps(step_ps)}.")
     return n
+
+
+def hottest_k(bath_k: float, n_dof: int) -> float:
+    """Return the kinetic temperature that chance exceeds in one frame of 10^21: 1 + 2 sqrt(x/n) + 2 x/n times the
+    bath's, n degrees of freedom, x = 50 (Laurent and Massart, Ann. Statist. 28, 1302 (2000), lemma 1)."""
+    x = _UNLIKELINESS / n_dof
+    return bath_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x)

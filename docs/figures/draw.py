@@ -49,10 +49,10 @@ def draw_effective(table: dict[str, Any], out: Path) -> None:
         ends = numbers(row["distance"])[1:]
         error = [[y - ends[0]], [ends[1] - y]] if ends else None
         label = None if whose in labelled else whose if whose in COLOURS else "MD"
-        labelled |= {whose} if whose in COLOURS else {"OpenMM", "MD in lanes"}
+        labelled |= {whose} if whose in COLOURS else {"OpenMM", "MD by SIMD replicas"}
         marker = "o" if whose in COLOURS else "s"
         axes.errorbar(rate, y, error, color=colour, marker=marker, capsize=2, lw=1, ms=5, ls="", label=label)
-        name = setting if whose in ("OpenMM", *COLOURS) else f"in lanes, {setting}"
+        name = setting if whose in ("OpenMM", *COLOURS) else f"SIMD, {setting}"
         below = name.startswith(("fitted", "gaussian"))
         where = {"xytext": (3, -4) if below else (-3, 4), "ha": "right" if below else "left"}
         where |= {"va": "top" if below else "bottom", "rotation": 60}

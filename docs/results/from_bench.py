@@ -78,7 +78,7 @@ def effective_samples(measured: dict[str, Any]) -> dict[str, Any]:
     ns = 1e-3 * min(measured["config"]["time_ps"], md["lengths_ps"][-1])
     near = math.exp(_between(math.log(1e3 * ns), [math.log(x) for x in md["lengths_ps"]], md["errors"]))
     rates = {cost["label"]: 1e3 / cost["cpu_s_per_ns"]["mean"] / (2.0 * slow["tau_ps"]) for cost in md["cost"]}
-    best = max(rates[cost["label"]] for cost in md["cost"] if cost["way"] != "lanes")
+    best = max(rates[cost["label"]] for cost in md["cost"] if cost["way"] != "simd")
     rows = [[name, significant(rate), significant(rate / best), f"{near:.3f}"] for name, rate in rates.items()]
     for row in (row for row in measured["rows"] if row.get("effective_per_s")):
         rate = row["effective_per_s"]

@@ -1,4 +1,4 @@
-"""Explicit water around a scene: a rhombic dodecahedron filled from OpenMM's equilibrated box, with ions."""
+"""Explicit water around a scene: a periodic cell filled from OpenMM's equilibrated box, with ions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse.csgraph import shortest_path
 
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.forces.template_files import cutoff_nm
@@ -15,8 +16,15 @@ from systems.chemistry.element_data import atomic_weight_da, covalent_radius_nm
 from systems.errors import InputError, PreparationError
 from systems.scene import FloatArray, Scene
 
-# Heights 1, 1 and 0.71 of the width; 71 % of the volume of the cube with the same distance between images.
+# Cells by the distance between periodic images. The dodecahedron has 71 % of the cube's volume, and 71 % of its height.
+_CUBE = np.eye(3)
 _DODECAHEDRON = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, np.sqrt(0.5)]])
+# Direct interactions must end before the next image. What is added to twice the cutoff: two waters share one image
+# by their middles (2 x 0.15 nm, `md_reference.simd`), and a barostat may shrink the cell (0.05 nm).
+_BEYOND_CUTOFF_NM = 0.35
+# Molecules of up to so many atoms are given room to stretch: so far reaches a bond of a zigzag chain, tip to tip.
+_FLEXIBLE_ATOMS = 100
+_STRETCHED_BOND_NM = 0.126
 # How near a water's oxygen may come: to an atom, its covalent radius and this; to another water.
 _SHELL_NM = 0.18
 _WATER_GAP_NM = 0.24
@@ -34,9 +42,11 @@ _ATTEMPTS = 30
 def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0) -> Scene:
     """Return the scene in a periodic cell of water (`spec.solvent` 'tip3p' or 'opc'), neutral, with Na+ and Cl-.
 
-    Wherever the solute turns, it stays `box.padding_nm` from the walls: periodic images are at least twice that apart.
-    The scene's atoms come first, in their order, moved to the middle of the cell; then waters, then ions. Which waters
-    become ions is drawn with `seed`, from those 0.5 nm from the solute and from each other where there are enough.
+    Wherever the solute turns, its periodic images stay `box.padding_nm` apart, also where it stretches if it has up to
+    100 atoms. The cell is a cube or a rhombic dodecahedron, whichever is smaller, and its height at least twice the
+    cutoff and 0.35 nm. The scene's atoms come first, in their order, moved to the middle of the cell; then waters, then
+    ions. Which waters become ions is drawn with `seed`, from those 0.5 nm from the solute and from each other where
+    there are enough.
     Raises PreparationError for a scene that has a cell, another solvent, or a cell of too many atoms.
     """
     if not spec.is_explicit:
@@ -45,10 +55,10 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0)
         raise PreparationError(f"scene {scene.name!r} has a periodic cell already; leave `padding_nm` out.")
     low, high = scene.positions_nm.min(axis=0), scene.positions_nm.max(axis=0)
     centre = (low + high) / 2
-    radius = float(np.linalg.norm(scene.positions_nm - centre, axis=1).max())
-    # Direct interactions must end before the next image, also after a barostat has shrunk the cell.
-    least_nm = 2.1 * cutoff_nm(spec.protein)[0] / float(_DODECAHEDRON[2, 2])
-    cell = max(2 * (radius + box.padding_nm), least_nm) * _DODECAHEDRON
+    apart_nm = _diameter_nm(scene) + box.padding_nm
+    least_nm = 2 * cutoff_nm(spec.protein)[0] + _BEYOND_CUTOFF_NM
+    cells = (max(apart_nm, least_nm / shape[2, 2]) * shape for shape in (_CUBE, _DODECAHEDRON))
+    cell = min(cells, key=np.linalg.det)
     volume_nm3 = float(np.linalg.det(cell))
     if volume_nm3 * 100 > _LARGEST:
         raise PreparationError(
@@ -67,6 +77,18 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0)
     water = _shaped(np.delete(water, chosen, axis=0), *_WATER_SHAPES[spec.solvent])
     done = f"solvated: {len(water)} {spec.solvent.upper()} waters, {kinds.count('Na')} Na+, {kinds.count('Cl')} Cl-"
     return _assembled(scene, solute, water, kinds, ions, cell, done, seed)
+
+
+def _diameter_nm(scene: Scene) -> float:
+    """Return the diameter of the sphere in which the solute turns, as it is or stretched."""
+    centre = (scene.positions_nm.min(axis=0) + scene.positions_nm.max(axis=0)) / 2
+    diameter_nm = 2 * float(np.linalg.norm(scene.positions_nm - centre, axis=1).max())
+    if scene.n_atoms > _FLEXIBLE_ATOMS:
+        return diameter_nm
+    bonded = np.zeros((scene.n_atoms, scene.n_atoms))
+    bonded[scene.bonds[:, 0], scene.bonds[:, 1]] = 1
+    steps = shortest_path(bonded, directed=False, unweighted=True)
+    return max(diameter_nm, _STRETCHED_BOND_NM * float(steps[np.isfinite(steps)].max()))
 
 
 def require_molecules(spec: ForceFieldSpec) -> None:

@@ -34,7 +34,7 @@ class Conditions:
     pressure_bar: float = option("Of the barostat (npt).", 1.0)
     seed: int = 0
     platform: str = option(
-        "OpenMM platform; auto: the fastest, timed here; lanes: 16 replicas at once on a core.", "auto"
+        "OpenMM platform; auto: the fastest, timed here; simd: 16 replicas at once on a core.", "auto"
     )
 
 

@@ -16,10 +16,8 @@ from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.errors import SimulationError, first_line
 from systems.scene import FloatArray, Scene
+from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
-GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
-# Minus the logarithm of how often chance may be taken for a blow-up.
-_UNLIKELINESS = 50.0
 _VELOCITY_TOLERANCE = 1e-8
 
 
@@ -39,13 +37,6 @@ class State:
     velocities_nm_ps: FloatArray | None = None
     forces_kj_mol_nm: FloatArray | None = None
     cell_nm: FloatArray | None = None
-
-
-def hottest_k(bath_k: float, n_dof: int) -> float:
-    """Return the kinetic temperature that chance exceeds in one frame of 10^21: 1 + 2 sqrt(x/n) + 2 x/n times the
-    bath's, n degrees of freedom, x = 50 (Laurent and Massart, Ann. Statist. 28, 1302 (2000), lemma 1)."""
-    x = _UNLIKELINESS / n_dof
-    return bath_k * (1.0 + 2.0 * math.sqrt(x) + 2.0 * x)
 
 
 def one_line(error: Exception) -> str:

@@ -16,10 +16,10 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
-from md_reference.run.lanes import Lanes, lanes_choice, n_lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.platforms import LANES, PlatformChoice, choose_platform, measured_platform
+from md_reference.run.platforms import SIMD, PlatformChoice, choose_platform, measured_platform, simd_choice
 from md_reference.run.timing import as_records
+from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.scene import FloatArray, Scene
 from systems.selection import part_of
 from systems.units import format_time_ps, format_wall
@@ -87,9 +87,9 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
     side_by_side = min(replicas, cores)
-    in_lanes = config.platform == LANES
-    if in_lanes:
-        choice = lanes_choice()
+    by_simd = config.platform == SIMD
+    if by_simd:
+        choice = simd_choice()
     elif measure_s > 0:
         choice = measured_platform(
             scene,
@@ -101,8 +101,8 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     else:
         choice = choose_platform(scene.n_atoms, config.platform, born=spec.solvent != "vacuum")
     planned = default = None
-    if measure_s > 0 and in_lanes:
-        planned = _time_lanes_s(scene, config, measure_s, system) / min(replicas, n_lanes())
+    if measure_s > 0 and by_simd:
+        planned = _time_simd_s(scene, config, measure_s, system) / min(replicas, n_replicas())
     elif measure_s > 0:
         planned, relaxed_nm = _time_step_s(scene, config, measure_s, choice)
         if spec.force_field not in ("gfn2-xtb", "model"):
@@ -121,8 +121,8 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
         platform_reason=choice.reason,
         timings=tuple(as_records(list(choice.timings))),
         threads=choice.threads,
-        parallel=f"{replicas} replicas, {n_lanes()} at once on a core"
-        if in_lanes
+        parallel=f"{replicas} replicas, {n_replicas()} at once on a core"
+        if by_simd
         else _parallel(replicas, cores, choice.threads),
         hydrogen_mass="natural"
         if spec.hydrogen_mass_da is None
@@ -138,12 +138,12 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     )
 
 
-def _time_lanes_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> float:
-    """Return the seconds of processor time of one step of all lanes, the fastest of all batches measured.
+def _time_simd_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> float:
+    """Return the seconds of processor time of one step of all replicas, the fastest of all batches measured.
 
-    Raises LanesUnavailableError, and SimulationError where lanes differ from OpenMM or cannot be stepped.
+    Raises SimdUnavailableError, and SimulationError where the replicas differ from OpenMM or cannot be stepped.
     """
-    run = Lanes(
+    run = SimdReplicas(
         system,
         temperature_k=config.temperature_k,
         friction_per_ps=config.friction_per_ps,
@@ -154,7 +154,7 @@ def _time_lanes_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) ->
         engine.minimise(max_iterations=100)
         relaxed_nm = engine.positions()
     run.check(system, relaxed_nm)
-    run.set_positions(np.repeat(relaxed_nm[None], run.n_lanes, axis=0))
+    run.set_positions(np.repeat(relaxed_nm[None], run.n_replicas, axis=0))
     run.step(20)
     fastest = math.inf
     began = time.perf_counter()
@@ -200,7 +200,7 @@ def _wall_s(config: MDConfig, replicas: int, step_s: float | None) -> float | No
     """Return the seconds of all replicas, as many at once as there are cores, equilibration included."""
     if step_s is None:
         return None
-    at_once = n_lanes() if config.platform == LANES else 1
+    at_once = n_replicas() if config.platform == SIMD else 1
     rounds = math.ceil(math.ceil(replicas / at_once) / available_cores()) * min(replicas, at_once)
     return rounds * (config.time_ps + config.equilibrate_ps) / config.timestep_ps * step_s
 

@@ -13,11 +13,12 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.machine import platforms
 from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
+from md_reference.simd.force_field import n_replicas
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.scene import Scene
 
-# What `platform` says for replicas in vector lanes (`run.lanes`); to OpenMM it is none.
-LANES = "lanes"
+# What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
+SIMD = "simd"
 # Up to so many atoms a thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
 # OpenMM 8.6.1 on peptides of 22 to 108 atoms: level with native OBC2 at 47 atoms on free cores (102 against 115
 # µs a step at 42, 205 against 167 at 62) and near 62 on busy ones, in vacuum at about 105 (9 against 47 µs at 22).
@@ -45,16 +46,21 @@ class PlatformChoice:
     timings: tuple[Timing, ...] = ()
 
 
+def simd_choice() -> PlatformChoice:
+    """Return the platform as plans and records name it. Raises SimdUnavailableError."""
+    return PlatformChoice(SIMD, 1, f"{n_replicas()} replicas at once on a core, forces checked against OpenMM's")
+
+
 def choose_platform(n_atoms: int, requested: str = "auto", *, born: bool = True) -> PlatformChoice:
     """Return the platform for `n_atoms` by size alone, with a generalised Born term or without; a request is checked.
 
     One thread in any case: below some hundreds of atoms a second thread slows a step down, and replicas, which run side
     by side, use the other cores. Raises UnknownNameError (with the nearest name) for a platform that is not here,
-    InputError for lanes, in which OpenMM does not run.
+    InputError for simd, in which OpenMM does not run.
     """
-    available = [*platforms(), LANES]
-    if requested == LANES:
-        raise InputError("platform lanes is for replicas of `reference` and `run`; take another platform here.")
+    available = [*platforms(), SIMD]
+    if requested == SIMD:
+        raise InputError("platform simd is for replicas of `reference` and `run`; take another platform here.")
     if requested != "auto":
         if requested not in available:
             raise UnknownNameError(

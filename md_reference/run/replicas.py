@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.forces.forcefield import resolve
+from md_reference.run.batch import simulate_batch
 from md_reference.run.config import MDConfig, check_run
-from md_reference.run.lanes import lanes_choice, n_lanes
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import line_of_run
-from md_reference.run.platforms import LANES, measured_platform
+from md_reference.run.platforms import SIMD, measured_platform, simd_choice
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
-from md_reference.run.simulate_lanes import simulate_batch
+from md_reference.simd.force_field import n_replicas
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
 from systems.parent_watch import end_with_parent
@@ -48,7 +48,7 @@ def simulate_replicas(
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
-    small scenes the fastest use of them. On platform lanes up to sixteen replicas share a process. The platform is
+    small scenes the fastest use of them. On platform simd up to sixteen replicas share a process. The platform is
     measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
     run, which it may raise to end them too; `progress` counts the frames of all replicas.
     Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
@@ -59,16 +59,16 @@ def simulate_replicas(
         check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     jobs = [[k] for k in range(len(outs))]
-    if config.platform == LANES:
-        size = n_lanes()
+    if config.platform == SIMD:
+        size = n_replicas()
         jobs = [list(range(k, min(k + size, len(outs)))) for k in range(0, len(outs), size)]
     width = workers or min(len(jobs), available_cores())
     # What goes on keeps its platform.
     fresh = [out for out in outs if not (resume and (out.exists() or checkpoint_path(out).exists()))]
     choice = None
-    if fresh and config.platform == LANES:
+    if fresh and config.platform == SIMD:
         if announce is not None:
-            announce(line_of_run(scene, config, lanes_choice(), replicas=len(outs)))
+            announce(line_of_run(scene, config, simd_choice(), replicas=len(outs)))
     elif fresh:
         settled = replace(config, force=resolve(scene, config.force))
         choice = measured_platform(scene, settled, max_threads=max(1, available_cores() // width), side_by_side=width)
@@ -140,8 +140,8 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
 def _run(
     scene: Scene, configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], progress: ProgressFn | None
 ) -> None:
-    """Run one replica, or on platform lanes a batch of them; `how`: what else `simulate` takes."""
-    if configs[0].platform == LANES:
+    """Run one replica, or on platform simd a batch of them; `how`: what else `simulate` takes."""
+    if configs[0].platform == SIMD:
         simulate_batch(scene, configs[0], outs, resume=how["resume"], overwrite=how["overwrite"], progress=progress)
     else:
         simulate(scene, configs[0], outs[0], progress=progress, **how)

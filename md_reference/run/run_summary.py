@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 _G_ML_PER_DA_NM3 = 1.66053906660e-3
 # Fewer frames than this carry no error bar.

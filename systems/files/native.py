@@ -42,7 +42,8 @@ def compiled_program(source: Path, macros: Mapping[str, float] | None = None) ->
     # What the compiler says that it is and calls this processor.
     asked = [compiler, "-march=native", "-v", "-E", "-x", "c++", os.devnull]
     said = subprocess.run(asked, capture_output=True, check=False).stderr
-    key = hashlib.sha256(b"\0".join([source.read_bytes(), said, repr(flags).encode()])).hexdigest()[:16]
+    texts = [source.read_bytes(), *(header.read_bytes() for header in sorted(source.parent.glob("*.h")))]
+    key = hashlib.sha256(b"\0".join([*texts, said, repr(flags).encode()])).hexdigest()[:16]
     path = cache_folder() / f"{source.stem}-{key}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -104,7 +104,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
 
 
 def _energy_spread(summary: dict[str, Any], n_atoms: int) -> float:
-    from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K
+    from systems.units import GAS_CONSTANT_KJ_MOL_K
 
     kinetic = 1.5 * n_atoms * GAS_CONSTANT_KJ_MOL_K * float(summary["temperature_k"]["mean"])
     return float(summary["total_kj_mol"]["standard_deviation"]) / kinetic

@@ -2,7 +2,7 @@
 
     python docs/studies/reference/run_estimates.py RUNS LONG [--time 20ns] [-o docs/results/tables/run_estimates.json]
 
-RUNS holds folders of runs. LONG gets a folder of the same name for each, with sixteen replicas of MD in lanes of
+RUNS holds folders of runs. LONG gets a folder of the same name for each, with sixteen SIMD replicas of MD of
 `--time` each, from another seed; what is there is not made again. Half of them is the truth, the other its replicate.
 """
 
@@ -32,7 +32,7 @@ def long_md(record: dict[str, Any], folder: Path, time_ps: float) -> list[Path]:
         every_ps = record["decision"]["save_every_ps"]
         sm.reference(
             record["scene"], folder / "md.h5", time_ps=every_ps * round(time_ps / every_ps), save_every_ps=every_ps,
-            replicas=REPLICAS, platform="lanes", seed=SEED, resume=True, quiet=True,
+            replicas=REPLICAS, platform="simd", seed=SEED, resume=True, quiet=True,
         )  # fmt: skip
         found = sorted(folder.glob("md_r*.h5"))
     return found
@@ -81,7 +81,7 @@ def main() -> None:
         table = {
             "command": "python docs/studies/reference/run_estimates.py RUNS LONG",
             "machine": machine_name(),
-            "note": f"Long MD: {REPLICAS} replicas of {format_time_ps(given.time)} each, in lanes, from another seed.",
+            "note": f"Long MD: {REPLICAS} replicas of {format_time_ps(given.time)} each, by SIMD, from another seed.",
             "columns": ["scene", "way, budget", "time over budget", "planned in all", "made, of planned", "worth told",
                         "worth by long MD", "verdict told", "verdict by long MD"],
             "rows": rows,

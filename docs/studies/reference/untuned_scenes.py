@@ -62,7 +62,7 @@ def row(name: str, record: dict[str, Any]) -> list[str]:
     if record.get("failed") or outcome is None:
         return [name, format_wall(record.get("spent_s", 0.0)), others, "", "", "",
                 f"failed: {record.get('failed')}"]  # fmt: skip
-    way = record["decision"]["way"] + (" in lanes" if rates["at_once"] > 1 else "")
+    way = record["decision"]["way"] + (" by SIMD" if rates["at_once"] > 1 else "")
     lengths = [format_time_ps(outcome[key], 2) for key in ("rolled_ps", "held_out_ps")]
     return [f"{name}, {rates['n_atoms']}", format_wall(record["spent_s"]), others, way,
             " + ".join(lengths), outcome["worth"] or "not told", outcome["status"]]  # fmt: skip

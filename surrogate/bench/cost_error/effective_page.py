@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from surrogate.bench.cost_error.effective_samples import break_even, pareto_front
-from surrogate.bench.cost_error.sweep_settings import LANES
+from surrogate.bench.cost_error.sweep_settings import SIMD
 from surrogate.bench.stress.stress_page import table
 
 
@@ -20,7 +20,7 @@ def effective_lines(result: dict[str, Any], sound_percent: float) -> list[str]:
         return ["No torsion relaxes 50 times over in the MD at hand: effective samples are not counted.", ""]
     points = _points(result, sound_percent)
     front = set(pareto_front([(one["rate"], one["distance"]) for one in points]))
-    best = max(one["rate"] for one in points if one["md"] and one["way"] != LANES)
+    best = max(one["rate"] for one in points if one["md"] and one["way"] != SIMD)
     rows = [
         {
             "what": one["name"],
@@ -39,7 +39,7 @@ def effective_lines(result: dict[str, Any], sound_percent: float) -> list[str]:
         f"Simulated time over 2 max(τ, τ of MD) of {slow['name']} (MD: {slow['tau_ps']:.1f} ps, {slow['samples']:.0f} "
         f"of them at hand), a processor second; distances after {1e-3 * result['config']['time_ps']:g} ns, of MD of "
         f"that length, too. Front: none is both faster and nearer. Settings under {sound_percent:g} % of whole frames "
-        "are left out. Over OpenMM: at its fastest. Plain: its own files and defaults. In lanes: sixteen at once.",
+        "are left out. Over OpenMM: at its fastest. Plain: its own files and defaults. SIMD: sixteen at once.",
         "",
         *_break_even(result, points, best, slow["tau_ps"]),
     ]

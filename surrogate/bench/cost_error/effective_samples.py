@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from surrogate.bench.cost_error.sweep_settings import LANES
+from surrogate.bench.cost_error.sweep_settings import SIMD
 from surrogate.judge.rows.motion.relaxation_rows import relaxation_of, turning
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def effective_row(row: dict[str, Any], tau_ps: float | None, md: dict[str, Any])
     if slow is None:
         return {}
     rate = samples_per_second(row["cpu_s_per_ns"]["mean"], tau_ps, slow["tau_ps"])
-    fastest = min(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != LANES)
+    fastest = min(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != SIMD)
     best = 1e3 / fastest / (2.0 * slow["tau_ps"])
     return {
         "slow_tau_ps": tau_ps,

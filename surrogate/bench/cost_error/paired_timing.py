@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surrogate.bench.cost_error.sweep_settings import LANES, OURS, PLAIN, CostErrorConfig, Setting
+from surrogate.bench.cost_error.sweep_settings import OURS, PLAIN, SIMD, CostErrorConfig, Setting
 from surrogate.bench.rolling import Frames, Roller
 from surrogate.bench.stress.other_arithmetic import openmm_of
 from systems.errors import SurromdError
 
 if TYPE_CHECKING:
-    from md_reference.run.lanes import Lanes
+    from md_reference.simd.force_field import SimdReplicas
     from surrogate.data.weights import Weights
     from surrogate.sampling.chunks import ChunkSampler
 
@@ -57,7 +57,7 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
 
 def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
     """Return processor and wall seconds of MD for a ns, by turns: OpenMM as it is set up here at each time step, MD in
-    lanes at the longest where it runs, and what OpenMM's manual makes of the model on one thread (`md_setups.plain`),
+    SIMD at the longest where it runs, and what OpenMM's manual makes of the model on one thread (`md_setups.plain`),
     where it knows the force field.
 
     A plain step is timed once: it takes the same at any time step, of which 4 fs wants heavier hydrogens.
@@ -65,26 +65,26 @@ def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
     with ExitStack() as stack:
         engines = {dt: stack.enter_context(openmm_of(weights.domain, dt, config.seed)) for dt in TIMESTEPS_PS}
         found: dict[float, list[tuple[float, float]]] = {dt: [] for dt in TIMESTEPS_PS}
-        simple, lanes = _plain_steps(weights, config), _in_lanes(weights, config)
+        simple, simd = _plain_steps(weights, config), _by_simd(weights, config)
         steps: list[tuple[float, float]] = []
         together: list[tuple[float, float]] = []
         for _ in range(config.rounds):
             for dt, engine in engines.items():
                 n = _steps(config.slice_ps, dt)
                 found[dt].append(_seconds_per_ns(config.slice_ps, lambda e=engine, n=n: e.step(n)))  # type: ignore[misc]
-            if lanes is not None:
-                n = _steps(config.slice_ps, lanes.timestep_ps)
-                together.append(_seconds_per_ns(config.slice_ps * lanes.n_lanes, lambda n=n: lanes.step(n)))  # type: ignore[misc]
+            if simd is not None:
+                n = _steps(config.slice_ps, simd.timestep_ps)
+                together.append(_seconds_per_ns(config.slice_ps * simd.n_replicas, lambda n=n: simd.step(n)))  # type: ignore[misc]
             if simple is not None:
                 steps.append(_seconds_per_ns(_steps(config.slice_ps, TIMESTEPS_PS[-1]), simple))
     rows = [_md_cost(OURS, dt, times) for dt, times in found.items()]
     if steps:
         rows += [_md_cost(PLAIN, dt, [(cpu / dt, wall / dt) for cpu, wall in steps]) for dt in TIMESTEPS_PS]
-    return rows + ([_md_cost(LANES, TIMESTEPS_PS[-1], together)] if lanes is not None else [])
+    return rows + ([_md_cost(SIMD, TIMESTEPS_PS[-1], together)] if simd is not None else [])
 
 
 def _md_cost(way: str, timestep_ps: float, times: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    name = {OURS: "OpenMM, {:g} fs", PLAIN: "OpenMM, {:g} fs, plain", LANES: "MD in lanes, {:g} fs"}[way]
+    name = {OURS: "OpenMM, {:g} fs", PLAIN: "OpenMM, {:g} fs, plain", SIMD: "MD by SIMD replicas, {:g} fs"}[way]
     return {
         "label": name.format(1e3 * timestep_ps),
         "way": way,
@@ -94,27 +94,28 @@ def _md_cost(way: str, timestep_ps: float, times: Sequence[tuple[float, float]])
     }
 
 
-def _in_lanes(weights: Weights, config: CostErrorConfig) -> Lanes | None:
-    """Return copies of the molecule in lanes, settled; None where this machine or the force field has none."""
+def _by_simd(weights: Weights, config: CostErrorConfig) -> SimdReplicas | None:
+    """Return copies of the molecule by SIMD, equilibrated; None where this machine or the force field has none."""
     from md_reference.forces.forcefield import build_system, resolve
     from md_reference.forces.spec import ForceFieldSpec
-    from md_reference.run.lanes import Lanes, LanesUnavailableError
+    from md_reference.simd.force_field import SimdReplicas
+    from md_reference.simd.system_terms import SimdUnavailableError
 
     domain = weights.domain
     try:
         system = build_system(domain.scene, resolve(domain.scene, ForceFieldSpec.of(domain.conditions)))
-        lanes = Lanes(
+        simd = SimdReplicas(
             system, temperature_k=domain.conditions["temperature_k"],
             friction_per_ps=domain.conditions.get("friction_per_ps") or 1.0, timestep_ps=TIMESTEPS_PS[-1],
             seed=config.seed,
         )  # fmt: skip
-    except (KeyError, LanesUnavailableError):
+    except (KeyError, SimdUnavailableError):
         return None
-    lanes.check(system, domain.scene.positions_nm)
-    lanes.set_positions(np.repeat(domain.scene.positions_nm[None], lanes.n_lanes, axis=0))
-    lanes.thermalise()
-    lanes.step(_steps(config.slice_ps, TIMESTEPS_PS[-1]))
-    return lanes
+    simd.check(system, domain.scene.positions_nm)
+    simd.set_positions(np.repeat(domain.scene.positions_nm[None], simd.n_replicas, axis=0))
+    simd.thermalise()
+    simd.step(_steps(config.slice_ps, TIMESTEPS_PS[-1]))
+    return simd
 
 
 def _plain_steps(weights: Weights, config: CostErrorConfig) -> Callable[[], object] | None:

@@ -22,7 +22,7 @@ from surrogate.bench.cost_error.effective_samples import effective_row, training
 from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
 from surrogate.bench.cost_error.sweep_settings import (
-    LANES,
+    SIMD,
     USUAL_BATCH,
     CostErrorConfig,
     CostErrorOptions,
@@ -129,7 +129,7 @@ def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[s
     """Return effective samples of a setting, and what its weights cost before; nothing of one that is only timed."""
     if "slow_relaxation_ps" not in row:
         return {}
-    fastest = min(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != LANES)
+    fastest = min(cost["cpu_s_per_ns"]["mean"] for cost in md["cost"] if cost["way"] != SIMD)
     return effective_row(row, row["slow_relaxation_ps"]["value"], md) | {"before": training_cost(weights, fastest)}
 
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from surrogate.data.weights import Weights
 
 STEPS = (2, 3, 4, 6, 10, 20)
-# Ways of MD: OpenMM as it is set up here and as its manual does, and sixteen copies at once (`md_reference.run.lanes`).
-OURS, PLAIN, LANES = "ours", "plain", "lanes"
+# Ways of MD: OpenMM as it is set up here and as its manual does, and sixteen copies at once (`md_reference.simd`).
+OURS, PLAIN, SIMD = "ours", "plain", "simd"
 USUAL_BATCH = 32
 
 

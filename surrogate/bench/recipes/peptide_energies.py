@@ -1,7 +1,7 @@
 """How likely each phi is in each capped amino acid: `python -m surrogate.bench.recipes.peptide_energies FOLDER`.
 
 Short runs leave phi > 0 and hardly ever enter it, so they do not tell how rare it is. Umbrella sampling does: sixteen
-copies of the molecule at once (`md_reference.run.lanes`), each held at another phi, neighbours exchanging their places
+copies of the molecule at once (`md_reference.simd`), each held at another phi, neighbours exchanging their places
 (Sugita, Kitao and Okamoto, J. Chem. Phys. 113, 6042 (2000)) so that psi and side chains turn where phi lets them, put
 together by WHAM (Kumar et al., J. Comput. Chem. 13, 1011 (1992)). Two runs of each, whose difference is kept; what is
 in FOLDER is not done again.
@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.lanes import Lanes
+from md_reference.simd.force_field import SimdReplicas
 from surrogate.bench.recipes.peptide_list import RESIDUES
 from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
@@ -51,15 +51,15 @@ def population_of_phi(scene: Scene, *, time_ps: float, seed: int) -> FloatArray:
     that of each copy. Raises SimulationError. Not for glycine, which has no higher barrier."""
     quad = backbone_torsions(scene)["phi"][0]
     system = build_system(scene, ForceFieldSpec("ff14SB", "obc2"))
-    run = Lanes(
+    run = SimdReplicas(
         system, temperature_k=_KELVIN, friction_per_ps=1.0, timestep_ps=_TIMESTEP_PS, seed=seed, biased=[quad.tolist()]
     )
     run.check(system, scene.positions_nm)
-    centres = np.linspace(_FIRST_RAD, _LAST_RAD, run.n_lanes)
+    centres = np.linspace(_FIRST_RAD, _LAST_RAD, run.n_replicas)
     start = float(torsion(scene.positions_nm, quad[None])[0])
     # The shorter way round.
     way = (centres - start + np.pi) % (2 * np.pi) - np.pi
-    run.set_positions(np.repeat(scene.positions_nm[None], run.n_lanes, axis=0))
+    run.set_positions(np.repeat(scene.positions_nm[None], run.n_replicas, axis=0))
     run.thermalise()
     stages = round(_PULLED_PS)
     for k in range(stages):
@@ -67,8 +67,8 @@ def population_of_phi(scene: Scene, *, time_ps: float, seed: int) -> FloatArray:
         run.step(round(_PULLED_PS / stages / _TIMESTEP_PS))
     kt = GAS_CONSTANT_KJ * _KELVIN
     rng = np.random.default_rng(seed)
-    held = np.arange(run.n_lanes)  # which centre each copy has
-    angles = np.empty((run.n_lanes, round(time_ps / _SAVE_PS)))
+    held = np.arange(run.n_replicas)  # which centre each copy has
+    angles = np.empty((run.n_replicas, round(time_ps / _SAVE_PS)))
     for k in range(-round(_SETTLED_PS / _SAVE_PS), angles.shape[1]):
         run.step(round(_SAVE_PS / _TIMESTEP_PS))
         phi = torsion(run.positions_nm, quad[None])[:, 0]

@@ -1,7 +1,7 @@
 """Runs of many peptides from diverse starts: `python -m surrogate.bench.recipes.peptide_runs FOLDER --budget 3h`.
 
 What the weights `peptides` learn from (`FOLDER/train`) and are tested on (`FOLDER/test`). Each molecule gets a folder
-with `run_000.h5`, ...: ff14SB, OBC2, 300 K, 4 fs, frames 1 ps apart, sixteen runs at once (`md_reference.run.lanes`,
+with `run_000.h5`, ...: ff14SB, OBC2, 300 K, 4 fs, frames 1 ps apart, sixteen runs at once (`md_reference.simd`,
 checked against OpenMM for each molecule). Runs for training start from structures chosen from metadynamics
 (`seeds.npz`), 20 ps after each start discarded; those for testing from the built structure, 1 ns discarded. What is
 there is left alone, so that the same command goes on after an interruption. One process a core, at low priority.
@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.batch import simulate_batch
 from md_reference.run.config import MDConfig
 from md_reference.run.engine import Engine
-from md_reference.run.lanes import n_lanes
 from md_reference.run.machine import available_cores
-from md_reference.run.platforms import LANES
-from md_reference.run.simulate_lanes import simulate_batch
+from md_reference.run.platforms import SIMD
+from md_reference.simd.force_field import n_replicas
 from surrogate.bench.recipes.peptide_list import Peptide, held_out_peptides, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds
 from systems.errors import SimulationError
@@ -102,10 +102,10 @@ def simulate(
 
     Their files get their names when all frames are there. Raises SimulationError.
     """
-    wanted = list(wanted[: n_lanes()])
+    wanted = list(wanted[: n_replicas()])
     config = MDConfig(
         time_ps=peptide.time_ps, equilibrate_ps=discard_ps, seed=_seed_of(peptide, wanted[0]), force=_SPEC,
-        platform=LANES,
+        platform=SIMD,
     )  # fmt: skip
     parts = [folder / f".{run_path(folder, k).stem}.part.h5" for k in wanted]
     notes = [{"start": {"group": seeds.groups[k], "index": k, "discarded_ps": discard_ps}} for k in wanted]

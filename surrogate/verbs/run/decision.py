@@ -193,10 +193,10 @@ def md_ps(rates: Rates, decision: Decision, name: Stage) -> float:
 def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ...]]:
     if way == "md":
         return "md", ("asked for",)
-    in_lanes = " in lanes" if rates.at_once > 1 else ""
+    by_simd = " by SIMD" if rates.at_once > 1 else ""
     if rates.rolls is not None:
         ratio = rates.rolls.ps_per_s / rates.md_ps_per_s
-        speeds = f"{rates.rolls.weights} rolls {ratio:.2g} times as fast as MD runs here{in_lanes}"
+        speeds = f"{rates.rolls.weights} rolls {ratio:.2g} times as fast as MD runs here{by_simd}"
         if ratio > 1.0 or way == "surrogate":
             return "rollout", (speeds, rates.coverage)
         return "md", (f"{speeds}: no surrogate pays", rates.coverage)
@@ -210,7 +210,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
     if way == "surrogate":
         return "trained", ("asked for; MD is cheap, and what it is trained on would answer by itself", none)
     day = format_time_ps(rates.md_ps_per_s * 86_400, 2)
-    return "md", (f"MD is cheap ({day} a day{in_lanes}) and nothing covers the scene: no surrogate would pay", none)
+    return "md", (f"MD is cheap ({day} a day{by_simd}) and nothing covers the scene: no surrogate would pay", none)
 
 
 def _frames(rates: Rates, budget_s: float) -> int:
@@ -239,9 +239,9 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
         ("by OpenMM", f"{per_day(rates.openmm_ps_per_s)} on {cores}{busy}, a replica on each"),
     ]
     if rates.at_once > 1:
-        lines.append(("in lanes", f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"))
-    elif rates.without_lanes:
-        lines.append(("in lanes", rates.without_lanes))
+        lines.append(("by SIMD", f"{per_day(rates.md_ps_per_s)}, {rates.at_once} replicas on each core"))
+    elif rates.without_simd:
+        lines.append(("by SIMD", rates.without_simd))
     if (rolls := rates.rolls) is not None:
         lines.append(("by rollout", f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"))
     lines.append(("way", WAYS[decision.way]))

@@ -223,11 +223,11 @@ class _Run:
         self.keep(replace(found.with_stage(entry), spent_s=now.spent_s, spent_in=now.spent_in))
 
     def _by_openmm(self, name: str, reason: str) -> None:
-        """Go on with a stage of MD by OpenMM where lanes have failed; their good frames stay."""
-        record, why = self.record, f"MD in lanes failed ({reason.rstrip('.')})"
+        """Go on with a stage of MD by OpenMM where SIMD replicas have failed; their good frames stay."""
+        record, why = self.record, f"MD by SIMD replicas failed ({reason.rstrip('.')})"
         assert record.rates is not None
         rates = by_openmm(record.rates, self.site.scene, self.site.config, why)
-        self.keep(replace(record, rates=rates, lanes_failed=record.rates.replicas))
+        self.keep(replace(record, rates=rates, simd_failed=record.rates.replicas))
         self.say(f"{why}: {name} by OpenMM")
         if self.decision.way == "md":  # an only replica cannot judge itself
             self._by_md(why)

@@ -25,8 +25,8 @@ REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
 _LONGEST_STRETCH = 30.0
-# Beyond this, lanes are not tried: they relax the scene on OpenMM's Reference platform, which takes minutes there.
-_MOST_ATOMS_IN_LANES = 500
+# Beyond this, SIMD is not tried: it relaxes the scene on OpenMM's Reference platform, which takes minutes there.
+_MOST_ATOMS_BY_SIMD = 500
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Rates:
     other work shares them; `alone`: what part of that a thread sees which runs by itself. `step_s`: processor seconds
     of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
     on this `platform`, `at_once` replicas on each core; `md`: in words; `dear`: it is quantum mechanics. `rolls`: of
-    weights that cover the scene, None where none do; `coverage`: why these, or none. `without_lanes`: why MD is not run
-    in lanes, where it might have been.
+    weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run
+    by SIMD, where it might have been.
     """
 
     n_atoms: int
@@ -61,7 +61,7 @@ class Rates:
     rolls: Rolls | None = None
     platform: str = "auto"
     at_once: int = 1
-    without_lanes: str = ""
+    without_simd: str = ""
     alone: float = 1.0
 
     @property
@@ -84,11 +84,11 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     from md_reference.forces.spec import QUANTUM
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
-    from md_reference.run.platforms import LANES
+    from md_reference.run.platforms import SIMD
 
     cores = min(cores or available_cores(), available_cores())
     stretch = measured_stretch(cores)
-    by_openmm = replace(config, platform="auto") if config.platform == LANES else config
+    by_openmm = replace(config, platform="auto") if config.platform == SIMD else config
     plan = make_plan(scene, by_openmm, replicas=cores)
     assert plan.us_per_step is not None
     weights, coverage = _covering(scene, config, named)
@@ -107,45 +107,45 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         alone=1.0 if cores == 1 else min(1.0, measured_stretch(1) / stretch),
     )
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
-    return rates if rates.dear or config.platform not in ("auto", LANES) else _in_lanes(rates, scene, config)
+    return rates if rates.dear or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)
 
 
-def _in_lanes(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
-    """Return the rates with MD in lanes where that is faster, else with the reason why it is not.
+def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
+    """Return the rates with MD by SIMD replicas where that is faster, else with the reason why it is not.
 
-    Raises SimulationError where lanes were asked for and cannot run the scene.
+    Raises SimulationError where SIMD was asked for and cannot run the scene.
     """
-    from md_reference.run.lanes import n_lanes
     from md_reference.run.plan import make_plan
-    from md_reference.run.platforms import LANES
+    from md_reference.run.platforms import SIMD
+    from md_reference.simd.force_field import n_replicas
 
-    asked_for = config.platform == LANES
+    asked_for = config.platform == SIMD
     if not asked_for and config.ensemble != "nvt":
-        return replace(rates, without_lanes=f"not in {config.ensemble}: they run in a bath (nvt) alone")
-    if not asked_for and scene.n_atoms > _MOST_ATOMS_IN_LANES:
-        return replace(rates, without_lanes=f"not tried: more than {_MOST_ATOMS_IN_LANES} atoms")
+        return replace(rates, without_simd=f"not in {config.ensemble}: they run in a bath (nvt) alone")
+    if not asked_for and scene.n_atoms > _MOST_ATOMS_BY_SIMD:
+        return replace(rates, without_simd=f"not tried: more than {_MOST_ATOMS_BY_SIMD} atoms")
     try:
-        at_once = n_lanes()
-        plan = make_plan(scene, replace(config, platform=LANES), replicas=rates.cores * at_once)
+        at_once = n_replicas()
+        plan = make_plan(scene, replace(config, platform=SIMD), replicas=rates.cores * at_once)
     except SimulationError as error:
         if asked_for:
             raise
-        return replace(rates, without_lanes=str(error).removesuffix("; take another platform."))
+        return replace(rates, without_simd=str(error).removesuffix("; take another platform."))
     assert plan.us_per_step is not None
     ps_per_s = rates.cores * config.timestep_ps / (plan.us_per_step * 1e-6) / rates.stretch
     if ps_per_s <= rates.md_ps_per_s and not asked_for:
-        return replace(rates, without_lanes="no faster than OpenMM here")
-    return replace(rates, md=plan.line, md_ps_per_s=ps_per_s, platform=LANES, at_once=at_once)
+        return replace(rates, without_simd="no faster than OpenMM here")
+    return replace(rates, md=plan.line, md_ps_per_s=ps_per_s, platform=SIMD, at_once=at_once)
 
 
 def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
-    """Return the rates without lanes, which is because of `why`."""
+    """Return the rates without SIMD, which is because of `why`."""
     from md_reference.run.plan import plan_line
     from md_reference.run.platforms import choose_platform
 
     choice = choose_platform(scene.n_atoms, "auto", born=config.force.is_born)
     line = plan_line(scene, config, choice, step_s=rates.step_s)
-    return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_lanes=why)
+    return replace(rates, md=line, md_ps_per_s=rates.openmm_ps_per_s, platform="auto", at_once=1, without_simd=why)
 
 
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:

@@ -53,7 +53,7 @@ class Outcome:
 class RunRecord:
     """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget, `spent_in` each
     stage; `trajectory`, `held_out`, `training`: files, relative to the folder; `weights`: a file there, or the name of
-    shipped ones; `lanes_failed`: how many replicas there were of MD in lanes when it failed, 0 where it did not."""
+    shipped ones; `simd_failed`: the number of SIMD replicas when MD by them failed, else 0."""
 
     scene: str
     molecule: str
@@ -71,7 +71,7 @@ class RunRecord:
     held_out: tuple[str, ...] = ()
     training: tuple[str, ...] = ()
     weights: str = ""
-    lanes_failed: int = 0
+    simd_failed: int = 0
     outcome: Outcome | None = None
 
     def ended(self, name: str) -> StageEntry | None:

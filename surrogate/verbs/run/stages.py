@@ -80,7 +80,7 @@ def _rates_and_decision(record: RunRecord) -> tuple[Rates, Decision]:
 def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     """Return a stage of MD into `place`, by the fastest way, replicas on all cores.
 
-    Where lanes have failed in this run, it is OpenMM's, in files beside theirs.
+    Where SIMD replicas have failed in this run, it is OpenMM's, in files beside theirs.
     """
 
     def outs(site: Site, replicas: int, mark: str = "") -> list[Path]:
@@ -90,7 +90,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
 
     def by_now(site: Site, record: RunRecord) -> list[Path]:
         assert record.rates is not None
-        return outs(site, record.rates.replicas, "-openmm" if record.lanes_failed else "")
+        return outs(site, record.rates.replicas, "-openmm" if record.simd_failed else "")
 
     def work(site: Site, record: RunRecord) -> RunRecord:
         from md_reference.run.replicas import simulate_replicas
@@ -110,7 +110,9 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         files[0].parent.mkdir(exist_ok=True)
 
         def heard(said: str | SimulationError) -> None:
-            if isinstance(said, SimulationError) and rates.at_once > 1:  # what is left of lanes is no reason to wait
+            if (
+                isinstance(said, SimulationError) and rates.at_once > 1
+            ):  # what is left of SIMD replicas is no reason to wait
                 raise said
 
         with accounted_outputs(files):
@@ -121,7 +123,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         return done
 
     def found(site: Site, record: RunRecord) -> RunRecord | None:
-        parts = [by_now(site, record)] + ([outs(site, record.lanes_failed)] if record.lanes_failed else [])
+        parts = [by_now(site, record)] + ([outs(site, record.simd_failed)] if record.simd_failed else [])
         files = [_with_frames(site.folder, part) for part in parts]
         together = tuple(itertools.chain(*files))
         if not together:

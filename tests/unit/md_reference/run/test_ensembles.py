@@ -18,13 +18,14 @@ import pytest
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run import simulate as module
 from md_reference.run.config import Conditions
-from md_reference.run.engine import GAS_CONSTANT_KJ_MOL_K, Engine
+from md_reference.run.engine import Engine
 from md_reference.run.platforms import PlatformChoice
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, TrajectoryError, UnknownNameError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import CheckpointFile, read_checkpoints
 from systems.trajectory.codec import open_trajectory, open_writer
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 FLEXIBLE = ForceFieldSpec(solvent="vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)
 RIGID = ForceFieldSpec(solvent="vacuum", hydrogen_mass_da=None)

@@ -161,7 +161,9 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
     assert row["effective_per_s"] == pytest.approx(
         1e3 / row["cpu_s_per_ns"]["mean"] / (2 * max(row["slow_tau_ps"], first["md"]["slowest"]["tau_ps"]))
     )
-    labels = [f"OpenMM, {n} fs, plain" for n in (1, 2, 4)] + ["MD in lanes, 4 fs"] * (shutil.which("g++") is not None)
+    labels = [f"OpenMM, {n} fs, plain" for n in (1, 2, 4)] + ["MD by SIMD replicas, 4 fs"] * (
+        shutil.which("g++") is not None
+    )
     assert [cost["label"] for cost in first["md"]["cost"]][3:] == labels
     fast, slow = (first["md"]["cost"][k]["cpu_s_per_ns"]["mean"] for k in (2, 0))
     assert slow > 2 * fast, "1 fs takes four times as many steps as 4 fs"

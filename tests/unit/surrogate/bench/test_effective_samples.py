@@ -28,7 +28,7 @@ def test_forgetting_too_fast_earns_nothing_and_too_slowly_costs() -> None:
     assert samples_per_second(2.0, 50.0, 25.0) == pytest.approx(right / 2)
     assert samples_per_second(2.0, None, 25.0) is None and samples_per_second(2.0, float("nan"), 25.0) is None
     md = {"slowest": {"tau_ps": 25.0}, "cost": [
-        {"way": way, "cpu_s_per_ns": {"mean": cost}} for way, cost in (("ours", 32.0), ("ours", 8.0), ("lanes", 0.5))
+        {"way": way, "cpu_s_per_ns": {"mean": cost}} for way, cost in (("ours", 32.0), ("ours", 8.0), ("simd", 0.5))
     ]}  # fmt: skip
     row: dict[str, Any] = {"cpu_s_per_ns": {"mean": 2.0}}
     assert effective_row(row, 20.0, md)["effective_over_md"] == pytest.approx(4.0), "of the fastest MD"

@@ -48,18 +48,18 @@ def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
 
 
 def test_md_in_lanes_is_a_rival_of_the_surrogate() -> None:
-    lanes = replace(COVERED, platform="lanes", at_once=16, md_ps_per_s=3200.0)
-    found = decide(lanes, 600.0)
-    assert found.way == "md" and "0.5 times as fast as MD runs here in lanes: no surrogate pays" in found.why[0]
-    lines = dict(table(lanes, found, 600.0))
-    assert lines["by OpenMM"].startswith("27.6 us a day on 2 cores") and lines["in lanes"].startswith("276 us a day")
+    simd = replace(COVERED, platform="simd", at_once=16, md_ps_per_s=3200.0)
+    found = decide(simd, 600.0)
+    assert found.way == "md" and "0.5 times as fast as MD runs here by SIMD: no surrogate pays" in found.why[0]
+    lines = dict(table(simd, found, 600.0))
+    assert lines["by OpenMM"].startswith("27.6 us a day on 2 cores") and lines["by SIMD"].startswith("276 us a day")
     assert lines["by rollout"] == "138 us a day, 8 replicas of alanine-dipeptide"
-    assert lanes.replicas == 32 and found.equilibrate_ps == pytest.approx(0.1 * found.expected_md_ps / 32)
-    one_core = decide(replace(lanes, cores=1), 600.0)
+    assert simd.replicas == 32 and found.equilibrate_ps == pytest.approx(0.1 * found.expected_md_ps / 32)
+    one_core = decide(replace(simd, cores=1), 600.0)
     assert named(one_core) == ["md", "report"], "sixteen replicas of one core judge each other"
-    without = replace(COVERED, without_lanes="no C++ compiler")
+    without = replace(COVERED, without_simd="no C++ compiler")
     assert decide(without, 600.0).way == "rollout"
-    assert dict(table(without, decide(without, 600.0), 600.0))["in lanes"] == "no C++ compiler"
+    assert dict(table(without, decide(without, 600.0), 600.0))["by SIMD"] == "no C++ compiler"
 
 
 @pytest.mark.parametrize("busy", [1.0, 2.0, 4.0])

@@ -1,4 +1,4 @@
-"""Rates of MD: lanes where they run and are faster, OpenMM and one plain line where not. Rates of rollouts."""
+"""Rates of MD: SIMD where they run and are faster, OpenMM and one plain line where not. Rates of rollouts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import lanes, plan
+from md_reference.run import plan
 from md_reference.run.config import MDConfig
-from md_reference.run.lanes import LanesUnavailableError
+from md_reference.simd import force_field
+from md_reference.simd.system_terms import SimdUnavailableError
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.verbs.run import rates as measuring
@@ -24,18 +25,18 @@ from systems.prepare.peptide import build_peptide
 
 SCENE = build_peptide("ACE-GLY-NME")
 CONFIG = MDConfig(time_ps=1.0, force=ForceFieldSpec("ff14SB", "obc2"))
-NO_COMPILER = "no C++ compiler (g++) was found, which platform lanes needs"
+NO_COMPILER = "no C++ compiler (g++) was found, which platform simd needs"
 
 
 @pytest.fixture(autouse=True)
 def timed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """OpenMM takes 25 µs a step, sixteen replicas in lanes 32: 2 each."""
+    """OpenMM takes 25 µs a step, sixteen SIMD replicas 32: 2 each."""
 
     def planned(scene: Any, config: MDConfig, *, replicas: int) -> Any:
-        return SimpleNamespace(us_per_step=2.0 if config.platform == "lanes" else 25.0, line=config.platform)
+        return SimpleNamespace(us_per_step=2.0 if config.platform == "simd" else 25.0, line=config.platform)
 
     monkeypatch.setattr(plan, "make_plan", planned)
-    monkeypatch.setattr(lanes, "n_lanes", lambda: 16)
+    monkeypatch.setattr(force_field, "n_replicas", lambda: 16)
     monkeypatch.setattr(measuring, "measured_stretch", lambda cores: 2.0)
     monkeypatch.setattr(measuring, "_covering", lambda *_: (None, "nothing covers it"))
 
@@ -46,14 +47,14 @@ def found(config: MDConfig = CONFIG) -> Rates:
 
 def test_lanes_are_taken_where_they_are_faster() -> None:
     rates = found()
-    assert (rates.platform, rates.at_once, rates.replicas, rates.md) == ("lanes", 16, 16, "lanes")
+    assert (rates.platform, rates.at_once, rates.replicas, rates.md) == ("simd", 16, 16, "simd")
     assert rates.md_ps_per_s == pytest.approx(0.004 / 2e-6 / 2.0), "half of the core is others'"
-    assert rates.openmm_ps_per_s == pytest.approx(0.004 / 25e-6 / 2.0) and rates.without_lanes == ""
+    assert rates.openmm_ps_per_s == pytest.approx(0.004 / 25e-6 / 2.0) and rates.without_simd == ""
 
 
 def refuses(error: Exception) -> Callable[..., Any]:
     def plan_of(scene: Any, config: MDConfig, *, replicas: int) -> Any:
-        if config.platform == "lanes":
+        if config.platform == "simd":
             raise error
         return SimpleNamespace(us_per_step=25.0, line=config.platform)
 
@@ -63,8 +64,8 @@ def refuses(error: Exception) -> Callable[..., Any]:
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (LanesUnavailableError(f"{NO_COMPILER}; take another platform."), NO_COMPILER),
-        (LanesUnavailableError("platform lanes knows no CMAPTorsionForce; take another platform."), "CMAPTorsionForce"),
+        (SimdUnavailableError(f"{NO_COMPILER}; take another platform."), NO_COMPILER),
+        (SimdUnavailableError("platform simd knows no CMAPTorsionForce; take another platform."), "CMAPTorsionForce"),
         (SimulationError("a copy of the molecule blew up"), "blew up"),
     ],
 )
@@ -74,17 +75,17 @@ def test_where_lanes_cannot_openmm_runs_and_one_line_says_why(
     monkeypatch.setattr(plan, "make_plan", refuses(error))
     rates = found()
     assert (rates.platform, rates.replicas) == ("auto", 1) and rates.md_ps_per_s == rates.openmm_ps_per_s
-    assert rates.without_lanes.endswith(said) or said in rates.without_lanes
-    assert "another platform" not in rates.without_lanes
+    assert rates.without_simd.endswith(said) or said in rates.without_simd
+    assert "another platform" not in rates.without_simd
     with pytest.raises(type(error)):
-        found(replace(CONFIG, platform="lanes"))
+        found(replace(CONFIG, platform="simd"))
 
 
 def test_what_is_no_rival_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "make_plan", refuses(AssertionError("lanes were tried")))
-    assert "bath" in found(replace(CONFIG, ensemble="nve")).without_lanes
+    monkeypatch.setattr(plan, "make_plan", refuses(AssertionError("SIMD was tried")))
+    assert "bath" in found(replace(CONFIG, ensemble="nve")).without_simd
     asked = found(replace(CONFIG, platform="CPU"))
-    assert (asked.platform, asked.without_lanes) == ("CPU", "")
+    assert (asked.platform, asked.without_simd) == ("CPU", "")
     assert found(replace(CONFIG, force=ForceFieldSpec("gfn2-xtb", "vacuum"))).dear
 
 
@@ -94,9 +95,9 @@ def test_without_a_compiler_the_line_is_plain(
 ) -> None:  # fmt: skip
     monkeypatch.undo()
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(lanes, "_program", lanes._program.__wrapped__)
+    monkeypatch.setattr(force_field, "_program", force_field._program.__wrapped__)
     monkeypatch.setattr(measuring, "_covering", lambda *_: (None, "nothing covers it"))
-    assert found().without_lanes == NO_COMPILER
+    assert found().without_simd == NO_COMPILER
 
 
 @pytest.mark.parametrize(

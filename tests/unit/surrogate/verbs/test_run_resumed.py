@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from md_reference.run import replicas
-from md_reference.run.lanes import Lanes
+from md_reference.simd.force_field import SimdReplicas
 from quick_report import judged_at_once
 from surrogate import api
 from surrogate.verbs.options import RunOptions
@@ -29,11 +29,11 @@ from systems.trajectory.codec import open_trajectory
 # As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock, and bursts are too dear.
 RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("alanine-dipeptide", 1.0, 0.25))
 BUDGET_S = 400.0
-OPENMM, LANES = RATES, replace(RATES, platform="lanes", at_once=16, md_ps_per_s=0.8)
+OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=16, md_ps_per_s=0.8)
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 WAYS = [
     pytest.param(("md", OPENMM, ["md", "held-out md", "report"]), id="one replica"),
-    pytest.param(("md", LANES, ["md", "report"]), id="lanes", marks=needs_compiler),
+    pytest.param(("md", SIMD, ["md", "report"]), id="simd", marks=needs_compiler),
     pytest.param(("surrogate", OPENMM, ["rollout", "held-out md", "report"]), id="rollout"),
 ]
 Way = tuple[str, Rates, list[str]]
@@ -141,24 +141,24 @@ def test_kills_before_and_after_each_stage_change_nothing(
 def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    count, step = [0], Lanes.step
+    count, step = [0], SimdReplicas.step
 
-    def fails(self: Lanes, n: int) -> None:
+    def fails(self: SimdReplicas, n: int) -> None:
         count[0] += 1
         if count[0] > good_frames + 1:  # the first equilibrates
             raise SimulationError("a copy of the molecule blew up")
         step(self, n)
 
-    monkeypatch.setattr(Lanes, "step", fails)
-    monkeypatch.setattr(one_scene, "measure", lambda *_: LANES)
+    monkeypatch.setattr(SimdReplicas, "step", fails)
+    monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
     found = run(tmp_path / "run", "md")
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
-    assert "MD in lanes failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
+    assert "MD by SIMD replicas failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
     kept = frames(tmp_path / "run")
-    in_lanes = [len(positions) for name, positions in kept.items() if "openmm" not in name]
-    assert in_lanes == [good_frames] * (16 if good_frames else 0)
+    by_simd = [len(positions) for name, positions in kept.items() if "openmm" not in name]
+    assert by_simd == [good_frames] * (16 if good_frames else 0)
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
     judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]

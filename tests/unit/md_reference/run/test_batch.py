@@ -1,4 +1,4 @@
-"""Replicas in lanes: files as `simulate` writes them, resumed bit for bit, stopped and refused in one line."""
+"""SIMD replicas: files as `simulate` writes them, resumed bit for bit, stopped and refused in one line."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import simulate_lanes
+from md_reference.run import batch
+from md_reference.run.batch import simulate_batch
 from md_reference.run.config import MDConfig
 from md_reference.run.plan import make_plan
 from md_reference.run.replicas import simulate_replicas
-from md_reference.run.simulate_lanes import simulate_batch
 from systems.errors import InputError, SimulationError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.checkpoint import checkpoint_path
@@ -23,7 +23,7 @@ from systems.trajectory.codec import open_trajectory
 pytestmark = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
 SCENE = build_peptide("ACE-GLY-NME")
 CONFIG = MDConfig(
-    time_ps=6.0, equilibrate_ps=1.0, seed=4, platform="lanes", force=ForceFieldSpec("ff14SB", "obc2")
+    time_ps=6.0, equilibrate_ps=1.0, seed=4, platform="simd", force=ForceFieldSpec("ff14SB", "obc2")
 )  # fmt: skip
 
 
@@ -38,8 +38,8 @@ def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
     for k, out in enumerate(outs):
         with open_trajectory(out) as reader:
             assert reader.n_frames == 6 and np.allclose(reader.time_ps, np.arange(1, 7))
-            assert reader.record["completed"] and reader.record["lane"] == k
-            assert reader.record["platform"] == "lanes" and "temperature_k" in reader.record["summary"]
+            assert reader.record["completed"] and reader.record["replica"] == k
+            assert reader.record["platform"] == "simd" and "temperature_k" in reader.record["summary"]
     assert not np.allclose(_frames(outs[0]), _frames(outs[1]))
     assert not list(tmp_path.glob("*.checkpoint"))
     again = [tmp_path / "b0.h5", tmp_path / "b1.h5"]
@@ -50,7 +50,7 @@ def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
 def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, parts = [tmp_path / "w0.h5", tmp_path / "w1.h5"], [tmp_path / "p0.h5", tmp_path / "p1.h5"]
     simulate_batch(SCENE, CONFIG, whole)
-    monkeypatch.setattr(simulate_lanes, "_BLOCK_S", 0.0)
+    monkeypatch.setattr(batch, "_BLOCK_S", 0.0)
 
     def stop(done: int, total: int, note: str | None = None) -> None:
         if note is None and done >= 6:
@@ -71,16 +71,16 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypa
 
 
 def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = simulate_lanes.Lanes.step
+    steps = batch.SimdReplicas.step
     count = []
 
-    def fails(self: simulate_lanes.Lanes, n: int) -> None:
+    def fails(self: batch.SimdReplicas, n: int) -> None:
         count.append(n)
         if len(count) > 4:
             raise SimulationError("a copy of the molecule blew up")
         steps(self, n)
 
-    monkeypatch.setattr(simulate_lanes.Lanes, "step", fails)
+    monkeypatch.setattr(batch.SimdReplicas, "step", fails)
     out = [tmp_path / "x.h5"]
     with pytest.raises(SimulationError, match="blew up after 3 ps; 3 good frames"):
         simulate_batch(SCENE, CONFIG, out)
@@ -90,12 +90,12 @@ def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkey
 
 @pytest.mark.parametrize("change", [{"ensemble": "nve"}, {"save_velocities": True}])
 def test_what_lanes_cannot_do_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="platform lanes"):
+    with pytest.raises(InputError, match="platform simd"):
         simulate_batch(SCENE, replace(CONFIG, **change), [tmp_path / "x.h5"])
     assert not list(tmp_path.iterdir())
 
 
 def test_the_plan_counts_replicas_that_run_at_once() -> None:
     one, many = (make_plan(SCENE, CONFIG, replicas=n, measure_s=0.05) for n in (1, 16))
-    assert many.platform == "lanes" and one.us_per_step is not None and many.us_per_step is not None
+    assert many.platform == "simd" and one.us_per_step is not None and many.us_per_step is not None
     assert 8 < one.us_per_step / many.us_per_step < 32

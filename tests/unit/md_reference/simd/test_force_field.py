@@ -1,4 +1,4 @@
-"""Molecular dynamics in lanes: OpenMM's forces, energy conserved, the bath's temperature, rigid bonds."""
+"""Molecular dynamics by SIMD replicas: OpenMM's forces, energy conserved, the bath's temperature, rigid bonds."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ import pytest
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import lanes
-from md_reference.run.lanes import Lanes, LanesUnavailableError
+from md_reference.simd import force_field
+from md_reference.simd.force_field import SimdReplicas
+from md_reference.simd.system_terms import SimdUnavailableError
 from systems.errors import SimulationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -27,12 +28,14 @@ def _system(scene: Scene, solvent: str = "obc2", **how: Any) -> Any:
     return build_system(scene, ForceFieldSpec("ff14SB", solvent, **how))
 
 
-def _lanes(system: Any, **how: Any) -> Lanes:
-    return Lanes(system, **{"temperature_k": 300.0, "friction_per_ps": 1.0, "timestep_ps": 0.004, "seed": 3, **how})
+def _replicas(system: Any, **how: Any) -> SimdReplicas:
+    return SimdReplicas(
+        system, **{"temperature_k": 300.0, "friction_per_ps": 1.0, "timestep_ps": 0.004, "seed": 3, **how}
+    )
 
 
-def _placed(scene: Scene, run: Lanes) -> Lanes:
-    run.set_positions(np.repeat(scene.positions_nm[None], run.n_lanes, axis=0))
+def _placed(scene: Scene, run: SimdReplicas) -> SimdReplicas:
+    run.set_positions(np.repeat(scene.positions_nm[None], run.n_replicas, axis=0))
     run.thermalise()
     return run
 
@@ -42,14 +45,14 @@ def _placed(scene: Scene, run: Lanes) -> Lanes:
 def test_energies_and_forces_are_those_of_openmm(sequence: str, solvent: str) -> None:
     scene = build_peptide(sequence)
     system = _system(scene, solvent)
-    _lanes(system).check(system, scene.positions_nm + 30.0)
+    _replicas(system).check(system, scene.positions_nm + 30.0)
 
 
 @pytest.mark.parametrize("kind", ["HarmonicAngleForce", "PeriodicTorsionForce", "NonbondedForce", "GBSAOBCForce"])
 def test_a_changed_term_is_noticed(kind: str) -> None:
     scene = build_peptide("ACE-SER-NME")
     system = _system(scene)
-    run = _lanes(system)
+    run = _replicas(system)
     other = copy.deepcopy(system)
     force = next(f for f in other.getForces() if type(f).__name__ == kind)
     if kind == "HarmonicAngleForce":
@@ -69,11 +72,11 @@ def test_a_changed_term_is_noticed(kind: str) -> None:
 def test_energy_is_conserved_without_a_bath() -> None:
     scene = build_peptide("ACE-ALA-NME")
     system = _system(scene)
-    warm = _placed(scene, _lanes(system))
+    warm = _placed(scene, _replicas(system))
     warm.step(500)
     totals = {}
     for timestep_ps in (0.0005, 0.001):
-        run = _lanes(system, friction_per_ps=0.0, timestep_ps=timestep_ps)
+        run = _replicas(system, friction_per_ps=0.0, timestep_ps=timestep_ps)
         run.set_positions(warm.positions_nm)
         run.set_velocities(warm.velocities_nm_ps)
         series = []
@@ -82,7 +85,7 @@ def test_energy_is_conserved_without_a_bath() -> None:
             before = run.temperatures_k()
             potential = run.energies()
             run.step(1)
-            kinetic = 0.5 * (before + run.temperatures_k()) * 0.5 * run.n_dof * lanes.GAS_CONSTANT_KJ_MOL_K
+            kinetic = 0.5 * (before + run.temperatures_k()) * 0.5 * run.n_dof * force_field.GAS_CONSTANT_KJ_MOL_K
             series.append(potential + kinetic)
             run.step(round(0.01 / timestep_ps) - 1)
         totals[timestep_ps] = np.stack(series)
@@ -95,7 +98,7 @@ def test_energy_is_conserved_without_a_bath() -> None:
 def test_the_bath_has_its_temperature_and_bonds_stay_rigid() -> None:
     scene = build_peptide("ACE-ALA-NME")
     system = _system(scene)
-    run = _placed(scene, _lanes(system, friction_per_ps=10.0))
+    run = _placed(scene, _replicas(system, friction_per_ps=10.0))
     run.step(1000)
     found = []
     for _ in range(150):
@@ -108,14 +111,14 @@ def test_the_bath_has_its_temperature_and_bonds_stay_rigid() -> None:
         i, j, length = system.getConstraintParameters(k)
         bonds = np.linalg.norm(run.positions_nm[:, i] - run.positions_nm[:, j], axis=-1)
         assert np.abs(bonds - length._value).max() < 2e-5 * length._value
-    # Every lane goes its own way.
-    assert np.unique(run.positions_nm[:, 0, 0]).size == run.n_lanes
+    # Every replica goes its own way.
+    assert np.unique(run.positions_nm[:, 0, 0]).size == run.n_replicas
 
 
 def test_the_mean_energy_is_that_of_openmm() -> None:
     scene = build_peptide("ACE-GLY-NME")
     system = _system(scene)
-    run = _placed(scene, _lanes(system))
+    run = _placed(scene, _replicas(system))
     run.step(5000)
     found = []
     for _ in range(400):
@@ -141,23 +144,23 @@ def test_what_it_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     scene = build_peptide("ACE-ALA-NME")
     system = _system(scene)
     system.addForce(openmm.CustomBondForce("r"))
-    with pytest.raises(LanesUnavailableError, match="CustomBondForce"):
-        _lanes(system)
+    with pytest.raises(SimdUnavailableError, match="CustomBondForce"):
+        _replicas(system)
     watery = build_system(build_peptide("ACE-ALA-NME"), ForceFieldSpec("ff14SB", "vacuum"))
     next(f for f in watery.getForces() if isinstance(f, openmm.NonbondedForce)).setNonbondedMethod(1)
-    with pytest.raises(LanesUnavailableError, match="NonbondedForce with a cutoff; take another"):
-        _lanes(watery)
+    with pytest.raises(SimdUnavailableError, match="NonbondedForce with a cutoff but without a cell; take another"):
+        _replicas(watery)
     monkeypatch.setattr("systems.files.native.shutil.which", lambda _: None)
-    with pytest.raises(LanesUnavailableError, match="which platform lanes needs"):
-        lanes._program.__wrapped__()
+    with pytest.raises(SimdUnavailableError, match="which platform simd needs"):
+        force_field._program.__wrapped__()
 
 
 def test_the_process_keeps_its_arithmetic() -> None:
     """A library linked with fast mathematics has every later calculation round the smallest numbers to zero. Asked in a
     process of its own, which nothing else has changed."""
     code = (
-        "import numpy as np; from md_reference.run.lanes import n_lanes; x = np.array([1e-310]);"
-        "assert n_lanes() and x[0] / 10 > 0"
+        "import numpy as np; from md_reference.simd.force_field import n_replicas; x = np.array([1e-310]);"
+        "assert n_replicas() and x[0] / 10 > 0"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

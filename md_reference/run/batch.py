@@ -1,4 +1,4 @@
-"""Up to sixteen replicas of one run at once, in the lanes of one core's vector registers (`run.lanes`).
+"""Up to sixteen replicas of one run at once, in one core's vector registers (`md_reference.simd`).
 
 Files, records, equilibration and resuming are those of `run.simulate`; one checkpoint, beside the first file, stands
 for all replicas of a batch.
@@ -20,10 +20,10 @@ import numpy.typing as npt
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine
-from md_reference.run.lanes import Lanes, lanes_choice, n_lanes
-from md_reference.run.platforms import LANES
+from md_reference.run.platforms import SIMD, simd_choice
 from md_reference.run.run_summary import summarise
 from md_reference.run.simulate import ProgressFn, already_complete, record_of, stand_of, tell_preparing
+from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
@@ -54,21 +54,21 @@ def simulate_batch(
     starts_nm: npt.NDArray[np.floating] | None = None,
     notes: Sequence[dict[str, Any]] = (),
 ) -> None:
-    """Run a replica for each of `outs`, at most `n_lanes()`; all have `config.seed` and their number in the batch.
+    """Run a replica for each of `outs`, at most `n_replicas()`; all have `config.seed` and their number in the batch.
 
     They start from the scene, its energy minimised, or from `starts_nm` (n, n_atoms, 3) as they stand; `notes` are
     added to their records.
 
     Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
     Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
-    Raises LanesUnavailableError for what lanes cannot do, SimulationError when a replica blows up (the frames before
-    stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
+    Raises SimdUnavailableError for what the platform cannot do, SimulationError when a replica blows up (the frames
+    before stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
     """
     config = check_run(scene, config, outs[0])
     if config.ensemble != "nvt" or config.columns:
-        raise InputError("platform lanes runs in a bath (nvt) and keeps positions alone; take another platform.")
-    if len(outs) > n_lanes():
-        raise InputError(f"{len(outs)} replicas are more than the {n_lanes()} lanes.")
+        raise InputError("platform simd runs in a bath (nvt) and keeps positions alone; take another platform.")
+    if len(outs) > n_replicas():
+        raise InputError(f"{len(outs)} replicas are more than the {n_replicas()} of a batch.")
     state_path = checkpoint_path(outs[0])
     with deferred_interrupt() as asked_to_stop, claimed_outputs(list(outs), may_exist=resume or overwrite):
         if resume and not state_path.exists() and any(out.exists() for out in outs):
@@ -78,11 +78,11 @@ def simulate_batch(
         kept = last_supported(state_path, list(outs)) if resume and state_path.exists() else None
         batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
         batch.start(starts_nm, asked_to_stop, progress)
-        record = record_of(scene, config, lanes_choice())
+        record = record_of(scene, config, simd_choice())
         with ExitStack() as stack:
             writers = []
             for k, out in enumerate(outs):
-                own = {**record, "lane": k, "of_lanes": len(outs), **(notes[k] if notes else {})}
+                own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
                 writers.append(stack.enter_context(writer_at(out, scene, own, batch.header, k, resumed=batch.resumed)))
             batch.produce(writers, asked_to_stop, progress)
         state_path.unlink(missing_ok=True)
@@ -104,7 +104,7 @@ class _Batch:
         self.done = int(self.header["files"][0]["n_frames"])
         self.file = CheckpointFile(checkpoint_path(outs[0]), kept)
         self.system = build_system(scene, config.force)
-        self.lanes = Lanes(
+        self.simd = SimdReplicas(
             self.system,
             temperature_k=config.temperature_k,
             friction_per_ps=config.friction_per_ps,
@@ -125,30 +125,30 @@ class _Batch:
         Raises SimulationError, KeyboardInterrupt.
         """
         if self.resumed:
-            self.lanes.restore(self.blob)
+            self.simd.restore(self.blob)
             return
         tell_preparing(progress, 0.0)
         if starts_nm is None:
             with Engine(self.scene, replace(self.config, platform="Reference"), system=self.system) as engine:
                 engine.minimise()
                 starts_nm = engine.positions()[None]
-        self.lanes.check(self.system, starts_nm[0])
-        # Lanes left over repeat the last start; they cost nothing and are not kept.
-        self.lanes.set_positions(starts_nm[np.minimum(np.arange(self.lanes.n_lanes), len(starts_nm) - 1)])
-        self.lanes.thermalise()
+        self.simd.check(self.system, starts_nm[0])
+        # SimdReplicas left over repeat the last start; they cost nothing and are not kept.
+        self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])
+        self.simd.thermalise()
         n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
         piece = max(1, min(1000, n_steps))
         for done in range(0, n_steps, piece):
             if asked_to_stop():
                 raise KeyboardInterrupt
-            self.lanes.step(min(piece, n_steps - done))
+            self.simd.step(min(piece, n_steps - done))
             tell_preparing(progress, min(1.0, (done + piece) / n_steps))
         self.save()
 
     def save(self) -> None:
-        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": LANES}
+        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": SIMD}
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
-        self.file.write(self.header, self.lanes.checkpoint())
+        self.file.write(self.header, self.simd.checkpoint())
 
     def produce(
         self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
@@ -188,25 +188,25 @@ class _Batch:
                 mass_da=float(self.scene.masses_da.sum()),
                 ensemble=config.ensemble,
                 temperature_k=config.temperature_k,
-                n_dof=self.lanes.n_dof,
+                n_dof=self.simd.n_dof,
             )
             writer.update_record(
                 {"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary}
             )
 
     def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
-        """Return the frames of the next seconds, each positions, energies and temperatures of all lanes."""
+        """Return the frames of the next seconds, each positions, energies and temperatures of all replicas."""
         found: list[tuple[Any, Any, Any]] = []
         until = time.monotonic() + _BLOCK_S
         while self.done + len(found) < self.config.n_frames and not (found and time.monotonic() > until):
             if asked_to_stop() and found:
                 break
             try:
-                self.lanes.step(self.config.steps_per_frame)
+                self.simd.step(self.config.steps_per_frame)
             except SimulationError as error:
                 return found, str(error)
-            positions = self.lanes.positions_nm.astype(np.float32)
-            found.append((positions, self.lanes.energies(), self.lanes.temperatures_k()))
+            positions = self.simd.positions_nm.astype(np.float32)
+            found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
         return found, ""
 
     def cost(self) -> dict[str, float]:

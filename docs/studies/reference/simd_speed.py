@@ -1,6 +1,6 @@
-"""Sixteen replicas in vector lanes against OpenMM on one core: processor time of a step, energies and forces.
+"""Sixteen replicas by SIMD replicas against OpenMM on one core: processor time of a step, energies and forces.
 
-    python docs/studies/reference/lanes.py [-o docs/results/tables/lanes.json]
+    python docs/studies/reference/simd_speed.py [-o docs/results/tables/simd_speed.json]
 
 Both are timed by turns in each round, OpenMM on the faster of its Reference and CPU platforms (one thread).
 """
@@ -21,8 +21,8 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
-from md_reference.run.lanes import Lanes
 from md_reference.run.machine import machine_name, platform_properties
+from md_reference.simd.force_field import SimdReplicas
 from systems.scene import Scene
 from systems.source import prepare
 
@@ -56,7 +56,7 @@ def steps_for(step: Any) -> int:
 
 
 def measure(scene: Scene, spec: ForceFieldSpec) -> dict[str, Any]:
-    """Return µs a step of a replica by OpenMM and in lanes, their ratio with its range, and what they differ by."""
+    """Return µs a step of a replica by OpenMM and by SIMD, their ratio with its range, and what they differ by."""
     system = build_system(scene, spec)
     with Engine(scene, Conditions(force=spec, platform="Reference"), system=system) as engine:
         engine.minimise()
@@ -69,16 +69,16 @@ def measure(scene: Scene, spec: ForceFieldSpec) -> dict[str, Any]:
         )
         contexts[name].setPositions(start)
         contexts[name].setVelocitiesToTemperature(KELVIN, 1)
-    run = Lanes(system, temperature_k=KELVIN, friction_per_ps=1.0, timestep_ps=TIMESTEP_PS, seed=1)
+    run = SimdReplicas(system, temperature_k=KELVIN, friction_per_ps=1.0, timestep_ps=TIMESTEP_PS, seed=1)
     run.check(system, start)
-    run.set_positions(np.repeat(start[None], run.n_lanes, axis=0))
+    run.set_positions(np.repeat(start[None], run.n_replicas, axis=0))
     run.thermalise()
-    ways = {name: context.getIntegrator().step for name, context in contexts.items()} | {"lanes": run.step}
+    ways = {name: context.getIntegrator().step for name, context in contexts.items()} | {"simd": run.step}
     many = {name: steps_for(step) for name, step in ways.items()}
     rounds = [{name: timed(step, many[name]) * 1e6 for name, step in ways.items()} for _ in range(ROUNDS)]
     openmm_us = np.array([min(r["Reference"], r["CPU"]) for r in rounds])
-    lanes_us = np.array([r["lanes"] / run.n_lanes for r in rounds])
-    ratio = openmm_us / lanes_us
+    simd_us = np.array([r["simd"] / run.n_replicas for r in rounds])
+    ratio = openmm_us / simd_us
     energies, forces = run.energies_and_forces(run.positions_nm)
     contexts["Reference"].setPositions(run.positions_nm[0].astype(np.float32))
     state = contexts["Reference"].getState(energy=True, forces=True)
@@ -86,7 +86,7 @@ def measure(scene: Scene, spec: ForceFieldSpec) -> dict[str, Any]:
     return {
         "n_atoms": scene.n_atoms,
         "openmm_us": float(np.median(openmm_us)),
-        "lanes_us": float(np.median(lanes_us)),
+        "simd_us": float(np.median(simd_us)),
         "ratio": [float(f(ratio)) for f in (np.median, np.min, np.max)],
         "energy_off_kj_mol": abs(float(energies[0]) - float(state.getPotentialEnergy()._value)),
         "force_off": float(np.sqrt(np.mean((forces[0] - exact) ** 2) / np.mean(exact**2))),
@@ -106,7 +106,7 @@ def main() -> None:
             [
                 f"{found['n_atoms']} ({scene.name}, {spec.solvent})",
                 f"{found['openmm_us']:.3g}",
-                f"{found['lanes_us']:.2g}",
+                f"{found['simd_us']:.2g}",
                 "{:.1f} [{:.1f}, {:.1f}]".format(*found["ratio"]),
                 f"{found['energy_off_kj_mol']:.1e}",
                 f"{found['force_off']:.1e}",
@@ -115,10 +115,10 @@ def main() -> None:
         sys.stdout.write(" | ".join(rows[-1]) + "\n")
     if out is not None:
         record = {
-            "command": "python docs/studies/reference/lanes.py",
+            "command": "python docs/studies/reference/simd_speed.py",
             "machine": machine_name(),
             "note": f"Processor time, medians of {ROUNDS} rounds, least and greatest ratio in brackets.",
-            "columns": ["atoms", "OpenMM, µs a step", "lanes, µs a step of a replica", "ratio", "energy, kJ/mol apart",
+            "columns": ["atoms", "OpenMM, µs a step", "SIMD, µs a step of a replica", "ratio", "energy, kJ/mol apart",
                         "forces, relative"],
             "rows": rows,
         }  # fmt: skip
