@@ -62,7 +62,7 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     if spec.preparation.get("keep_water"):
         require_molecules(force)
     if force.is_explicit and scene.cell_nm is None:
-        scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed)
+        scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
     system = build_system(scene, force)
     platform = measured_platform(scene, replace(config, force=force), system=lambda: system)
     prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))

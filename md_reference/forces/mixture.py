@@ -28,6 +28,12 @@ def is_water(elements: Sequence[str], atoms: IntArray) -> bool:
     return len(atoms) == 3 and sorted(elements[i] for i in atoms.tolist()) == ["H", "H", "O"]
 
 
+def solute_of(scene: Scene) -> IntArray:
+    """Return the atoms of all molecules but water and single ions, ascending."""
+    parts = [m for m in molecules_of(scene) if len(m) > 1 and not is_water(scene.elements, m)]
+    return np.sort(np.concatenate(parts)) if parts else np.empty(0, np.int64)
+
+
 def merge(n_atoms: int, parts: Iterable[tuple[IntArray, Any]]) -> Any:
     """Return one `openmm.System` of parts that do not share atoms: atom k of a part is particle `atoms[k]`.
 

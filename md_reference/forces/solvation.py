@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -28,9 +29,12 @@ _STRETCHED_BOND_NM = 0.126
 # How near a water's oxygen may come: to an atom, its covalent radius and this; to another water.
 _SHELL_NM = 0.18
 _WATER_GAP_NM = 0.24
-# Bulk water at 300 K and 1 bar, and the partial specific volume of small molecules and peptides (0.75 to 0.85 cm³/g).
-_WATERS_PER_NM3 = 33.3
+# At 300 K and 1 bar: waters per nm³ with the forces as they are here, the thermal expansion of the bulk in 1/K and its
+# growth in 1/K² (`docs/studies/water/density.py`; TIP3P expands three times as much as water). The partial specific
+# volume of small molecules and peptides is 0.75 to 0.85 cm³/g, that of Na+ and Cl- -1.2 and 17.8 cm³/mol.
+_BULK = {"tip3p": (32.87, 9.2e-4, 2e-6), "opc": (33.3, 2.7e-4, 9e-6)}
 _NM3_PER_DA = 0.8 / 602.214
+_NM3_OF_ION = {"Na": -0.0020, "Cl": 0.0296}
 _ION_GAP_NM = 0.5
 _MOLAR_OF_WATER = 55.4
 # Length of OH in nm and angle HOH in degrees.
@@ -39,14 +43,14 @@ _LARGEST = 200_000
 _ATTEMPTS = 30
 
 
-def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0) -> Scene:
+def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0, temperature_k: float = 300.0) -> Scene:
     """Return the scene in a periodic cell of water (`spec.solvent` 'tip3p' or 'opc'), neutral, with Na+ and Cl-.
 
     Wherever the solute turns, its periodic images stay `box.padding_nm` apart, also where it stretches if it has up to
-    100 atoms. The cell is a cube or a rhombic dodecahedron, whichever is smaller, and its height at least twice the
-    cutoff and 0.35 nm. The scene's atoms come first, in their order, moved to the middle of the cell; then waters, then
-    ions. Which waters become ions is drawn with `seed`, from those 0.5 nm from the solute and from each other where
-    there are enough.
+    100 atoms. The cell is a cube or a rhombic dodecahedron, whichever is smaller, its height at least twice the cutoff
+    and 0.35 nm, and its volume that of 1 bar at `temperature_k`. The scene's atoms come first, in their order, moved to
+    the middle of the cell; then waters, then ions. Which waters become ions is drawn with `seed`, from those 0.5 nm
+    from the solute and from each other where there are enough.
     Raises PreparationError for a scene that has a cell, another solvent, or a cell of too many atoms.
     """
     if not spec.is_explicit:
@@ -67,16 +71,30 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0)
         )
     solute = scene.positions_nm - centre + cell.sum(axis=0) / 2
     rng = np.random.default_rng(seed)
-    wanted = round((volume_nm3 - float(scene.masses_da.sum()) * _NM3_PER_DA) * _WATERS_PER_NM3)
+    density = _waters_per_nm3(spec.solvent, temperature_k)
+    solute_nm3 = float(scene.masses_da.sum()) * _NM3_PER_DA
+    wanted = math.ceil((volume_nm3 - solute_nm3) * density)
     water = _fill(cell, solute, scene.elements, wanted, rng)
     charge = int(scene.formal_charges.sum())
     pairs = round(len(water) * box.ionic_strength_molar / _MOLAR_OF_WATER)
     kinds = ["Na"] * (pairs + max(0, -charge)) + ["Cl"] * (pairs + max(0, charge))
     chosen = _ion_sites(water[:, 0], solute, cell, len(kinds), rng)
     ions = water[chosen, 0]
-    water = _shaped(np.delete(water, chosen, axis=0), *_WATER_SHAPES[spec.solvent])
+    water = np.delete(water, chosen, axis=0)
+    # The volume of 1 bar: more exact than the mean of 200 ps with a barostat, whose error is 0.3 %.
+    wanted_nm3 = len(water) / density + solute_nm3 + sum(_NM3_OF_ION[kind] for kind in kinds)
+    scale = (wanted_nm3 / volume_nm3) ** (1 / 3)
+    cell, ions, middle = cell * scale, ions * scale, cell.sum(axis=0) / 2
+    solute += (scale - 1) * middle
+    water = _shaped(water + (scale - 1) * water[:, :1], *_WATER_SHAPES[spec.solvent])
     done = f"solvated: {len(water)} {spec.solvent.upper()} waters, {kinds.count('Na')} Na+, {kinds.count('Cl')} Cl-"
     return _assembled(scene, solute, water, kinds, ions, cell, done, seed)
+
+
+def _waters_per_nm3(solvent: str, temperature_k: float) -> float:
+    density, expansion, growth = _BULK[solvent]
+    warmer = temperature_k - 300.0
+    return density * math.exp(-expansion * warmer - 0.5 * growth * warmer**2)
 
 
 def _diameter_nm(scene: Scene) -> float:
@@ -104,6 +122,7 @@ def solvate_if_asked(
     ionic_strength_molar: float | None = None,
     *,
     seed: int = 0,
+    temperature_k: float = 300.0,
 ) -> Scene:
     """Return the scene in water where `spec.solvent` is explicit and it has no cell yet, else as it is.
 
@@ -112,7 +131,7 @@ def solvate_if_asked(
     asked = {"padding_nm": padding_nm, "ionic_strength_molar": ionic_strength_molar}
     given = {name: value for name, value in asked.items() if value is not None}
     if spec.is_explicit and scene.cell_nm is None:
-        return solvate(scene, spec, WaterBox(**given), seed=seed)
+        return solvate(scene, spec, WaterBox(**given), seed=seed, temperature_k=temperature_k)
     named = " and ".join(f"`{name}`" for name in given)
     if given and not spec.is_explicit:
         raise InputError(f"nothing would use {named} without water around the scene; give `solvent='tip3p'` or opc.")

@@ -18,15 +18,16 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
-from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
+from md_reference.run.config import SIMD, MDConfig, check_run, check_same_run, settings_of
 from md_reference.run.engine import Engine
-from md_reference.run.platforms import SIMD, simd_choice
+from md_reference.run.platforms import simd_choice
 from md_reference.run.run_summary import summarise
 from md_reference.run.simulate import ProgressFn, already_complete, record_of, stand_of, tell_preparing
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.errors import InputError, SimulationError
 from systems.interrupts import deferred_interrupt
 from systems.scene import Scene
+from systems.selection import part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     Checkpoint,
@@ -83,7 +84,8 @@ def simulate_batch(
             writers = []
             for k, out in enumerate(outs):
                 own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
-                writers.append(stack.enter_context(writer_at(out, scene, own, batch.header, k, resumed=batch.resumed)))
+                writer = writer_at(out, batch.written, own, batch.header, k, resumed=batch.resumed)
+                writers.append(stack.enter_context(writer))
             batch.produce(writers, asked_to_stop, progress)
         state_path.unlink(missing_ok=True)
 
@@ -103,6 +105,9 @@ class _Batch:
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
         self.file = CheckpointFile(checkpoint_path(outs[0]), kept)
+        solute = config.kept_atoms(scene)
+        self.atoms = np.arange(scene.n_atoms) if solute is None else solute
+        self.written = scene if solute is None else part_of(scene, solute)
         self.system = build_system(scene, config.force)
         self.simd = SimdReplicas(
             self.system,
@@ -129,7 +134,9 @@ class _Batch:
             return
         tell_preparing(progress, 0.0)
         if starts_nm is None:
-            with Engine(self.scene, replace(self.config, platform="Reference"), system=self.system) as engine:
+            # The Reference platform has no neighbour lists.
+            platform = "Reference" if self.scene.cell_nm is None else "CPU"
+            with Engine(self.scene, replace(self.config, platform=platform), system=self.system) as engine:
                 engine.minimise()
                 starts_nm = engine.positions()[None]
         self.simd.check(self.system, starts_nm[0])
@@ -159,10 +166,12 @@ class _Batch:
             frames, failure = self._frames(asked_to_stop)
             if frames:
                 positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+                cell = self.scene.cell_nm
+                cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
                 times = (self.done + 1 + np.arange(len(frames))) * config.save_every_ps
                 for k, writer in enumerate(writers):
                     scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
-                    writer.append(positions[k], times, scalars=scalars)
+                    writer.append(positions[k], times, scalars=scalars, cell_nm=cells)
                 self.done += len(frames)
                 self.header["files"] = [{"n_frames": self.done, "digest": w.digest()} for w in writers]
             if failure:
@@ -205,7 +214,7 @@ class _Batch:
                 self.simd.step(self.config.steps_per_frame)
             except SimulationError as error:
                 return found, str(error)
-            positions = self.simd.positions_nm.astype(np.float32)
+            positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
             found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
         return found, ""
 

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.integrators import check_ensemble
-from systems.errors import InputError
+from systems.errors import InputError, UnknownNameError
 from systems.files.outside import check_disk
 from systems.options import option
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
-    from systems.scene import Scene
+    from systems.scene import IntArray, Scene
+
+# What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
+SIMD = "simd"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class MDConfig(Conditions):
     time_ps: float = option("Simulated time, such as 10ns.")
     save_every_ps: float = option("Interval between saved frames.", 1.0)
     equilibrate_ps: float = option("So long before frames are written.", 100.0)
+    keep: str = option("Atoms written from explicit water: solute, all or auto (solute with --platform simd).", "auto")
     save_velocities: bool = option("Keep them with each frame (.h5).", False)
     save_forces: bool = option("Keep them with each frame (.h5).", False)
 
@@ -55,6 +59,15 @@ class MDConfig(Conditions):
     @property
     def n_frames(self) -> int:
         return whole_steps(self.time_ps, self.save_every_ps, "run length in save intervals")
+
+    def kept_atoms(self, scene: Scene) -> IntArray | None:
+        """Return the atoms that are written, ascending, or None for all of them."""
+        if scene.cell_nm is None or self.keep == "all" or (self.keep == "auto" and self.platform != SIMD):
+            return None
+        from md_reference.forces.mixture import solute_of
+
+        solute = solute_of(scene)
+        return None if len(solute) in (0, scene.n_atoms) else solute
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -100,7 +113,10 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
     _ = config.steps_per_frame
-    check_disk(out, config.n_frames, scene.n_atoms)
+    if config.keep not in ("auto", "solute", "all"):
+        raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
+    kept = config.kept_atoms(scene)
+    check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
     if config.columns and out.suffix.lower() == ".dcd":
         raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
     return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))

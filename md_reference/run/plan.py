@@ -13,11 +13,11 @@ from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import MDConfig
+from md_reference.run.config import SIMD, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.integrators import check_ensemble, integrator_name
 from md_reference.run.machine import available_cores
-from md_reference.run.platforms import SIMD, PlatformChoice, choose_platform, measured_platform, simd_choice
+from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform, simd_choice
 from md_reference.run.timing import as_records
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.scene import FloatArray, Scene
@@ -150,7 +150,8 @@ def _time_simd_s(scene: Scene, config: MDConfig, wall_s: float, system: Any) -> 
         timestep_ps=min(config.timestep_ps, 0.001),
         seed=config.seed,
     )
-    with Engine(scene, replace(config, platform="Reference"), system=system) as engine:
+    platform = "Reference" if scene.cell_nm is None else "CPU"
+    with Engine(scene, replace(config, platform=platform), system=system) as engine:
         engine.minimise(max_iterations=100)
         relaxed_nm = engine.positions()
     run.check(system, relaxed_nm)

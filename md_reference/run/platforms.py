@@ -10,15 +10,13 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import Conditions
+from md_reference.run.config import SIMD, Conditions
 from md_reference.run.machine import platforms
 from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
 from md_reference.simd.force_field import n_replicas
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.scene import Scene
 
-# What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
-SIMD = "simd"
 # Up to so many atoms a thread of the Reference platform is at least as fast as one of the CPU platform. Measured with
 # OpenMM 8.6.1 on peptides of 22 to 108 atoms: level with native OBC2 at 47 atoms on free cores (102 against 115
 # µs a step at 42, 205 against 167 at 62) and near 62 on busy ones, in vacuum at about 105 (9 against 47 µs at 22).

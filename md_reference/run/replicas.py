@@ -13,10 +13,10 @@ from typing import Any
 
 from md_reference.forces.forcefield import resolve
 from md_reference.run.batch import simulate_batch
-from md_reference.run.config import MDConfig, check_run
+from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import line_of_run
-from md_reference.run.platforms import SIMD, measured_platform, simd_choice
+from md_reference.run.platforms import measured_platform, simd_choice
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.simd.force_field import n_replicas
 from systems.errors import SimulationError, SurromdError

@@ -21,7 +21,8 @@ from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
-from systems.scene import Scene
+from systems.scene import FloatArray, Scene
+from systems.selection import part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
@@ -151,6 +152,7 @@ class _Run:
         self.started = self.saved_at = time.monotonic()
         self.piece = 10
         self.system: Any = None
+        self.kept = config.kept_atoms(scene)
 
     @property
     def wall_s(self) -> float:
@@ -183,7 +185,8 @@ class _Run:
         """Return the writer of the trajectory, which holds the frames that are done."""
         columns = self.config.columns
         record = record_of(self.scene, self.config, self.choice)
-        return writer_at(self.out, self.scene, record, self.header, resumed=self.resumed, columns=columns)
+        scene = self.scene if self.kept is None else part_of(self.scene, self.kept)
+        return writer_at(self.out, scene, record, self.header, resumed=self.resumed, columns=columns)
 
     def _equilibrated(self) -> Engine:
         """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
@@ -312,6 +315,11 @@ class _Run:
         if not states:
             return
         config, periodic = self.config, self.scene.cell_nm is not None
+        atoms = slice(None) if self.kept is None else self.kept
+
+        def written(name: str) -> FloatArray:
+            return np.array([getattr(s, name)[atoms] for s in states])
+
         scalars = {
             "potential_kj_mol": np.array([s.potential_kj_mol for s in states]),
             "temperature_k": np.array([s.temperature_k for s in states]),
@@ -320,11 +328,11 @@ class _Run:
         if cells is not None and config.ensemble == "npt":
             scalars["volume_nm3"] = np.linalg.det(cells)
         writer.append(
-            np.array([s.positions_nm for s in states], dtype=np.float32),
+            written("positions_nm").astype(np.float32),
             (self.done + 1 + np.arange(len(states))) * config.save_every_ps,
             scalars=scalars,
-            velocities_nm_ps=np.array([s.velocities_nm_ps for s in states]) if config.save_velocities else None,
-            forces_kj_mol_nm=np.array([s.forces_kj_mol_nm for s in states]) if config.save_forces else None,
+            velocities_nm_ps=written("velocities_nm_ps") if config.save_velocities else None,
+            forces_kj_mol_nm=written("forces_kj_mol_nm") if config.save_forces else None,
             cell_nm=cells,
         )
 

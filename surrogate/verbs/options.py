@@ -108,6 +108,7 @@ class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Ov
 
     time_ps: float = from_field(MDConfig, "time_ps")
     save_every_ps: float | None = from_field(MDConfig, "save_every_ps", None)
+    keep: str = from_field(MDConfig, "keep")
     save_velocities: bool = from_field(MDConfig, "save_velocities")
     save_forces: bool = from_field(MDConfig, "save_forces")
 

@@ -107,7 +107,14 @@ def settle_run(
     if options.keep_water:
         require_molecules(config.force)
     dry = scene
-    scene = solvate_if_asked(scene, config.force, options.padding_nm, options.ionic_strength_molar, seed=seed)
+    scene = solvate_if_asked(
+        scene,
+        config.force,
+        options.padding_nm,
+        options.ionic_strength_molar,
+        seed=seed,
+        temperature_k=config.temperature_k,
+    )
     config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
     if not quiet:
         if scene is not dry:

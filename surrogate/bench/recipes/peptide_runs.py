@@ -25,10 +25,9 @@ import numpy as np
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.batch import simulate_batch
-from md_reference.run.config import MDConfig
+from md_reference.run.config import SIMD, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
-from md_reference.run.platforms import SIMD
 from md_reference.simd.force_field import n_replicas
 from surrogate.bench.recipes.peptide_list import Peptide, held_out_peptides, training_peptides
 from surrogate.bench.recipes.peptide_seeds import Seeds, choose_seeds

@@ -82,9 +82,9 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
     Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
     """
     from md_reference.forces.spec import QUANTUM
+    from md_reference.run.config import SIMD
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
-    from md_reference.run.platforms import SIMD
 
     cores = min(cores or available_cores(), available_cores())
     stretch = measured_stretch(cores)
@@ -115,8 +115,8 @@ def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
 
     Raises SimulationError where SIMD was asked for and cannot run the scene.
     """
+    from md_reference.run.config import SIMD
     from md_reference.run.plan import make_plan
-    from md_reference.run.platforms import SIMD
     from md_reference.simd.force_field import n_replicas
 
     asked_for = config.platform == SIMD
