@@ -62,19 +62,25 @@ INLINE V root(V a) {
 #endif
 }
 
-// 2 / sqrt(a) to single precision: an estimate and Newton steps.
-INLINE V two_over_root(V a) {
+// 1 / sqrt(a) to 1e-4 or better.
+INLINE V root_estimate(V a) {
 #if defined(__AVX512F__)
-    V y = (V)_mm512_rsqrt14_ps((__m512)a);
+    return (V)_mm512_rsqrt14_ps((__m512)a);
 #elif defined(__AVX2__)
-    V y = (V)_mm256_rsqrt_ps((__m256)a);
+    return (V)_mm256_rsqrt_ps((__m256)a);
 #elif defined(__ARM_NEON)
-    V y = (V)vrsqrteq_f32((float32x4_t)a);
-    y = 0.5f * y * (3.0f - a * y * y);
+    const V y = (V)vrsqrteq_f32((float32x4_t)a);
+    return 0.5f * y * (3.0f - a * y * y);
 #else
     V y;
     for (int l = 0; l < W; l++) y[l] = 1.0f / __builtin_sqrtf(a[l]);
+    return y;
 #endif
+}
+
+// 2 / sqrt(a) to single precision, by a Newton step.
+INLINE V two_over_root(V a) {
+    const V y = root_estimate(a);
     return y * (3.0f - (a * y) * y);
 }
 

@@ -229,7 +229,7 @@ def test_what_it_does_not_know_is_refused() -> None:
     with pytest.raises(SimdUnavailableError, match="virtual sites"):
         replicas(build_system(solvate(prepare("alanine-dipeptide"), opc, WaterBox()), opc))
     charmm = ForceFieldSpec("charmm36", "tip3p")
-    with pytest.raises(SimdUnavailableError, match="hydrogens have Lennard-Jones|switching|knows no Custom|CMAP"):
+    with pytest.raises(SimdUnavailableError, match="knows no"):
         replicas(build_system(solvate(prepare("alanine-dipeptide"), charmm, WaterBox()), charmm))
 
 
