@@ -89,9 +89,10 @@ def test_energy_is_conserved_without_a_bath() -> None:
             series.append(potential + kinetic)
             run.step(round(0.01 / timestep_ps) - 1)
         totals[timestep_ps] = np.stack(series)
-    # A ps moves it by less than 0.1 kJ/mol of some 70 in motion; it scatters as the square of the step.
+    # Of some 70 kJ/mol in motion. A replica's energy follows the shape of the molecule by the square of the step (0.04
+    # kJ/mol, 0.12 where a torsion turns), the mean of sixteen does not; it scatters as the square of the step.
     drift = totals[0.0005][-20:].mean(0) - totals[0.0005][:20].mean(0)
-    assert np.abs(drift).max() < 0.1
+    assert abs(drift.mean()) < 0.03
     assert 3.0 < np.mean(totals[0.001].std(0) / totals[0.0005].std(0)) < 5.0
 
 
