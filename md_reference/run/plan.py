@@ -305,6 +305,10 @@ def _skips(
         skips.append(Skip("removal of centre-of-mass motion", "the Langevin bath acts on it like on everything else"))
     if not config.save_velocities:
         skips.append(Skip("velocities on disk", "nobody asked for them (`save_velocities=True`)", "half of the file"))
+    kept = config.kept_atoms(scene)
+    if kept is not None:
+        share = f"{1 - len(kept) / scene.n_atoms:.0%} of the file"
+        skips.append(Skip("water and ions on disk", "it is simulated and not kept (`keep='all'` keeps it)", share))
     skips.append(Skip("energies and copies between saved frames", "nobody keeps them"))
     if spec.solvent == "vacuum":
         skips.append(Skip("generalised Born term", "the solvent is vacuum"))

@@ -15,7 +15,7 @@ struct Transform { int n, n_factors, factors[MOST_FACTORS]; float turns[2 * MOST
 struct Mesh {
     int32_t n_atoms, nx, ny, nz;
     const int32_t *order;      // [n_atoms]: neighbours in memory apart, or they would wait for each other's rows
-    const float *charges;      // [n_atoms], times the root of Coulomb's constant
+    const float *charges;      // [n_atoms], times the root of Coulomb's constant, over 24^3
     const float *influence;    // [nx][ny][nz / 2 + 1]: of a mode's square on the energy, twice what is counted once
     float to_cell[9];          // fraction of cell vector k: sum over d of to_cell[3 d + k] x_d
     Transform along[3];
@@ -110,10 +110,8 @@ static void transform_strided(const Transform *t, C *modes, int64_t stride, floa
     for (int k = 0; k < t->n; k++) modes[k * stride] = line[k];
 }
 
-// Weights of five points and their derivatives, by the fraction of a cell: rows of coefficients of t^0 to t^4.
-static const V8 SPLINE[5] = {{1/24.f, 11/24.f, 11/24.f, 1/24.f, 0}, {-4/24.f, -12/24.f, 12/24.f, 4/24.f, 0},
-                             {6/24.f, -6/24.f, -6/24.f, 6/24.f, 0}, {-4/24.f, 12/24.f, -12/24.f, 4/24.f, 0},
-                             {1/24.f, -4/24.f, 6/24.f, -4/24.f, 1/24.f}};
+// Weights of five points, times 24, and their derivatives by the fraction of a cell: coefficients of t^0 to t^4.
+static const V8 SPLINE[5] = {{1, 11, 11, 1, 0}, {-4, -12, 12, 4, 0}, {6, -6, -6, 6, 0}, {-4, 12, -12, 4, 0}, {1, -4, 6, -4, 1}};
 
 INLINE V8 weights(float t) { return (((SPLINE[4] * t + SPLINE[3]) * t + SPLINE[2]) * t + SPLINE[1]) * t + SPLINE[0]; }
 INLINE V8 slopes(float t) { return ((4.0f * SPLINE[4] * t + 3.0f * SPLINE[3]) * t + 2.0f * SPLINE[2]) * t + SPLINE[1]; }

@@ -25,6 +25,8 @@ _PERIODS = 6
 FORCE_DEGREES, ENERGY_DEGREE = {16: 3, 8: 4, 4: 6}, 14
 _GRID_FACTORS = (4, 2, 3, 5, 7)
 _MOST_POINTS = 128
+# pme.h has 24 times the weights of a spline in each direction, which are whole numbers.
+_SPLINE_UNIT = 24.0**3
 
 
 class SimdUnavailableError(SimulationError):
@@ -269,7 +271,10 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
     oxygen = n_solute
     with_oxygen = np.sqrt(epsilon[:n_solute] * epsilon[oxygen]), 0.5 * (sigma[:n_solute] + sigma[oxygen])
     to_oxygen = _lennard_jones(with_oxygen[1], with_oxygen[0])
-    inside = _within_solute(force, place, charge, sigma, epsilon, n_solute)
+    spread = (math.sqrt(COULOMB) * charge / _SPLINE_UNIT).astype(np.float32)
+    # What reciprocal space counts too much, ten times the energy of the cell, is of the charges as rounded.
+    rounded = _SPLINE_UNIT / math.sqrt(COULOMB) * spread.astype(np.float64)
+    inside = _within_solute(force, place, charge, sigma, epsilon, n_solute, rounded)
     force_terms, energy_terms = polynomials(cutoff, alpha, force.getReactionFieldDielectric(), width)
     terms.units = _units(terms)
     terms.water = {
@@ -283,7 +288,7 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
         "energy": energy_terms,
         "own": [own[0, 0] / 8, own[0, 1] / 8, own[1, 1] / 8, 0.0],
         "lennard_jones": _lennard_jones(sigma[oxygen], epsilon[oxygen]),
-        "inside": [own[0, 1], own[1, 1]],
+        "inside": COULOMB * rounded[n_solute + 1] * rounded[n_solute : n_solute + 2],
         "solute": np.stack(
             [COULOMB * charge[:n_solute] * charge[oxygen] / 8, COULOMB * charge[:n_solute] * charge[oxygen + 1] / 8,
              *to_oxygen], axis=1),
@@ -294,9 +299,7 @@ def _add_water(terms: Terms, force: Any, system: Any, constraints: list[Any], ma
     if force.getUseDispersionCorrection():
         terms.constant_kj_mol += _dispersion(sigma, epsilon, cutoff) / volume
     if ewald:
-        spread = (math.sqrt(COULOMB) * charge).astype(np.float32)
-        # Of the charges as rounded: it is ten times the energy of the cell.
-        terms.constant_kj_mol -= alpha / math.sqrt(math.pi) * float((spread.astype(np.float64) ** 2).sum())
+        terms.constant_kj_mol -= alpha / math.sqrt(math.pi) * COULOMB * float((rounded**2).sum())
         terms.grid = grid
         waters = n_solute + 3 * np.arange(n_waters)
         terms.mesh = {
@@ -424,7 +427,13 @@ def _screened_force(alpha: float, square: FloatArray) -> FloatArray:
 
 
 def _within_solute(
-    force: Any, place: IntArray, charge: FloatArray, sigma: FloatArray, epsilon: FloatArray, n_solute: int
+    force: Any,
+    place: IntArray,
+    charge: FloatArray,
+    sigma: FloatArray,
+    epsilon: FloatArray,
+    n_solute: int,
+    rounded: FloatArray,
 ) -> dict[str, Any]:
     """Return pairs of solute atoms and, apart, those that are exceptions."""
     apart, terms = [], []
@@ -436,7 +445,7 @@ def _within_solute(
                 raise _unknown("exception between molecules of water")
             continue
         apart.append((i, j))
-        terms.append((COULOMB * q._value, *_lennard_jones(s._value, e._value), COULOMB * charge[i] * charge[j]))
+        terms.append((COULOMB * q._value, *_lennard_jones(s._value, e._value), COULOMB * rounded[i] * rounded[j]))
     excluded = set(apart)
     i, j = _integers([p for p in itertools.combinations(range(n_solute), 2) if p not in excluded], 2).T
     c12, c6 = _lennard_jones(0.5 * (sigma[i] + sigma[j]), np.sqrt(epsilon[i] * epsilon[j]))

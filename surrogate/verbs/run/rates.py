@@ -25,8 +25,8 @@ REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
 _LONGEST_STRETCH = 30.0
-# Beyond this, SIMD is not tried: it relaxes the scene on OpenMM's Reference platform, which takes minutes there.
-_MOST_ATOMS_BY_SIMD = 500
+# Beyond this, SIMD replicas are not tried: pairs of waters are the same in all of them, the more in vain the larger the cell.
+_MOST_ATOMS_BY_SIMD = 3000
 
 
 @dataclass(frozen=True)

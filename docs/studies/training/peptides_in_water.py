@@ -1,0 +1,179 @@
+"""Peptides in TIP3P water by SIMD replicas: what a model in explicit solvent learns from and is tested on.
+
+    python docs/studies/training/peptides_in_water.py FOLDER --budget 3h [--workers 1]
+    python docs/studies/training/peptides_in_water.py FOLDER --list
+
+ff14SB, 300 K, NVT at the volume of 1 bar, PME, 4 fs, frames 1 ps apart without water. Each batch is sixteen runs
+`FOLDER/{test,train}/NAME/run_000.h5`, ... that begin in other states: sixteen replicas in OBC2, 200 ps at 500 K and 500
+ps at 300 K, whose torsions the replicas in water are turned to; 50 ps after that are left out. Rounds of the test set
+and of the training set by turns, the test set first. What is there is left alone and what was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import multiprocessing
+import os
+import sys
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.solvation import solvate
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
+from md_reference.run.batch import simulate_batch
+from md_reference.run.config import SIMD, Conditions, MDConfig
+from md_reference.run.engine import Engine
+from md_reference.run.machine import available_cores
+from md_reference.simd.force_field import SimdReplicas, n_replicas
+from surrogate.bench.recipes.peptide_list import Peptide, training_peptides
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import rotatable_torsions
+from systems.errors import SimulationError
+from systems.parent_watch import end_with_parent
+from systems.prepare.peptide import build_peptide
+from systems.scene import FloatArray, IntArray, Scene
+from systems.trajectory.topology_file import topology_path
+from systems.units import parse_wall_s
+
+WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")
+# Pairs and chains are not among the training peptides, in no solvent; monomers are tested on runs of their own.
+TEST = (
+    *(Peptide((name,), True, 16, 3000.0) for name in ("ALA", "PHE")),
+    *(Peptide(pair, True, 16, 3000.0) for pair in (("LEU", "SER"), ("LYS", "GLU"), ("VAL", "ASN"), ("PHE", "GLY"))),
+    *(Peptide(chain, True, 16, 3000.0) for chain in (("SER", "LEU", "ALA"), ("ALA", "SER", "VAL", "LEU"))),
+    *(Peptide(chain, False, 16, 3000.0) for chain in (("ILE", "GLN", "ALA", "PHE"), ("MET", "SER"))),
+)
+TRAINING_PS, ROUNDS, DISCARDED_PS = 1000.0, 6, 50.0
+HOT_K, HOT_PS, COOL_PS = 500.0, 200.0, 500.0
+TURNED_PS, STIFFNESS_KJ_MOL = 20.0, 300.0
+
+
+def dynamics(system: Any, temperature_k: float, seed: int, **how: Any) -> SimdReplicas:
+    settings = {"friction_per_ps": 5.0, "timestep_ps": 0.002, **how}
+    return SimdReplicas(system, temperature_k=temperature_k, seed=seed, **settings)
+
+
+def minimised(scene: Scene, spec: ForceFieldSpec, system: Any) -> FloatArray:
+    platform = "Reference" if scene.cell_nm is None else "CPU"
+    with Engine(scene, Conditions(force=spec, platform=platform), system=system, threads=1) as engine:
+        engine.minimise()
+        return engine.positions()
+
+
+def many_states(dry: Scene, quads: IntArray, seed: int) -> FloatArray:
+    """Return the torsions `(n_replicas, k)` of replicas in OBC2 that were hot and have cooled down."""
+    system = build_system(dry, IMPLICIT)
+    start = minimised(dry, IMPLICIT, system)
+    hot = dynamics(system, HOT_K, seed)
+    hot.set_positions(np.repeat(start[None], hot.n_replicas, axis=0))
+    hot.thermalise()
+    hot.step(round(HOT_PS / hot.timestep_ps))
+    cool = dynamics(system, 300.0, seed + 1)
+    cool.set_positions(hot.positions_nm)
+    cool.thermalise()
+    cool.step(round(COOL_PS / cool.timestep_ps))
+    return torsion(cool.positions_nm, quads)
+
+
+def starts_in_water(wet: Scene, quads: IntArray, angles: FloatArray, seed: int) -> FloatArray:
+    """Return positions `(n_replicas, n_atoms, 3)` in which the solute of each replica was turned to its torsions."""
+    system = build_system(wet, WATER)
+    run = dynamics(system, 300.0, seed, biased=quads.tolist())
+    run.set_positions(np.repeat(minimised(wet, WATER, system)[None], run.n_replicas, axis=0))
+    run.thermalise()
+    run.step(round(5.0 / run.timestep_ps))
+    for share in (0.1, 0.3, 1.0):
+        for place in range(len(quads)):
+            run.set_bias(place, angles[:, place], share * STIFFNESS_KJ_MOL)
+        run.step(round(TURNED_PS / 3 / run.timestep_ps))
+    return run.positions_nm
+
+
+def batch(folder: Path, peptide: Peptide, number: int) -> None:
+    """Simulate the batch of this number, from wherever it stands. Raises SimulationError, KeyboardInterrupt."""
+    names = [f"run_{k:03d}.h5" for k in range(number * n_replicas(), (number + 1) * n_replicas())]
+    if all((folder / name).exists() for name in names):
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "lock", "a") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        dry = build_peptide(peptide.sequence)
+        wet = solvate(dry, WATER, WaterBox())
+        seed = zlib.crc32(f"water:{peptide.name}:{number}".encode()) % (2**31 - 2)
+        parts = [folder / f".{name[:-3]}.part.h5" for name in names]
+        starts = None
+        if not any(part.exists() for part in parts):
+            quads = rotatable_torsions(dry)
+            starts = starts_in_water(wet, quads, many_states(dry, quads, seed), seed)
+        config = MDConfig(
+            force=WATER, time_ps=peptide.time_ps, equilibrate_ps=DISCARDED_PS, seed=seed, platform=SIMD, keep="solute"
+        )
+        simulate_batch(wet, config, parts, resume=True, starts_nm=starts)
+        for part, name in zip(parts, names, strict=True):
+            os.replace(topology_path(part), topology_path(folder / name))
+            os.replace(part, folder / name)
+
+
+def order() -> Iterator[tuple[str, Peptide, int]]:
+    """Yield every batch: where its files go, the molecule and the number."""
+    training = [Peptide(p.residues, p.capped, p.n_starts, TRAINING_PS) for p in training_peptides()]
+    for number in range(ROUNDS):
+        yield from (("test", peptide, number) for peptide in TEST)
+        yield from (("train", peptide, number) for peptide in training)
+
+
+def work(folder: str, budget_s: float, taken: Any) -> None:
+    end_with_parent()
+    deadline = time.monotonic() + budget_s
+    for place, (kind, peptide, number) in enumerate(order()):
+        if time.monotonic() > deadline:
+            return
+        with taken.get_lock():
+            if place < taken.value:
+                continue
+            taken.value = place + 1
+        try:
+            batch(Path(folder) / kind / peptide.name, peptide, number)
+        except SimulationError as error:
+            sys.stderr.write(f"{peptide.name}: {error}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--budget", default="3h", help="wall time after which no further batch is begun")
+    parser.add_argument("--workers", type=int, default=available_cores())
+    parser.add_argument("--list", action="store_true", help="print what is there and simulate nothing")
+    chosen = parser.parse_args(arguments)
+    if chosen.list:
+        for kind, peptide, number in order():
+            done = len(list((chosen.folder / kind / peptide.name).glob("run_*.h5"))) - number * n_replicas()
+            if done > 0:
+                sys.stdout.write(f"{kind} {peptide.name} {min(done, n_replicas())} x {peptide.time_ps:g} ps\n")
+        return
+    os.nice(15)
+    context = multiprocessing.get_context("spawn")
+    how = (str(chosen.folder), parse_wall_s(chosen.budget, "--budget"), context.Value("i", 0))
+    workers = [context.Process(target=work, args=how) for _ in range(chosen.workers)]
+    for worker in workers:
+        worker.start()
+    try:
+        for worker in workers:
+            worker.join()
+    finally:
+        for worker in workers:
+            worker.terminate()
+
+
+if __name__ == "__main__":
+    main()
