@@ -116,10 +116,10 @@ _System = _structure(
 
 
 @lru_cache(maxsize=1)
-def _program() -> ctypes.CDLL:
-    """Return `force_field.cpp` compiled for this processor."""
+def _program(width: int | None = None) -> ctypes.CDLL:
+    """Return `force_field.cpp` compiled for this processor, for batches of 16, 8 or 4, or what its registers hold."""
     try:
-        program = compiled_program(_SOURCE)
+        program = compiled_program(_SOURCE, {} if width is None else {"W": width})
     except CompilerError as error:
         raise SimdUnavailableError(f"{error}, which platform simd needs; take another platform.") from error
     program.work_floats.restype, program.work_floats.argtypes = ctypes.c_int64, [ctypes.c_int64]

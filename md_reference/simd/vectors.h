@@ -1,6 +1,6 @@
 // A register's worth of replicas: one number of each in a V, and the few functions that a compiler does not vectorise.
 //
-// W, the number of replicas, is 16 with AVX-512, 8 with AVX2 and 4 elsewhere (NEON, SSE).
+// W, the number of replicas, is 16 with AVX-512, 8 with AVX2 and 4 elsewhere (NEON, SSE), unless the compiler is told.
 #pragma once
 #include <math.h>
 #include <stdint.h>
@@ -11,12 +11,14 @@
 #include <arm_neon.h>
 #endif
 
+#ifndef W
 #if defined(__AVX512F__)
 #define W 16
 #elif defined(__AVX2__)
 #define W 8
 #else
 #define W 4
+#endif
 #endif
 #define LANES _Pragma("omp simd") for (int l = 0; l < W; l++)
 #define INLINE static inline __attribute__((always_inline))
@@ -38,7 +40,7 @@ INLINE V3 cross(V3 a, V3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b
 
 // Keeps what was rounded from being reassociated by fast mathematics.
 INLINE V rounded(V a) {
-#if defined(__AVX512F__)
+#if W == 16
     asm("" : "+v"(a));
 #elif defined(__x86_64__)
     asm("" : "+x"(a));
@@ -51,9 +53,9 @@ INLINE V rounded(V a) {
 INLINE V nearest(V a) { return rounded(a + 12582912.0f) - 12582912.0f; }
 
 INLINE V root(V a) {
-#if defined(__AVX512F__)
+#if W == 16
     return (V)_mm512_sqrt_ps((__m512)a);
-#elif defined(__AVX2__)
+#elif W == 8
     return (V)_mm256_sqrt_ps((__m256)a);
 #else
     V b;
@@ -64,9 +66,9 @@ INLINE V root(V a) {
 
 // 1 / sqrt(a) to 1e-4 or better.
 INLINE V root_estimate(V a) {
-#if defined(__AVX512F__)
+#if W == 16
     return (V)_mm512_rsqrt14_ps((__m512)a);
-#elif defined(__AVX2__)
+#elif W == 8
     return (V)_mm256_rsqrt_ps((__m256)a);
 #elif defined(__ARM_NEON)
     const V y = (V)vrsqrteq_f32((float32x4_t)a);
@@ -93,7 +95,7 @@ INLINE V larger(V a, V b) { return a > b ? a : b; }
 INLINE V smaller(V a, V b) { return a < b ? a : b; }
 INLINE V absolute(V a) { return (V)((I)a & 0x7fffffff); }
 INLINE bool any(I mask) {
-#if defined(__AVX512F__)
+#if W == 16
     return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
 #else
     int32_t found = 0;

@@ -25,7 +25,7 @@ REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 LONG_LAG_PS = 10.0
 _CHUNKS = 6
 _LONGEST_STRETCH = 30.0
-# Beyond this, SIMD replicas are not tried: pairs of waters are the same in all of them, the more in vain the larger the cell.
+# Beyond this SIMD replicas are not tried: all compute the same pairs of waters, the more in vain the larger the cell.
 _MOST_ATOMS_BY_SIMD = 3000
 
 

@@ -93,6 +93,22 @@ def test_forces_and_energies_are_those_of_openmm(name: str, molar: float) -> Non
     assert forces < FORCES and energy < ENERGY_KJ_MOL
 
 
+@pytest.mark.parametrize("width", [8, 4])
+def test_narrower_registers(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What runs with AVX2, and with NEON or SSE but for their estimate of a root."""
+    if force_field.n_replicas() <= width:
+        pytest.skip("the registers of this processor are no wider")
+    program = force_field._program.__wrapped__(width)
+    monkeypatch.setattr(force_field, "_program", lambda: program)
+    run = started("alanine-dipeptide", timestep_ps=0.004)
+    assert run.n_replicas == width
+    forces, energy = off_openmm(wet("alanine-dipeptide")[1], relaxed("alanine-dipeptide"))
+    assert forces < FORCES and energy < ENERGY_KJ_MOL
+    run.step(100)
+    legs = np.linalg.norm(np.diff(run.positions_nm[:, 22:].reshape(width, -1, 3, 3)[:, :, :2], axis=2), axis=-1)
+    np.testing.assert_allclose(legs, 0.09572, atol=2e-6)
+
+
 def test_a_slanted_cell_and_a_grid_of_other_factors() -> None:
     slanted = ("sequence:ALA-GLU", 0.0, 1.9)
     scene, system = wet(*slanted)
