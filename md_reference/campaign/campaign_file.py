@@ -243,7 +243,8 @@ def name_of(source: str) -> str:
 
 def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> list[Run]:
     shared, protocol = _by_protocol(shared, own)
-    given = {**shared.values, **own.values}
+    # Nobody trains on the water of a hundred runs.
+    given = {"keep": "solute", **shared.values, **own.values}
     values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given, protocol)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.

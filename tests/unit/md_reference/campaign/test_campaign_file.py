@@ -77,6 +77,7 @@ def test_runs_are_scenes_times_temperatures_times_replicas(tmp_path: Path, repos
     assert first == MDConfig(
         time_ps=1000.0,
         save_every_ps=0.5,
+        keep="solute",
         temperature_k=300.0,
         friction_per_ps=5.0,
         timestep_ps=0.002,
@@ -177,7 +178,8 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 def test_one_molecule_has_one_default_in_a_campaign_too(tmp_path: Path) -> None:
     text = 'scenes = ["ethanol", "smiles:CCO", "alanine-dipeptide"]\ntime = "1ps"\n'
     named, smiles, peptide = (replace(run.config, seed=0) for run in _read(tmp_path, text).runs)
-    assert named == smiles == peptide
+    assert named == smiles == peptide and named.keep == "solute"
+    assert _read(tmp_path, text + 'keep = "all"\n').runs[0].config.keep == "all"
     assert (named.temperature_k, named.timestep_ps, named.force.force_field) == (300.0, 0.004, "auto")
 
 
