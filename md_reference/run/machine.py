@@ -36,7 +36,6 @@ def available_cores() -> int:
 
 
 def platform_properties(name: str, threads: int) -> dict[str, str]:
-    """Return the properties of a Context. More threads than one add up forces in a fixed order, so that runs repeat."""
-    if name != "CPU":
-        return {}
-    return {"Threads": str(threads)} | ({"DeterministicForces": "true"} if threads > 1 else {})
+    """Return the properties of a Context. Forces are added up in a fixed order, so that runs repeat: in a periodic cell
+    one thread does not do so by itself."""
+    return {"Threads": str(threads), "DeterministicForces": "true"} if name == "CPU" else {}
