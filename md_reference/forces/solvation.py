@@ -29,9 +29,10 @@ _STRETCHED_BOND_NM = 0.126
 # How near a water's oxygen may come: to an atom, its covalent radius and this; to another water.
 _SHELL_NM = 0.18
 _WATER_GAP_NM = 0.24
-# At 300 K and 1 bar: waters per nm³ with the forces as they are here, the thermal expansion of the bulk in 1/K and its
-# growth in 1/K² (`docs/studies/water/density.py`; TIP3P expands three times as much as water). The partial specific
-# volume of small molecules and peptides is 0.75 to 0.85 cm³/g, that of Na+ and Cl- -1.2 and 17.8 cm³/mol.
+# At 300 K and 1 bar: waters per nm³, the thermal expansion in 1/K and its growth in 1/K². TIP3P by 400 ps of OpenMM at
+# 1 bar (`docs/studies/water/alanine_dipeptide.py`) and Jorgensen and Jenson, J. Comput. Chem. 19, 1179 (1998); OPC by
+# Izadi, Anandakrishnan and Onufriev, J. Phys. Chem. Lett. 5, 3863 (2014), with the growth of real water. The partial
+# specific volume of small molecules and peptides is 0.75 to 0.85 cm³/g, that of Na+ and Cl- -1.2 and 17.8 cm³/mol.
 _BULK = {"tip3p": (32.87, 9.2e-4, 2e-6), "opc": (33.3, 2.7e-4, 9e-6)}
 _NM3_PER_DA = 0.8 / 602.214
 _NM3_OF_ION = {"Na": -0.0020, "Cl": 0.0296}
