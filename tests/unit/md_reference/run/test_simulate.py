@@ -392,7 +392,7 @@ def test_an_unknown_platform_is_one_line_with_the_nearest(alanine_dipeptide: Sce
         simulate(alanine_dipeptide, replace(SHORT, platform="Referense"), tmp_path / "a.h5")
     assert "\n" not in str(caught.value)
     with pytest.raises(UnknownNameError, match="Did you mean 'simd'"):
-        simulate(alanine_dipeptide, replace(SHORT, platform="lames"), tmp_path / "a.h5")
+        simulate(alanine_dipeptide, replace(SHORT, platform="smid"), tmp_path / "a.h5")
     with pytest.raises(InputError, match="for replicas of `reference` and `run`"):
         simulate(alanine_dipeptide, replace(SHORT, platform="simd"), tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
