@@ -192,6 +192,7 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
 
         order = sorted(of_label, key=rank, reverse=True)
         chosen |= {place: next(label for label in order if label in occupancy[place]) for place in group}
+    chosen = {place: chosen[place] for place in occupancy}
     kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[_place(a)] == a.altloc]
     instead = {(*atoms[i].residue_key, atoms[i].name): i for i in kept if atoms[i].altloc}
     stays = [instead.get((*a.residue_key, a.name), i) if a.altloc else i for i, a in enumerate(atoms)]
