@@ -9,14 +9,19 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.cell_shape import box_vectors
+from systems.chemistry.element_data import covalent_radius_nm, is_metal
+from systems.files.outside import check_density
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 # The longest bond that is looked for. Files without a cell write one of 1 Å; nearest images of bonds are only certain
 # where every width of the cell is more than twice their length.
-LONGEST_BOND_NM = 0.35
-_LEAST_WIDTH_NM = 2.0 * LONGEST_BOND_NM
+_LONGEST_BOND_NM = 0.35
+_LEAST_WIDTH_NM = 2.0 * _LONGEST_BOND_NM
+_BOND_SLACK_NM = 0.04
+# Water has 100 atoms in a cubic nanometre, diamond 176.
+_DENSEST_PER_NM3 = 250.0
 
 
 def cell_of(numbers: Sequence[float]) -> FloatArray | None:
@@ -61,19 +66,29 @@ def images_of_whole(positions_nm: FloatArray, cell_nm: FloatArray, pairs: IntArr
     return images
 
 
-def near_images(positions_nm: FloatArray, cell_nm: FloatArray, reach_nm: float) -> tuple[IntArray, FloatArray]:
-    """Return the pairs i < j `(n, 2)` any images of which are nearer than `reach_nm`, and the distances `(n,)` nm."""
+def bonded_images(
+    elements: Sequence[str], positions_nm: FloatArray, cell_nm: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the pairs i < j `(n, 2)` any images of which are within a bond's length, and the distances `(n,)` nm.
+
+    That is the sum of covalent radii and 0.04 nm; metals are bonded to nothing. In a cell too small for its atoms,
+    which is another structure's, there are none. Raises PreparationError where most atoms stand in each other.
+    """
+    if len(elements) > _DENSEST_PER_NM3 * abs(float(np.linalg.det(cell_nm))):
+        return np.empty((0, 2), dtype=np.int64), np.empty(0)
     from scipy.spatial import cKDTree
 
     widths, inverse = _widths(cell_nm), np.linalg.inv(cell_nm)
     # Heights above the faces: none differs by more than the distance, so a box of theirs holds the sphere.
     heights = np.mod(positions_nm @ inverse, 1.0) * widths
     heights[heights >= widths] = 0.0
-    pairs = cKDTree(heights, boxsize=widths).query_pairs(reach_nm, p=np.inf, output_type="ndarray")
-    pairs = pairs.reshape(-1, 2).astype(np.int64)
+    tree = cKDTree(heights, boxsize=widths)
+    check_density(tree, _LONGEST_BOND_NM, "the structure")
+    pairs = tree.query_pairs(_LONGEST_BOND_NM, p=np.inf, output_type="ndarray").reshape(-1, 2).astype(np.int64)
     apart = positions_nm[pairs[:, 1]] - positions_nm[pairs[:, 0]]
     length = np.linalg.norm(apart - np.rint(apart @ inverse) @ cell_nm, axis=1)
-    near = length < reach_nm
+    radii = np.array([-1.0 if is_metal(e) else covalent_radius_nm(e) for e in elements])
+    near = length < np.minimum(radii[pairs].sum(axis=1) + _BOND_SLACK_NM, _LONGEST_BOND_NM)
     pairs, length = np.sort(pairs[near], axis=1), length[near]
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     return pairs[order], length[order]

@@ -9,16 +9,13 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell_images import LONGEST_BOND_NM, images_of_whole, near_images
-from systems.chemistry.element_data import covalent_radius_nm, is_metal
+from systems.chemistry.cell_images import bonded_images, images_of_whole
 from systems.errors import listed
 from systems.prepare.bonding import links_residues
 from systems.prepare.read.records import StructureFile
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-
-_BOND_SLACK_NM = 0.04
 
 
 def made_whole(found: StructureFile) -> StructureFile:
@@ -56,12 +53,10 @@ def _bonds_in_cell(found: StructureFile, x: FloatArray) -> IntArray:
     assert found.cell_nm is not None
     atoms = found.atoms
     stated = set(found.conect)
-    pairs, length = near_images(x, found.cell_nm, LONGEST_BOND_NM)
-    radii = np.array([-1.0 if is_metal(a.element) else covalent_radius_nm(a.element) for a in atoms])
-    close = length < radii[pairs].sum(axis=1) + _BOND_SLACK_NM
+    pairs, length = bonded_images([a.element for a in atoms], x, found.cell_nm)
     rows = [
         (i, j)
-        for (i, j), d in zip(pairs[close].tolist(), length[close].tolist(), strict=True)
+        for (i, j), d in zip(pairs.tolist(), length.tolist(), strict=True)
         if atoms[i].residue_key == atoms[j].residue_key or (i, j) in stated or links_residues(atoms[i], atoms[j], d)
     ]
     return np.array(rows, dtype=np.int64).reshape(-1, 2)

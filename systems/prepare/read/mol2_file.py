@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.bond_orders import bent_carbons
-from systems.chemistry.cell_images import cell_of, images_of_whole
+from systems.chemistry.cell_images import bonded_images, cell_of, images_of_whole
 from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
 from systems.chemistry.lewis import lewis_structure
@@ -81,7 +81,7 @@ def read_mol2(text: str, path: Path, notes: list[str]) -> Mol2:
         raise InputError(f"{path}: a coordinate is not a number; write the file again.")
     cell = _cell(sections.get("CRYSIN", []))
     if cell is not None:
-        images = images_of_whole(x, cell, np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2))
+        images = images_of_whole(x, cell, np.array(sorted(bonds)) if bonds else bonded_images(elements, x, cell)[0])
         if images.any():
             x = x + images @ cell
             for row, (a, b, c) in zip(atoms, (10.0 * x).tolist(), strict=True):

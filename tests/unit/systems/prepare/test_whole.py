@@ -104,7 +104,9 @@ def test_heavy_atoms_are_made_whole_before_hydrogens_are_added(tmp_path: Path) -
 def test_molecules_without_templates_are_made_whole_too(tmp_path: Path) -> None:
     split = _wrapped(ETHANOL, CUBIC)
     assert _longest_nm(split) > 1.0
-    for path in (_pdb(tmp_path / "x.pdb", split, CUBIC), _mol2(tmp_path / "x.mol2", split, CUBIC)):
+    bare = replace(split, bonds=split.bonds[:0], bond_orders=split.bond_orders[:0])
+    files = [_mol2(tmp_path / f"{k}.mol2", each, CUBIC) for k, each in enumerate((split, bare))]
+    for path in (_pdb(tmp_path / "x.pdb", split, CUBIC), *files):
         scene = prepare(path)
         assert molecule_key(scene) == molecule_key(ETHANOL) and _longest_nm(scene) < 0.16
         assert "made whole by the periodic cell" in _notes(scene)
@@ -112,8 +114,6 @@ def test_molecules_without_templates_are_made_whole_too(tmp_path: Path) -> None:
 
 def test_what_stays_broken_is_refused_with_its_bond_and_length(tmp_path: Path) -> None:
     peptide, molecule = _wrapped(ALA2, CUBIC, (0.0, 0.0, 0.1)), _wrapped(ETHANOL, CUBIC)
-    unnamed = CUBIC[:3]
-    assert len(unnamed) == 3
     files = [
         _pdb(tmp_path / "none.pdb", peptide, None),
         _pdb(tmp_path / "placeholder.pdb", peptide, (1.0, 1.0, 1.0, 90.0, 90.0, 90.0)),
