@@ -10,15 +10,20 @@ import numpy as np
 import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
+from md_reference.forces.mixture import solute_of
 from md_reference.run.config import Conditions
 from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
-from systems.errors import SimulationError, first_line
+from systems.chemistry.geometry import signed_volumes
+from systems.chemistry.graph import stereocentres
+from systems.errors import PreparationError, SimulationError, first_line, listed
 from systems.scene import FloatArray, Scene
+from systems.selection import part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8
+_FLAT_NM3 = 2e-4
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,28 @@ class State:
 def one_line(error: Exception) -> str:
     """Return the first line of an OpenMM error, without the advice and the web address behind it."""
     return first_line(error).split("  For more information")[0].rstrip(".")
+
+
+def refuse_inverted(scene: Scene, minimised_nm: FloatArray) -> None:
+    """Raise PreparationError where a stereocentre of the solute turned over in the minimisation, which left positions
+    `(n_atoms, 3)` nm; one that the scene has flat may go either way."""
+    if scene.interactions is not None:
+        return
+    atoms = solute_of(scene)
+    centres = stereocentres(part_of(scene, atoms))
+    rows = atoms[centres] if len(atoms) else centres
+    before, after = (signed_volumes(x, rows) for x in (scene.positions_nm, minimised_nm))
+    turned = rows[(np.abs(before) > _FLAT_NM3) & (np.sign(before) != np.sign(after)), 0].tolist()
+    if turned:
+        residues = [int(scene.residue_of_atom[i]) for i in turned]
+        names = [
+            f"{scene.residue_names[r]} {scene.residue_ids[r]} {scene.atom_names[i]}"
+            for i, r in zip(turned, residues, strict=True)
+        ]
+        raise PreparationError(
+            f"{scene.name}: minimising its energy turns the stereocentre {listed(names)} over, as the geometry is "
+            "broken there; correct the coordinates, or build the molecule anew."
+        )
 
 
 class Engine:

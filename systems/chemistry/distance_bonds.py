@@ -1,8 +1,8 @@
-"""Bonds by distance, where neither the file nor a residue template says what is bonded."""
+"""Bonds by distance, where neither the file nor a residue template says what is bonded; bonds too long to be any."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.geometry import near_pairs
+from systems.errors import PreparationError
 from systems.scene import Scene
 
 _TOLERANCE_NM = 0.04
@@ -56,3 +57,23 @@ def bonds_by_distance(elements: Sequence[str], positions_nm: npt.ArrayLike) -> n
             best[h] = min(best.get(h, (np.inf, -1)), (d, i + j - h))
     rows += [(min(h, k), max(h, k)) for h, (_, k) in best.items()]
     return np.array(sorted(set(rows)), dtype=np.int64).reshape(-1, 2)
+
+
+def refuse_long_bonds(
+    elements: Sequence[str], positions_nm: npt.NDArray[np.float64], bonds: npt.ArrayLike, label: Callable[[int], str]
+) -> None:
+    """Raise PreparationError, which names the longest of them, where bonds `(n, 2)` are longer than any bond is:
+    the sum of their covalent radii and 0.04 nm."""
+    rows = np.asarray(bonds, dtype=np.int64).reshape(-1, 2)
+    radii = np.array([covalent_radius_nm(e) for e in elements])
+    length = np.linalg.norm(positions_nm[rows[:, 0]] - positions_nm[rows[:, 1]], axis=1)
+    excess = length - radii[rows].sum(axis=1) - _TOLERANCE_NM
+    wrong = int((excess > 0).sum())
+    if wrong:
+        k = int(excess.argmax())
+        i, j = rows[k].tolist()
+        more = f" ({wrong - 1} more are too long)" if wrong > 1 else ""
+        raise PreparationError(
+            f"the bond {label(i)} - {label(j)} is {10 * length[k]:.2f} Å long{more}: the molecule is broken; make it "
+            "whole (unwrap it from its periodic cell, or write the cell into the file), or correct the coordinates."
+        )

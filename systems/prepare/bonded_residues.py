@@ -30,13 +30,15 @@ class Residue:
 class Bonding:
     """Bonds `(n_bonds, 2)`, the residues in the order of the file, and an account of where bonds came from.
 
-    `peptide_bonds` are the pairs (C, N) that join standard residues.
+    `peptide_bonds` are the pairs (C, N) that join standard residues, `unmade` the bonds that the file states and that
+    are none.
     """
 
     bonds: npt.NDArray[np.int64]
     residues: list[Residue]
     notes: list[str]
     peptide_bonds: set[tuple[int, int]]
+    unmade: list[str] = field(default_factory=list)
 
     @property
     def neighbours(self) -> list[list[int]]:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.components import component, known_template
+from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import canonical_heavy_name, template_for
@@ -40,8 +41,8 @@ def find_bonds(
     disulfide bonds are found by distance. All other residues take CONECT records if these reach each of their atoms,
     distances within 0.04 nm of the sum of covalent radii if not; to other residues only the bonds that link polymers.
     Monatomic ions have no bonds by distance, and metal ions none at all. Peptide bonds across one of the `chain_ends`
-    (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide and hydrogens far from
-    everything.
+    (atoms that TER follows) are noted. Raises PreparationError for atoms that coincide, bonds of templates that are too
+    long to be any, and hydrogens far from everything.
     """
     x = np.array([a.position_angstrom for a in atoms], dtype=np.float64) / 10.0
     near = near_pairs(x, 0.35, "the structure")
@@ -61,9 +62,13 @@ def find_bonds(
         if residue.heavy and residue.template is not None:
             names = [*residue.template.bonds, *([("C", "OXT")] if "OXT" in residue.heavy else [])]
             bonds |= {_pair(residue.heavy[a], residue.heavy[b]) for a, b in names if {a, b} <= set(residue.heavy)}
+    refuse_long_bonds(
+        [a.element for a in atoms], x, np.array(sorted(bonds), dtype=np.int64), lambda i: atom_label(atoms[i])
+    )
     peptide = _peptide_bonds(near, length, of_atom)
     bonds |= {_pair(c, n) for c, n in peptide}
-    bonds |= _accepted_conect(atoms, x, conect, of_atom, {i for i in ions if is_metal(atoms[i].element)}, notes)
+    metals = {i for i in ions if is_metal(atoms[i].element)}
+    bonds |= _accepted_conect(atoms, x, conect, of_atom, metals, notes)
     free = _free_atoms(residues, bonds, notes)
     _note_bonds_across_ends(peptide, of_atom, chain_ends, notes)
     bonds |= _bonds_by_distance(atoms, near, length, free, ions, bonds, notes)
@@ -72,7 +77,12 @@ def find_bonds(
     bonds |= _links_of_components(atoms, near, length, of_atom, ions)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
     note_missing(residues, atoms, bonded)
-    return Bonding(bonded, residues, notes, peptide)
+    unmade = [
+        f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({10 * np.linalg.norm(x[i] - x[j]):.2f} Å)"
+        for i, j in conect
+        if _pair(i, j) not in bonds and not {i, j} & metals
+    ]
+    return Bonding(bonded, residues, notes, peptide, unmade)
 
 
 def are_ions(atoms: Sequence[AtomRecord]) -> bool:
@@ -133,9 +143,10 @@ def _accepted_conect(
     notes: list[str],
 ) -> set[tuple[int, int]]:
     """CONECT pairs, but those that span impossible distances, those to metal ions (which coordinate and do not bond),
-    and those inside standard residues (templates know)."""
+    and those inside standard residues (templates know). Raises PreparationError for impossible ones inside others."""
     accepted = set()
-    too_long = to_metals = 0
+    broken = []
+    to_metals = 0
     for i, j in conect:
         if of_atom[i] is of_atom[j] and of_atom[i].heavy:
             continue
@@ -144,11 +155,10 @@ def _accepted_conect(
             continue
         limit = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _CONECT_SLACK_NM
         if float(np.linalg.norm(x[i] - x[j])) > limit:
-            too_long += 1
+            broken += [(i, j)] if of_atom[i] is of_atom[j] else []
         else:
             accepted.add(_pair(i, j))
-    if too_long:
-        notes.append(f"{too_long} CONECT bonds are impossibly long and are ignored")
+    refuse_long_bonds([a.element for a in atoms], x, np.array(broken, dtype=np.int64), lambda i: atom_label(atoms[i]))
     if to_metals:
         notes.append(f"{to_metals} CONECT bonds to metal ions are ignored: ions coordinate")
     return accepted
@@ -191,7 +201,7 @@ def _bonds_by_distance(
             reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
             if d >= reach:
                 continue
-            if atoms[i].residue_key == atoms[j].residue_key or _links_residues(atoms[i], atoms[j], d):
+            if atoms[i].residue_key == atoms[j].residue_key or links_residues(atoms[i], atoms[j], d):
                 found.add((i, j))
             elif (i, j) not in known:
                 apart.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
@@ -206,7 +216,7 @@ def _are_amide(first: AtomRecord, second: AtomRecord) -> bool:
     return first.residue_key != second.residue_key and {first.element, second.element} == {"C", "N"}
 
 
-def _links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
+def links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
     """Whether a distance between residues is one of the bonds that link them in polymers: amides, disulfides,
     thioethers, the phosphates of nucleic acids, and sugars at their anomeric carbons."""
     a, b = sorted((first, second), key=lambda atom: atom.element)
@@ -283,7 +293,7 @@ def _links_of_components(
             continue
         if not any(of_atom[k].heavy and template_for(of_atom[k].key[2]) is None for k in (i, j)):
             continue
-        if _links_residues(atoms[i], atoms[j], d):
+        if links_residues(atoms[i], atoms[j], d):
             found.add((i, j))
     return found
 

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 
+from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import template_for
-from systems.errors import PreparationError
+from systems.errors import PreparationError, listed
 from systems.preparation import Preparation
 from systems.prepare.bonded_residues import Bonding, Residue
-from systems.prepare.bonding import find_bonds
+from systems.prepare.bonding import find_bonds, links_residues
 from systems.prepare.clashes import check_contacts
 from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
 from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
@@ -22,10 +24,11 @@ from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mmcif_file import is_component
 from systems.prepare.read.modified_residues import describe_residue, standardise
 from systems.prepare.read.peptide_mol2 import read_peptide_mol2
-from systems.prepare.read.records import AtomRecord
+from systems.prepare.read.records import AtomRecord, StructureFile
 from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
 from systems.prepare.structure import scene_from_records
 from systems.prepare.waters import complete_waters
+from systems.prepare.whole import made_whole
 from systems.scene import Scene
 
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
@@ -47,14 +50,17 @@ def prepare_file(path: Path, options: Preparation) -> Scene:
 
 def _prepare_file(path: Path, options: Preparation) -> Scene:
     found = read_peptide_mol2(path) if suffix_of(path) == ".mol2" else read_structure(path)
+    found = made_whole(found)
     repairs = list(found.notes)
-    kept = _choose_alternates(found.atoms, repairs)
+    kept = _choose_alternates(found, repairs)
     kept, wet = settle_solvent(
         found.atoms, kept, keep_water=options.keep_water, keep_ions=options.keep_ligand, notes=repairs
     )
     part = standardise([found.atoms[i] for i in kept], repairs)
     structure = _Structure(part, *_reindexed(found.conect, found.chain_ends, kept))
     bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
+    if bonding.unmade:
+        repairs.append(f"stated bonds that are not made: {listed(bonding.unmade)}")
     ligands = ligand_atoms(structure.atoms, bonding)
     if ligands:
         stays = settle_ligands(
@@ -76,7 +82,6 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
     before = _handedness(bonding, atoms)
-    say_inverted(before, repairs)
     if not bonding.is_complete:
         _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
@@ -85,9 +90,12 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
         repairs += account
         after = heavy_of_records(atoms)
         names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
-        compare(before, handedness((key, names[key], heavy) for key, heavy in after.items() if key in names))
+        hands = handedness((key, names[key], heavy) for key, heavy in after.items() if key in names)
+        compare(before, hands)
     else:
+        hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)
+    say_inverted(hands, repairs)
     if ligands and stays:
         bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
         atoms = [*atoms, *others.atoms]
@@ -155,23 +163,63 @@ def _disulfides(bonding: Bonding, atoms: Sequence[AtomRecord]) -> list[str]:
     ]
 
 
-def _choose_alternates(atoms: Sequence[AtomRecord], repairs: list[str]) -> list[int]:
-    """Indices of the atoms that stay: of alternate locations, each residue's most occupied."""
+def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
+    """Indices of the atoms that stay: of alternate locations the most occupied, one label for all that is bonded.
+
+    Labels that most of the bonded residues have go first. A stated bond holds for the alternate that stays: `conect` of
+    `found` is changed to that.
+    """
+    atoms = found.atoms
+    labelled = [i for i, a in enumerate(atoms) if a.altloc]
+    if not labelled:
+        return list(range(len(atoms)))
+    groups = nx.Graph()
     occupancy: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for atom in atoms:
-        if atom.altloc:
-            occupancy.setdefault((atom.chain, atom.residue_id), {}).setdefault(atom.altloc, []).append(atom.occupancy)
-    chosen = {k: max(v, key=lambda a: (sum(v[a]) / len(v[a]), -ord(a[0]))) for k, v in occupancy.items()}
-    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[a.chain, a.residue_id] == a.altloc]
+    for i in labelled:
+        groups.add_node(_place(atoms[i]))
+        occupancy.setdefault(_place(atoms[i]), {}).setdefault(atoms[i].altloc, []).append(atoms[i].occupancy)
+    groups.add_edges_from((_place(atoms[i]), _place(atoms[j])) for i, j in _bonds_of_alternates(found, labelled))
+    chosen: dict[tuple[str, str], str] = {}
+    for group in nx.connected_components(groups):
+        of_label: dict[str, list[list[float]]] = {}
+        for place in group:
+            for label, values in occupancy[place].items():
+                of_label.setdefault(label, []).append(values)
+
+        def rank(label: str, of_label: dict[str, list[list[float]]] = of_label) -> tuple[int, float, int]:
+            values = np.concatenate(of_label[label])
+            return len(of_label[label]), round(float(values.mean()), 4), -ord(label[0])
+
+        order = sorted(of_label, key=rank, reverse=True)
+        chosen |= {place: next(label for label in order if label in occupancy[place]) for place in group}
+    chosen = {place: chosen[place] for place in occupancy}
+    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[_place(a)] == a.altloc]
+    instead = {(*atoms[i].residue_key, atoms[i].name): i for i in kept if atoms[i].altloc}
+    stays = [instead.get((*a.residue_key, a.name), i) if a.altloc else i for i, a in enumerate(atoms)]
+    found.conect = sorted({(min(p), max(p)) for p in ((stays[i], stays[j]) for i, j in found.conect) if p[0] != p[1]})
     if len(kept) < len(atoms):
-        labels = ", ".join(f"{c}{r}:{a}" for (c, r), a in list(chosen.items())[:6]) + (
-            " ..." if len(chosen) > 6 else ""
-        )
+        together = ", one label for what is bonded" if groups.number_of_edges() else ""
+        labels = listed([f"{''.join(place)}:{label}" for place, label in chosen.items()])
         repairs.append(
-            f"alternate locations in {len(chosen)} residues: the most occupied kept ({labels}), "
+            f"alternate locations in {len(chosen)} residues: the most occupied kept ({labels}){together}, "
             f"{len(atoms) - len(kept)} atoms left out"
         )
     return kept
+
+
+def _place(atom: AtomRecord) -> tuple[str, str]:
+    return atom.chain, atom.residue_id
+
+
+def _bonds_of_alternates(found: StructureFile, labelled: Sequence[int]) -> list[tuple[int, int]]:
+    """Bonds between alternates of two residues: those that are stated, and those that link polymers."""
+    atoms = found.atoms
+    x = np.array([atoms[i].position_angstrom for i in labelled]) / 10.0
+    near = [(labelled[a], labelled[b], float(np.linalg.norm(x[a] - x[b]))) for a, b in near_pairs(x, 0.25).tolist()]
+    linked = [
+        (i, j) for i, j, d in near if atoms[i].altloc == atoms[j].altloc and links_residues(atoms[i], atoms[j], d)
+    ]
+    return [(i, j) for i, j in (*found.conect, *linked) if atoms[i].altloc and atoms[j].altloc]
 
 
 def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:

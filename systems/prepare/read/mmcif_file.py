@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from systems.chemistry.cell_images import cell_of
 from systems.chemistry.element_data import element_symbol
-from systems.errors import InputError, first_line
+from systems.errors import InputError, first_line, listed
 from systems.prepare.read.records import AtomRecord, StructureFile, coordinates
 
 _NEEDED = ("Cartn_x", "Cartn_y", "Cartn_z", "label_atom_id")
@@ -18,6 +19,7 @@ _OPTIONAL = (
     "pdbx_PDB_model_num",
 )  # fmt: skip
 _UNCERTAINTY = re.compile(r"\(\d+\)$")
+SYMMETRIC = "they lead to a symmetry copy"
 # (chain, number with insertion code, residue name, atom name)
 Address = tuple[str, str, str, str]
 
@@ -88,23 +90,39 @@ def _read_mmcif(text: str, path: Path) -> StructureFile:
         found.atoms.append(atom)
     if len(models) > 1:
         found.notes.append(f"{len(models)} models in the file: the first is taken")
-    found.conect = sorted(addressed(_connections(blocks[0]), found.atoms))
+    found.conect = sorted(addressed(_connections(blocks[0], found.notes), found.atoms, found.notes))
+    found.cell_nm = _cell(blocks[0])
     return found
 
 
-def addressed(ends: Iterable[Sequence[Address]], atoms: Sequence[AtomRecord]) -> set[tuple[int, int]]:
-    """Return the index pairs of atoms named by chain, residue and name; of alternates, those that go together."""
+def addressed(ends: Iterable[Sequence[Address]], atoms: Sequence[AtomRecord], notes: list[str]) -> set[tuple[int, int]]:
+    """Return the index pairs of atoms named by chain, residue and name; of alternates, those that go together.
+
+    `notes` says for which of the bonds the file has no such two atoms.
+    """
     index: dict[Address, list[int]] = {}
     for i, atom in enumerate(atoms):
         index.setdefault((*atom.residue_key, atom.name), []).append(i)
-    pairs = set()
+    pairs: set[tuple[int, int]] = set()
+    absent = []
     for first, second in ends:
-        for i in index.get(first, ()):
-            for j in index.get(second, ()):
-                labels = {atoms[i].altloc, atoms[j].altloc} - {""}
-                if i != j and len(labels) < 2:
-                    pairs.add((min(i, j), max(i, j)))
+        those = {
+            (min(i, j), max(i, j))
+            for i in index.get(first, ())
+            for j in index.get(second, ())
+            if i != j and len({atoms[i].altloc, atoms[j].altloc} - {""}) < 2
+        }
+        pairs |= those
+        absent += [] if those else [(first, second)]
+    note_unmade(absent, "the file has no such two atoms together", notes)
     return pairs
+
+
+def note_unmade(ends: Iterable[Sequence[Address]], reason: str, notes: list[str]) -> None:
+    """Note records of bonds that make none."""
+    names = [" - ".join(f"{name} {chain}{number} {atom}" for chain, number, name, atom in pair) for pair in ends]
+    if names:
+        notes.append(f"records of bonds not used, as {reason}: {listed(names)}")
 
 
 def _atom(item: dict[str, str], number: int, path: Path) -> tuple[AtomRecord, str]:
@@ -135,7 +153,18 @@ def _atom(item: dict[str, str], number: int, path: Path) -> tuple[AtomRecord, st
     return atom, f"{path}, atom row {number}: {name!r} has no recognisable element; fill type_symbol."
 
 
-def _connections(block: Any) -> list[tuple[Address, Address]]:
+def _cell(block: Any) -> Any:
+    """Box vectors `(3, 3)` nm of `_cell`, or None."""
+    tags = [*(f"length_{a}" for a in "abc"), *(f"angle_{a}" for a in ("alpha", "beta", "gamma"))]
+    for row in block.find("_cell.", tags):
+        try:
+            return cell_of([float(_UNCERTAINTY.sub("", row.str(k))) for k in range(6)])
+        except ValueError:
+            return None
+    return None
+
+
+def _connections(block: Any, notes: list[str]) -> list[tuple[Address, Address]]:
     """Covalent bonds of `_struct_conn` within the asymmetric unit, by the authors' names."""
     tags = ["conn_type_id", "?ptnr1_symmetry", "?ptnr2_symmetry"]
     sides = [
@@ -148,15 +177,17 @@ def _connections(block: Any) -> list[tuple[Address, Address]]:
         ]
         for k in (1, 2)
     ]
-    found = []
+    found: list[tuple[Address, Address]] = []
+    elsewhere: list[tuple[Address, Address]] = []
     for row in block.find("_struct_conn.", [*tags, *sides[0], *sides[1]]):
         kind = row.str(0).lower()
         symmetry = [row.str(k) for k in (1, 2) if row.has(k)]
-        if not kind.startswith(("covale", "disulf")) or len(set(symmetry)) > 1:
+        if not kind.startswith(("covale", "disulf")):
             continue
         ends: list[Address] = []
         for start in (3, 8):
             insertion = row.str(start + 2) if row.has(start + 2) else ""
             ends.append((row.str(start), row.str(start + 1) + insertion, row.str(start + 3), row.str(start + 4)))
-        found.append((ends[0], ends[1]))
+        (found if len(set(symmetry)) < 2 else elsewhere).append((ends[0], ends[1]))
+    note_unmade(elsewhere, SYMMETRIC, notes)
     return found

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.bond_orders import bent_carbons
+from systems.chemistry.cell_images import bonded_images, cell_of, images_of_whole
 from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
 from systems.chemistry.lewis import lewis_structure
@@ -78,6 +79,16 @@ def read_mol2(text: str, path: Path, notes: list[str]) -> Mol2:
     x = np.array(positions) / 10.0
     if not np.isfinite(x).all():
         raise InputError(f"{path}: a coordinate is not a number; write the file again.")
+    cell = _cell(sections.get("CRYSIN", []))
+    if cell is not None:
+        images = images_of_whole(x, cell, np.array(sorted(bonds)) if bonds else bonded_images(elements, x, cell)[0])
+        if images.any():
+            x = x + images @ cell
+            for row, (a, b, c) in zip(atoms, (10.0 * x).tolist(), strict=True):
+                row[2:5] = [f"{a:.6f}", f"{b:.6f}", f"{c:.6f}"]
+            notes.append(
+                f"made whole by the periodic cell: {int(images.any(axis=1).sum())} atoms moved by cell vectors"
+            )
     if not bonds and len(atoms) > 1:
         bonds = {(int(i), int(j)) for i, j in bonds_by_distance(elements, x)}
         notes.append("no bonds in the file: bonds from distances")
@@ -231,6 +242,14 @@ def _rewritten(atoms: list[list[str]], bonds: list[list[str]], number_of: dict[s
     rows = [" ".join([str(k + 1), row[1], *row[2:6], "1", "MOL", "0.0"]) for k, row in enumerate(atoms)]
     joined = [f"{k + 1} {number_of[row[1]] + 1} {number_of[row[2]] + 1} {row[3]}" for k, row in enumerate(bonds)]
     return "\n".join([*head, "@<TRIPOS>ATOM", *rows, "@<TRIPOS>BOND", *joined, ""])
+
+
+def _cell(rows: list[list[str]]) -> Any:
+    """Box vectors `(3, 3)` nm of a CRYSIN record, or None."""
+    try:
+        return cell_of([float(value) for value in rows[0][:6]]) if rows else None
+    except ValueError:
+        return None
 
 
 def _types(sections: dict[str, list[list[str]]]) -> set[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.geometry import near_pairs
 from systems.errors import InputError, PreparationError
 from systems.prepare.read.file_text import read_text, suffix_of
@@ -174,6 +175,7 @@ def _with_geometry(molecule: Any, notes: list[str]) -> Any:
     if out.GetNumAtoms() > n_atoms:
         notes.append(f"hydrogens added: {out.GetNumAtoms() - n_atoms}")
     _refuse_coincident(out)
+    _refuse_broken(out)
     Chem.AssignStereochemistryFrom3D(out)
     return out
 
@@ -188,6 +190,13 @@ def _is_drawing(molecule: Any, conformer: Any) -> bool:
     return not positions[:, 2].any() and any(
         atom.GetSymbol() == "C" and atom.GetTotalDegree() == 4 and atom.GetDegree() > 2 for atom in molecule.GetAtoms()
     )
+
+
+def _refuse_broken(molecule: Any) -> None:
+    atoms = [atom.GetSymbol() for atom in molecule.GetAtoms()]
+    bonds = np.array([(b.GetBeginAtomIdx(), b.GetEndAtomIdx()) for b in molecule.GetBonds()], dtype=np.int64)
+    positions_nm = np.array(molecule.GetConformer().GetPositions()) / 10.0
+    refuse_long_bonds(atoms, positions_nm, bonds, lambda i: f"{atoms[i]}{i + 1}")
 
 
 def _refuse_coincident(molecule: Any) -> None:

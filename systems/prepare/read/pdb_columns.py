@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
+from systems.chemistry.cell_images import cell_of
 from systems.chemistry.element_data import element_symbol, repeats_name
 from systems.errors import InputError
 from systems.prepare.read.hybrid36 import decode
@@ -71,6 +73,8 @@ def read_pdb(text: str, path: Path) -> StructureFile:
             conect_lines.append(line)
         elif word in ("LINK", "LINKR", "SSBOND"):
             header.append(line)
+        elif word == "CRYST1" and found.cell_nm is None:
+            found.cell_nm = _cell(line)
         elif (
             word not in _RECORDS
             and not is_atom
@@ -92,12 +96,20 @@ def read_pdb(text: str, path: Path) -> StructureFile:
     pairs, ignored = _conect(conect_lines, index_of, repeated)
     if ignored:
         found.notes.append(f"{ignored} CONECT entries name no single atom of the file and are ignored")
-    found.conect = sorted(pairs | _links(header, found.atoms))
+    found.conect = sorted(pairs | _links(header, found.atoms, found.notes))
     return found
 
 
 def _fields(line: str) -> list[str]:
     return [line[k : k + 8] for k in (30, 38, 46)]
+
+
+def _cell(line: str) -> Any:
+    fields = [line[a:b] for a, b in ((6, 15), (15, 24), (24, 33), (33, 40), (40, 47), (47, 54))]
+    try:
+        return cell_of([float(field) for field in fields])
+    except ValueError:
+        return None
 
 
 def _atom(line: str, number: int, path: Path) -> tuple[AtomRecord, str]:
@@ -159,18 +171,21 @@ def _conect(lines: list[str], index_of: dict[str, int], repeated: set[str]) -> t
     return pairs, ignored
 
 
-def _links(header: list[str], atoms: list[AtomRecord]) -> set[tuple[int, int]]:
+def _links(header: list[str], atoms: list[AtomRecord], notes: list[str]) -> set[tuple[int, int]]:
     """Return the index pairs of LINK and SSBOND records that join atoms of the same asymmetric unit."""
     if not header:
         return set()
     import gemmi
 
-    from systems.prepare.read.mmcif_file import addressed
+    from systems.prepare.read.mmcif_file import SYMMETRIC, addressed, note_unmade
 
     structure = gemmi.read_pdb_string("\n".join(header) + "\n")
-    ends = [
-        tuple((p.chain_name, str(p.res_id.seqid), p.res_id.name, p.atom_name) for p in (link.partner1, link.partner2))
+    ends = {
+        tuple(
+            (p.chain_name, str(p.res_id.seqid), p.res_id.name, p.atom_name) for p in (link.partner1, link.partner2)
+        ): (link.asu == gemmi.Asu.Different)
         for link in structure.connections
-        if link.asu != gemmi.Asu.Different and link.type in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf)
-    ]
-    return addressed(ends, atoms)
+        if link.type in (gemmi.ConnectionType.Covale, gemmi.ConnectionType.Disulf)
+    }
+    note_unmade([pair for pair, elsewhere in ends.items() if elsewhere], SYMMETRIC, notes)
+    return addressed([pair for pair, elsewhere in ends.items() if not elsewhere], atoms, notes)

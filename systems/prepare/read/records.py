@@ -6,6 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+import numpy.typing as npt
+
 # Narrower than float(), which also takes 1_0.5, tabs and the digits of other alphabets.
 _COORDINATE = re.compile(r" *[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)? *|\s*[-+]?(nan|inf)\w*\s*", re.ASCII | re.IGNORECASE)
 
@@ -37,7 +40,7 @@ class StructureFile:
 
     `conect` holds the pairs of CONECT, LINK and SSBOND records (`_struct_conn` in mmCIF), `chain_ends` the atoms that a
     TER record follows, or with which a chain of mmCIF ends. An atom whose element is not known has the element "", and
-    `unknown` says where it stands.
+    `unknown` says where it stands. `cell_nm`: box vectors `(3, 3)` of a periodic cell, None where the file has none.
     """
 
     atoms: list[AtomRecord]
@@ -45,6 +48,7 @@ class StructureFile:
     chain_ends: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     unknown: dict[int, str] = field(default_factory=dict)
+    cell_nm: npt.NDArray[np.float64] | None = None
 
 
 def coordinates(fields: Sequence[str]) -> tuple[float, float, float] | None:

@@ -16,8 +16,17 @@ import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.engine import Engine, refuse_inverted
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
-from systems.errors import InputError, SimulationError, StorageError, TrajectoryError, UnitError, UnknownNameError
+from systems.errors import (
+    InputError,
+    PreparationError,
+    SimulationError,
+    StorageError,
+    TrajectoryError,
+    UnitError,
+    UnknownNameError,
+)
 from systems.scene import Scene
 from systems.trajectory.checkpoint import read_checkpoints
 from systems.trajectory.codec import open_trajectory, open_writer
@@ -69,6 +78,21 @@ def test_without_equilibration_the_run_begins_at_the_minimum(alanine_dipeptide: 
     positions, times, record = contents(tmp_path / "a.h5")
     assert len(positions) == config.n_frames and times[0] == pytest.approx(config.save_every_ps)
     assert record["equilibrate_ps"] == 0.0
+
+
+def test_a_stereocentre_that_minimising_turns_over_is_refused(
+    alanine_dipeptide: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mirrored = alanine_dipeptide.positions_nm * [1.0, 1.0, -1.0]
+    refuse_inverted(alanine_dipeptide, alanine_dipeptide.positions_nm + 0.001)
+    refuse_inverted(alanine_dipeptide.with_positions(mirrored), mirrored)
+    flat = alanine_dipeptide.with_positions(mirrored * [1.0, 1.0, 0.0])
+    refuse_inverted(flat, mirrored)
+
+    monkeypatch.setattr(Engine, "minimise", lambda engine, **_: engine.set_positions(mirrored))
+    with pytest.raises(PreparationError, match="turns the stereocentre ALA 2 CA over") as caught:
+        simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
+    assert "\n" not in str(caught.value)
 
 
 # ---- frames and times ----------------------------------------------------------------------------------------------
