@@ -1,8 +1,8 @@
-// Energy and gradient of PAINET as a potential in lanes: LANES copies of one molecule, one in each element of a vector
+// Energy and gradient of PAINET as a potential by SIMD: W copies of one molecule, one in each element of a vector
 // register. What it computes, and in which order, is `energy.py`; the gradient is that of its every step, backwards.
 //
 // `langevin` moves the copies by it, in double precision. A value is a V, or a D: one number for each copy. Arrays are
-// [..][LANES]; weights are the same for all copies. Sizes of the network come as macros from lanes.py, which compiles this
+// [..][W]; weights are the same for all copies. Sizes of the network come as macros from simd.py, which compiles this
 // at first use. No copy depends on the others, but for the number of rounds that rigid bonds take.
 #include <math.h>
 #include <stdint.h>
@@ -13,10 +13,10 @@
 #define N_EDGE (N_STEPS * N_FOUND + N_MEMBERS)
 #define N_ATTENDED (N_HEADS * HEAD_DIM)
 
-typedef float V __attribute__((vector_size(4 * LANES), may_alias));
+typedef float V __attribute__((vector_size(4 * W), may_alias));
 // As numpy and torch lay arrays.
-typedef double D __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
-typedef float U __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef double D __attribute__((vector_size(8 * W), aligned(8), may_alias));
+typedef float U __attribute__((vector_size(4 * W), aligned(4), may_alias));
 
 static const float HALF_WIDTH = 2.5f, SOFTENING_NM2 = 1e-8f, ROOT_TWO = 1.41421356f, LEAST_NORM = 1e-12f;
 
@@ -70,13 +70,13 @@ static inline V above_zero(V a) { return a > 0.0f ? a : splat(0.0f); }
 static void silu(const V *x, V *y, int64_t n) {
     const float *a = (const float *)x;
     float *b = (float *)y;
-    _Pragma("omp simd") for (int64_t k = 0; k < n * LANES; k++) b[k] = a[k] / (1.0f + expf(-a[k]));
+    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) b[k] = a[k] / (1.0f + expf(-a[k]));
 }
 
 static void silu_back(const V *x, V *dy, int64_t n) {
     const float *a = (const float *)x;
     float *d = (float *)dy;
-    _Pragma("omp simd") for (int64_t k = 0; k < n * LANES; k++) {
+    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) {
         const float g = 1.0f / (1.0f + expf(-a[k]));
         d[k] *= g * (1.0f + a[k] * (1.0f - g));
     }
@@ -135,10 +135,10 @@ static void measure(const Network *net, const D *x, Edge *edges, V *energy) {
                 e->apart[a] = __builtin_convertvector(x[3 * i + a] - x[3 * j + a], V);
                 square += e->apart[a] * e->apart[a];
             }
-            for (int l = 0; l < LANES; l++) e->distance[l] = sqrtf(square[l]);
+            for (int l = 0; l < W; l++) e->distance[l] = sqrtf(square[l]);
             float *log_d = (float *)&e->log;
             const float *d = (const float *)&e->distance;
-            _Pragma("omp simd") for (int l = 0; l < LANES; l++) log_d[l] = logf(d[l]);
+            _Pragma("omp simd") for (int l = 0; l < W; l++) log_d[l] = logf(d[l]);
             const V inside = above_zero(1.0f - p[2] * e->distance * e->distance), cube = inside * inside * inside;
             for (int k = 0; k < N_RADIAL; k++) {
                 const V u = ((e->log - p[0]) * p[1] - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
@@ -321,7 +321,7 @@ static inline V dot(const V *a, const V *b) {
 // Vectors of unit length, in place, and what they were long.
 static void normalise(V *q, V *norm) {
     const V square = dot(q, q);
-    for (int l = 0; l < LANES; l++) (*norm)[l] = sqrtf(square[l]);
+    for (int l = 0; l < W; l++) (*norm)[l] = sqrtf(square[l]);
     *norm = *norm > LEAST_NORM ? *norm : splat(LEAST_NORM);
     for (int d = 0; d < HEAD_DIM; d++) q[d] /= *norm;
 }
@@ -506,10 +506,10 @@ int64_t work_floats(int64_t n) {
     Back b;
     Edge *edges;
     V *x, *h, *carried, *scratch;
-    return LANES * (laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch) + ROOM * n);
+    return W * (laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch) + ROOM * n);
 }
 
-// `positions` [n][3][LANES] nm -> the members' `energy` [N_MEMBERS][LANES] and the `gradient` [n][3][LANES] of their mean,
+// `positions` [n][3][W] nm -> the members' `energy` [N_MEMBERS][W] and the `gradient` [n][3][W] of their mean,
 // per nm, in the network's unit.
 void evaluate(const Network *net, const double *positions, float *energy, float *gradient, float *work) {
     const int64_t n = net->n;
@@ -592,7 +592,7 @@ static void correct(const Bath *bath, const D *bonds, const D *off, D *x) {
 
 static bool beyond(const D off, double limit) {
     double most = 0.0;
-    for (int l = 0; l < LANES; l++) most = fabs(off[l]) > most ? fabs(off[l]) : most;
+    for (int l = 0; l < W; l++) most = fabs(off[l]) > most ? fabs(off[l]) : most;
     return most > limit;
 }
 
@@ -630,8 +630,8 @@ static void rest(const Bath *bath, int64_t n, D *v) {
     }
 }
 
-// Positions nm and velocities nm/ps [n][3][LANES], in place, after steps that `draws` [n_steps][n][3][LANES] holds normal
-// numbers for; `lost` [n][LANES]: what the bath gives of them.
+// Positions nm and velocities nm/ps [n][3][W], in place, after steps that `draws` [n_steps][n][3][W] holds normal
+// numbers for; `lost` [n][W]: what the bath gives of them.
 void langevin(const Network *net, const Bath *bath, const double *lost, double *positions, double *velocities,
               const float *draws, int64_t n_steps, float *work) {
     const int64_t n = net->n;
@@ -639,10 +639,10 @@ void langevin(const Network *net, const Bath *bath, const double *lost, double *
     D *x = (D *)positions, *v = (D *)velocities;
     const D *of_bath = (const D *)lost;
     const U *draw = (const U *)draws;
-    V *room = (V *)work + work_floats(n) / LANES - ROOM * n;
+    V *room = (V *)work + work_floats(n) / W - ROOM * n;
     D *gone = (D *)take(room, 6 * n), *bonds = (D *)take(room, 12 * n), *moving = (D *)take(room, 12 * n);
     D *off = (D *)take(room, 4 * n);
-    float *gradient = (float *)take(room, 3 * n), energy[N_MEMBERS * LANES];
+    float *gradient = (float *)take(room, 3 * n), energy[N_MEMBERS * W];
     rest(bath, n, v);
     for (int64_t step = 0; step < n_steps; step++) {
         evaluate(net, positions, energy, gradient, work);
