@@ -206,10 +206,10 @@ class PainetPotential(Surrogate):
         kept = math.exp(-self.config.friction_per_ps * dt)
         lost = math.sqrt(1.0 - kept * kept) * thermal
         rigid = self._rigid(molecule, dt)
-        if isinstance(simd := self.gradient(x, molecule), SimdPotential):
-            return simd.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
         share = masses / masses.sum()
         v = v - (share * v).sum(-2, keepdim=True)
+        if isinstance(simd := self.gradient(x, molecule), SimdPotential):
+            return simd.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
         for k in range(draw.shape[2]):
             v = v + dt * self.forces(x, molecule) / masses
             if rigid is not None:

@@ -1,8 +1,8 @@
 """The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
 
 `simd.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
-writing what a pair of atoms sees to memory, and moves the copies by it. This machine's C++ compiler makes it at first
-use, in seconds.
+writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
+md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from md_reference import simd as engine
 from surrogate.models.painet.attention import EnergyAttention
 from surrogate.models.painet.pairs import N_SHELLS
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import radial_grid
 from surrogate.models.painet.potential.energy import WALL, EnergyNetwork, Fabric, Look, Prepared
-from surrogate.models.painet.potential.rigid import ROUNDS, TOLERANCE, RigidBonds
+from surrogate.models.painet.potential.rigid import TOLERANCE, RigidBonds
 from systems.files.native import CompilerError, compiled_program
 
 _SOURCE = Path(__file__).with_name("simd.cpp")
@@ -48,9 +49,9 @@ class _Step(ctypes.Structure):
 
 class _Bath(ctypes.Structure):
     _fields_ = [
-        ("n_bonds", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("bonds", "length2", "per_mass", "inverse", "atoms")),
-        *((name, ctypes.c_double) for name in ("timestep", "kept", "unit")),
+        *((name, ctypes.c_int32) for name in ("n_atoms", "n_bonds")),
+        *((name, ctypes.c_void_p) for name in ("atoms", "bonds", "lengths")),
+        *((name, ctypes.c_double) for name in ("timestep", "keep", "noise", "tolerance")),
     ]
 
 
@@ -141,20 +142,21 @@ class SimdPotential:
         n_steps, 3) holds normal numbers for."""
         rows, width, n_steps = len(x), _width(len(x)), draw.shape[2]
         at, moving = _laid(x.double(), width), _laid(v.double(), width)
-        lost, draws = _laid(bath.lost.expand(rows, -1, 1), width), _laid(draw.transpose(1, 2).float(), width)
-        atoms = torch.cat([1.0 / bath.masses, bath.masses / bath.masses.sum()], dim=-1)
+        drawn = _laid((bath.lost[..., None] * draw).transpose(1, 2).float(), width)
+        # What the bath gives is drawn: no thermal speeds.
+        atoms = torch.cat([1.0 / bath.masses, torch.zeros_like(bath.masses)], dim=-1)
         if (rigid := bath.rigid) is None:
-            bonds, arrays = torch.zeros(0, 2, dtype=torch.int32), [atoms] * 4
+            bonds, lengths = torch.zeros(0, 2, dtype=torch.int32), atoms
         else:
             bonds = torch.stack([rigid.first, rigid.second], dim=-1).to(torch.int32)
-            arrays = [rigid.length2, rigid.per_mass.contiguous(), rigid.inverse.contiguous(), atoms]
-        places = (array.data_ptr() for array in (bonds, *arrays))
-        settings = _Bath(len(bonds), *places, bath.timestep_ps, bath.kept, self.unit)
+            lengths = rigid.length2.sqrt()
+        places = (array.data_ptr() for array in (atoms, bonds, lengths))
+        settings = _Bath(self.n_atoms, len(bonds), *places, bath.timestep_ps, bath.kept, 1.0, TOLERANCE)
 
         def compute(block: int, program: ctypes.CDLL, work: int) -> None:
-            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (lost, at, moving, draws)]
-            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), *of_block, ctypes.c_int64(n_steps),
-                             ctypes.c_void_p(work))  # fmt: skip
+            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (at, moving, drawn)]
+            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), ctypes.c_double(self.unit), *of_block,
+                             ctypes.c_int64(n_steps), ctypes.c_void_p(work))  # fmt: skip
 
         self._each_block(len(at), width, compute)
         return _back(at, rows), _back(moving, rows)
@@ -219,8 +221,7 @@ def _back(laid: Tensor, rows: int) -> Tensor:
 @lru_cache(maxsize=8)
 def _program(config: PotentialConfig, width: int) -> ctypes.CDLL:
     sizes = {name.upper(): getattr(config, name) for name in _SIZES}
-    rigid = {"RIGID_ROUNDS": ROUNDS, "RIGID_TOLERANCE": TOLERANCE}
-    program = compiled_program(_SOURCE, {"W": width, **sizes, **rigid})
+    program = compiled_program(_SOURCE, {"W": width, **sizes}, Path(engine.__path__[0]))
     program.work_floats.restype = ctypes.c_int64
     return program
 
