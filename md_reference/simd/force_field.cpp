@@ -9,7 +9,8 @@
 #include "water.h"
 
 struct System {
-    Bath bath;
+    Bath<float> bath;
+    RigidWaters rigid;
     Molecule molecule;
     Water water;
     Mesh mesh;
@@ -17,9 +18,11 @@ struct System {
     double constant;  // of the energy
 };
 
+static int n_atoms(const System *s) { return s->bath.n_atoms + 3 * s->rigid.n; }
+
 // Forces at x, and where `energy` is not null that of each replica.
 static void evaluate(const System *s, const V3 *x, V3 *f, double *energy) {
-    memset((void *)f, 0, sizeof(V3) * s->bath.n_atoms);
+    memset((void *)f, 0, sizeof(V3) * n_atoms(s));
     if (energy)
         for (int l = 0; l < W; l++) energy[l] = s->constant;
     bonded(&s->molecule, x, f, energy);
@@ -45,21 +48,22 @@ void forces(const System *s, const float *x, float *f, double *energy) {
 }
 
 int32_t constrain_velocities(const System *s, float *x, float *v) {
-    Replicas r = {(V3 *)x, 0, (V3 *)v, 0, 0, 0};
-    return slow(&s->bath, &r);
+    Replicas<float> r = {(V3 *)x, 0, (V3 *)v, 0, 0};
+    return slow(&s->bath, &s->rigid, &r);
 }
 
 // Returns 0, or 1 + the step at which rigid bonds could not be met. `room` is [2][n_atoms][3][W].
 int64_t step(const System *s, float *x, float *low, float *v, uint32_t *random, float *room, int64_t n_steps) {
-    const int n = s->bath.n_atoms;
-    Replicas r = {(V3 *)x, (V3 *)low, (V3 *)v, (V3 *)room, (V3 *)room + n, (Random *)random};
+    Replicas<float> r = {(V3 *)x, (V3 *)low, (V3 *)v, (V3 *)room, (V3 *)room + n_atoms(s)};
+    Streams *noise = (Streams *)random;
     for (int64_t k = 0; k < n_steps; k++) {
         if (s->periodic && k % s->listed_steps == 0) {
             trade(&s->water, r.x, r.low, r.v);
             list_pairs(&s->water, r.x);
         }
         evaluate(s, r.x, r.f, 0);
-        if (!advance(&s->bath, &r)) return k + 1;
+        if (!advance<false>(&s->bath, &r, noise)) return k + 1;
+        advance_waters(&s->bath, &s->rigid, &r, noise);
     }
     return 0;
 }

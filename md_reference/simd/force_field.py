@@ -50,13 +50,12 @@ def _all(kind: Any, *names: str) -> list[tuple[str, Any]]:
 _INT, _FLOAT, _POINTER = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 _Bath = _structure(
     "_Bath",
-    *_all(_INT, "n_atoms", "n_bonds", "n_waters"),
+    *_all(_INT, "n_atoms", "n_bonds"),
     *_all(_POINTER, "atoms", "bonds", "lengths"),
-    *_all(_FLOAT, "timestep", "keep", "noise"),
-    ("water", _FLOAT * 3),
-    ("legs", _FLOAT * 2),
-    ("inverse", _FLOAT * 9),
-    ("tolerance", _FLOAT),
+    *_all(_FLOAT, "timestep", "keep", "noise", "tolerance"),
+)
+_RigidWaters = _structure(
+    "_RigidWaters", ("n", _INT), ("masses", _FLOAT * 3), ("legs", _FLOAT * 2), ("inverse", _FLOAT * 9)
 )
 _Molecule = _structure(
     "_Molecule",
@@ -106,6 +105,7 @@ _Mesh = _structure(
 _System = _structure(
     "_System",
     ("bath", _Bath),
+    ("rigid", _RigidWaters),
     ("molecule", _Molecule),
     ("water", _Water),
     ("mesh", _Mesh),
@@ -187,9 +187,8 @@ class SimdReplicas:
         self._system = _System()
         self._fill(
             self._system.bath,
-            n_atoms=self.n_atoms,
+            n_atoms=terms.n_solute,
             n_bonds=len(terms.rigid),
-            n_waters=terms.n_waters,
             atoms=np.stack([1.0 / masses, speeds], axis=1),
             bonds=terms.rigid,
             lengths=terms.lengths,
@@ -197,8 +196,8 @@ class SimdReplicas:
             keep=keep,
             noise=math.sqrt(1.0 - keep * keep),
             tolerance=_TOLERANCE,
-            **terms.rigid_water,
         )
+        self._fill(self._system.rigid, n=terms.n_waters, **terms.rigid_water)
         self._biases = aligned((len(biased), 2, self.n_replicas))
         self._fill(
             self._system.molecule,

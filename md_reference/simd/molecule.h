@@ -21,19 +21,6 @@ struct Molecule {
 
 INLINE int64_t molecule_work(int64_t n) { return 4 * n + n * (n - 1); }
 
-#define BY_ELEMENT(name, function) \
-    INLINE V name(V a) { \
-        float in[W], out[W]; \
-        memcpy(in, &a, sizeof a); \
-        LANES out[l] = function(in[l]); \
-        memcpy(&a, out, sizeof a); \
-        return a; \
-    }
-BY_ELEMENT(exponential, expf)
-BY_ELEMENT(log_ratio, logf)
-BY_ELEMENT(hyperbolic, tanhf)
-BY_ELEMENT(arc_cosine, acosf)
-
 static void bonds(const Molecule *s, const V3 *x, V3 *f, double *energy) {
     for (int b = 0; b < s->n_bonds; b++) {
         const int i = s->bonds[2 * b], j = s->bonds[2 * b + 1];

@@ -336,7 +336,7 @@ def _rigid_triangle(terms: Terms, masses: FloatArray, legs: tuple[float, float])
         [-mh * (p @ s), mh * (q @ s), 2 * mh * (s @ s)],
     ])  # fmt: skip
     terms.rigid_water = {
-        "water": [oxygen, hydrogen, 1 / (oxygen + 2 * hydrogen)],
+        "masses": [oxygen, hydrogen, 1 / (oxygen + 2 * hydrogen)],
         "legs": legs,
         "inverse": np.linalg.inv(matrix),
     }

@@ -1,6 +1,7 @@
 // A register's worth of replicas: one number of each in a V, and the few functions that a compiler does not vectorise.
 //
 // W, the number of replicas, is 16 with AVX-512, 8 with AVX2 and 4 elsewhere (NEON, SSE), unless the compiler is told.
+// Where that is more than a register holds, a V is several.
 #pragma once
 #include <math.h>
 #include <stdint.h>
@@ -20,27 +21,42 @@
 #define W 4
 #endif
 #endif
-#define LANES _Pragma("omp simd") for (int l = 0; l < W; l++)
+#if W == 16 && defined(__AVX512F__)
+#define AVX512
+#elif W == 8 && defined(__AVX2__)
+#define AVX2
+#elif W == 4 && defined(__ARM_NEON)
+#define NEON
+#endif
 #define INLINE static inline __attribute__((always_inline))
 
 typedef float V __attribute__((vector_size(4 * W), may_alias));
 typedef int32_t I __attribute__((vector_size(4 * W), may_alias));
 typedef uint32_t U __attribute__((vector_size(4 * W), may_alias));
-typedef double D __attribute__((vector_size(8 * W), may_alias));
+// As numpy and torch lay arrays.
+typedef double D __attribute__((vector_size(8 * W), aligned(8), may_alias));
+typedef float Vu __attribute__((vector_size(4 * W), aligned(4), may_alias));
 typedef float V8 __attribute__((vector_size(32), may_alias));
 typedef float V8u __attribute__((vector_size(32), may_alias, aligned(4)));
-struct V3 { V x, y, z; };
+
+// A number for each replica in single or double precision, and a vector of three.
+template <class S> struct Register { typedef V type; };
+template <> struct Register<double> { typedef D type; };
+template <class S> using Each = typename Register<S>::type;
+template <class S> struct __attribute__((may_alias)) Three { Each<S> x, y, z; };
+typedef Three<float> V3;
 
 INLINE V splat(float a) { return a - (V){}; }
-INLINE V3 operator-(V3 a, V3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-INLINE V3 operator+(V3 a, V3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE V3 operator*(V s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
-INLINE V dot(V3 a, V3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class S> INLINE Three<S> operator-(Three<S> a, Three<S> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class S> INLINE Three<S> operator+(Three<S> a, Three<S> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class S> INLINE Three<S> operator*(Each<S> s, Three<S> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class S> INLINE Three<S> operator*(S s, Three<S> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class S> INLINE Each<S> dot(Three<S> a, Three<S> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 INLINE V3 cross(V3 a, V3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 
 // Keeps what was rounded from being reassociated by fast mathematics.
 INLINE V rounded(V a) {
-#if W == 16
+#ifdef AVX512
     asm("" : "+v"(a));
 #elif defined(__x86_64__)
     asm("" : "+x"(a));
@@ -53,9 +69,9 @@ INLINE V rounded(V a) {
 INLINE V nearest(V a) { return rounded(a + 12582912.0f) - 12582912.0f; }
 
 INLINE V root(V a) {
-#if W == 16
+#ifdef AVX512
     return (V)_mm512_sqrt_ps((__m512)a);
-#elif W == 8
+#elif defined(AVX2)
     return (V)_mm256_sqrt_ps((__m256)a);
 #else
     V b;
@@ -66,11 +82,11 @@ INLINE V root(V a) {
 
 // 1 / sqrt(a) to 1e-4 or better.
 INLINE V root_estimate(V a) {
-#if W == 16
+#ifdef AVX512
     return (V)_mm512_rsqrt14_ps((__m512)a);
-#elif W == 8
+#elif defined(AVX2)
     return (V)_mm256_rsqrt_ps((__m256)a);
-#elif defined(__ARM_NEON)
+#elif defined(NEON)
     const V y = (V)vrsqrteq_f32((float32x4_t)a);
     return 0.5f * y * (3.0f - a * y * y);
 #else
@@ -86,16 +102,18 @@ INLINE V two_over_root(V a) {
     return y * (3.0f - (a * y) * y);
 }
 
-INLINE float largest(V a) {
-    float most = a[0];
+template <class S> INLINE S largest(Each<S> a) {
+    S most = a[0];
     for (int l = 1; l < W; l++) most = a[l] > most ? a[l] : most;
     return most;
 }
 INLINE V larger(V a, V b) { return a > b ? a : b; }
+INLINE D larger(D a, D b) { return a > b ? a : b; }
 INLINE V smaller(V a, V b) { return a < b ? a : b; }
 INLINE V absolute(V a) { return (V)((I)a & 0x7fffffff); }
+INLINE D absolute(D a) { return a < 0.0 ? -a : a; }
 INLINE bool any(I mask) {
-#if W == 16
+#ifdef AVX512
     return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
 #else
     int32_t found = 0;
@@ -103,6 +121,20 @@ INLINE bool any(I mask) {
     return found != 0;
 #endif
 }
+
+// A function that the compiler knows for whole registers.
+#define BY_ELEMENT(name, function) \
+    INLINE V name(V a) { \
+        float in[W], out[W]; \
+        memcpy(in, &a, sizeof a); \
+        _Pragma("omp simd") for (int l = 0; l < W; l++) out[l] = function(in[l]); \
+        memcpy(&a, out, sizeof a); \
+        return a; \
+    }
+BY_ELEMENT(exponential, expf)
+BY_ELEMENT(log_ratio, logf)
+BY_ELEMENT(hyperbolic, tanhf)
+BY_ELEMENT(arc_cosine, acosf)
 
 INLINE void add_to(double *sum, V a) {
     for (int l = 0; l < W; l++) sum[l] += (double)a[l];

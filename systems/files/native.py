@@ -30,8 +30,11 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "surromd"
 
 
-def compiled_program(source: Path, macros: Mapping[str, float] | None = None) -> ctypes.CDLL:
-    """Compile `source` with these macros for this processor, once for each version of it, and load it.
+def compiled_program(
+    source: Path, macros: Mapping[str, float] | None = None, headers: Path | None = None
+) -> ctypes.CDLL:
+    """Compile `source` with these macros and the `headers` of a folder, else of its own, for this processor, once for
+    each version of them, and load it.
 
     Raises CompilerError, and OSError where nothing can be kept.
     """
@@ -42,7 +45,8 @@ def compiled_program(source: Path, macros: Mapping[str, float] | None = None) ->
     # What the compiler says that it is and calls this processor.
     asked = [compiler, "-march=native", "-v", "-E", "-x", "c++", os.devnull]
     said = subprocess.run(asked, capture_output=True, check=False).stderr
-    texts = [source.read_bytes(), *(header.read_bytes() for header in sorted(source.parent.glob("*.h")))]
+    headers = headers or source.parent
+    texts = [source.read_bytes(), *(header.read_bytes() for header in sorted(headers.glob("*.h")))]
     key = hashlib.sha256(b"\0".join([*texts, said, repr(flags).encode()])).hexdigest()[:16]
     path = cache_folder() / f"{source.stem}-{key}.so"
     if not path.exists():
@@ -50,7 +54,7 @@ def compiled_program(source: Path, macros: Mapping[str, float] | None = None) ->
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             part = Path(folder) / path.name
             compiled = f"{part}.o"
-            for step in ([*flags, "-o", compiled, str(source)], ["-shared", "-o", str(part), compiled]):
+            for step in ([*flags, f"-I{headers}", "-o", compiled, str(source)], ["-shared", "-o", str(part), compiled]):
                 done = subprocess.run([compiler, *step], capture_output=True, text=True, check=False)
                 if done.returncode:
                     lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

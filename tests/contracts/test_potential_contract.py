@@ -15,13 +15,13 @@ from surrogate.models.conformance import SurrogateContract, branched_chain, orth
 from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.painet.attention import pair_energy
 from surrogate.models.painet.potential import energy as room
-from surrogate.models.painet.potential import lanes
+from surrogate.models.painet.potential import simd
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import bonded_shells, find_edges
 from surrogate.models.painet.potential.energy import latent_energy
-from surrogate.models.painet.potential.lanes import lanes_of
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.rigid import RigidBonds
+from surrogate.models.painet.potential.simd import simd_potential_of
 from systems.errors import InputError
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4,
@@ -100,13 +100,13 @@ needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c+
 @needs_compiler
 @pytest.mark.parametrize("config", SIZES)
 @pytest.mark.parametrize("rows", [1, 5, 33])
-def test_forces_in_lanes_are_those_of_torch(config: PotentialConfig, rows: int) -> None:
+def test_forces_by_simd_are_those_of_torch(config: PotentialConfig, rows: int) -> None:
     molecule, model, x = branched_chain(9), lively(config), walks(9, rows)
     # Walls that some pairs stand in.
     model.network.nearest_nm.fill_(0.12)
     model.network.farthest_nm.fill_(0.4)
-    in_lanes = model.gradient(x, molecule)
-    members, gradient = in_lanes(x)
+    by_simd = model.gradient(x, molecule)
+    members, gradient = by_simd(x)
     exact = lively(config)
     exact.load_state_dict(model.state_dict())
     exact = exact.double()
@@ -116,7 +116,7 @@ def test_forces_in_lanes_are_those_of_torch(config: PotentialConfig, rows: int) 
     torch.testing.assert_close(members, expected.members_kj_mol, rtol=1e-5, atol=1e-2)
     assert (gradient + expected.forces_kj_mol_nm).abs().max() < 1e-4 * scale
     # A frame does not depend on those beside it.
-    torch.testing.assert_close(in_lanes(x[:1].repeat(rows, 1, 1))[1][-1], gradient[0], rtol=0, atol=0)
+    torch.testing.assert_close(by_simd(x[:1].repeat(rows, 1, 1))[1][-1], gradient[0], rtol=0, atol=0)
     # Negative control: torch's own single precision is no nearer.
     plain = model.evaluate(x, model.fabric(molecule)).forces_kj_mol_nm
     assert 0.0 < (plain - expected.forces_kj_mol_nm).abs().max() < 1e-4 * scale
@@ -125,7 +125,7 @@ def test_forces_in_lanes_are_those_of_torch(config: PotentialConfig, rows: int) 
 @needs_compiler
 @pytest.mark.parametrize("rows", [2, 19])
 @pytest.mark.parametrize("timestep_ps", [0.001, 0.004])
-def test_steps_in_lanes_are_those_of_torch(timestep_ps: float, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_by_simd_are_those_of_torch(timestep_ps: float, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(SMALL, timestep_ps=timestep_ps, lag_ps=timestep_ps, hydrogen_mass_da=3.0, friction_per_ps=20.0)
     elements = torch.tensor([6, 6, 8, 1, 1, 1, 1, 1, 1])
     bonds = torch.tensor([(0, 1), (1, 2), (0, 3), (0, 4), (0, 5), (1, 6), (1, 7), (2, 8)])
@@ -148,7 +148,7 @@ def test_steps_in_lanes_are_those_of_torch(timestep_ps: float, rows: int, monkey
 
     found = moved(lively(config))
     with monkeypatch.context() as without:
-        without.setattr("surrogate.models.painet.potential.model.lanes_of", lambda *_, **__: None)
+        without.setattr("surrogate.models.painet.potential.model.simd_potential_of", lambda *_, **__: None)
         expected = moved(lively(config))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float((other - other.mean(0)).abs().max()))
@@ -172,21 +172,21 @@ def test_frames_stay_as_they_were_when_the_next_are_made(rows: int) -> None:
 
 
 @needs_compiler
-def test_lanes_are_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    def in_lanes(model: PainetPotential, n_atoms: int) -> bool:
+def test_simd_is_for_single_precision_few_atoms_and_a_model_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def by_simd(model: PainetPotential, n_atoms: int) -> bool:
         x, molecule = walks(n_atoms), branched_chain(n_atoms)
         made = model.network.prepare(fabric := model.fabric(molecule), x)
-        found = lanes_of(model.network, fabric, made, len(x)) is not None
+        found = simd_potential_of(model.network, fabric, made, len(x)) is not None
         torch.testing.assert_close(
             model.forces(x, molecule).float(), evaluated(model, x, molecule)[1].float(), rtol=1e-4, atol=0.05
         )
         return found
 
-    assert in_lanes(lively(), 9)
-    assert not in_lanes(lively().double(), 9) and not in_lanes(lively(), 80)
+    assert by_simd(lively(), 9)
+    assert not by_simd(lively().double(), 9) and not by_simd(lively(), 80)
     monkeypatch.setenv("PATH", "")
-    lanes._program.cache_clear()
-    assert not in_lanes(lively(), 9), "without a compiler"
+    simd._program.cache_clear()
+    assert not by_simd(lively(), 9), "without a compiler"
 
 
 @needs_compiler

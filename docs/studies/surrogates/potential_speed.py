@@ -1,4 +1,4 @@
-"""What a force of PAINET as a potential costs, by torch and in lanes, alone and in batches, beside GFN2-xTB's, in
+"""What a force of PAINET as a potential costs, by torch and by SIMD, alone and in batches, beside GFN2-xTB's, in
 processor time of one core (the least of several).
 
     python docs/studies/surrogates/potential_speed.py [--batches 1,32,256] [SMILES...]
@@ -63,7 +63,7 @@ def main() -> None:
             x = at + 0.003 * torch.randn(rows, *at.shape[1:], dtype=at.dtype)
             by_torch = gradient_of(partial(model.members, fabric=fabric, made=made))
             costs = [least_ms(partial(force, x)) / rows for force in (by_torch, model.gradient(x, molecule))]
-            line.append(f"batch {rows}: " + ", in lanes ".join(f"{cost:.3g}" for cost in costs))
+            line.append(f"batch {rows}: " + ", by SIMD ".join(f"{cost:.3g}" for cost in costs))
         sys.stdout.write("; ".join(line) + "\n")
         sys.stdout.flush()
 

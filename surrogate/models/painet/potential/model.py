@@ -15,8 +15,8 @@ from surrogate.models.painet.potential.config import LONGEST_FLEXIBLE_PS, Potent
 from surrogate.models.painet.potential.edges import FEW_ATOMS
 from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
 from surrogate.models.painet.potential.gradient import GradientFn, gradient_of
-from surrogate.models.painet.potential.lanes import Bath, Lanes, lanes_of
 from surrogate.models.painet.potential.rigid import RigidBonds
+from surrogate.models.painet.potential.simd import Bath, SimdPotential, simd_potential_of
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
@@ -176,7 +176,7 @@ class PainetPotential(Surrogate):
         return -self.gradient(positions_nm, molecule)(positions_nm)[1]
 
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
-        """Return what computes the members' energies and their mean's gradient at frames like these: in lanes where
+        """Return what computes the members' energies and their mean's gradient at frames like these: by SIMD where
         they run, else by torch."""
         known = self._known
         # Above so many atoms pairs change from frame to frame.
@@ -184,16 +184,16 @@ class PainetPotential(Surrogate):
             fabric = self.fabric(molecule)
             with torch.inference_mode(False), torch.no_grad():
                 made = self.network.prepare(fabric, positions_nm)
-            lanes = self._in_lanes(fabric, made, len(positions_nm))
-            known = molecule, lanes or gradient_of(lambda x: self.members(x, fabric, made))
+            simd = self._by_simd(fabric, made, len(positions_nm))
+            known = molecule, simd or gradient_of(lambda x: self.members(x, fabric, made))
             self._known = known
         return known[1]
 
-    def _in_lanes(self, fabric: Fabric, made: Prepared, rows: int) -> Lanes | None:
+    def _by_simd(self, fabric: Fabric, made: Prepared, rows: int) -> SimdPotential | None:
         if self.training:
             return None
         unit, zero = float(self.energy_scale_kj_mol), float(self.energy_offset_kj_mol)
-        return lanes_of(self.network, fabric, made, rows, unit=unit, zero=zero)
+        return simd_potential_of(self.network, fabric, made, rows, unit=unit, zero=zero)
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -206,10 +206,10 @@ class PainetPotential(Surrogate):
         kept = math.exp(-self.config.friction_per_ps * dt)
         lost = math.sqrt(1.0 - kept * kept) * thermal
         rigid = self._rigid(molecule, dt)
-        if isinstance(lanes := self.gradient(x, molecule), Lanes):
-            return lanes.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
         share = masses / masses.sum()
         v = v - (share * v).sum(-2, keepdim=True)
+        if isinstance(simd := self.gradient(x, molecule), SimdPotential):
+            return simd.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
         for k in range(draw.shape[2]):
             v = v + dt * self.forces(x, molecule) / masses
             if rigid is not None:

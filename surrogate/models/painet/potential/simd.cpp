@@ -1,35 +1,20 @@
-// Energy and gradient of PAINET as a potential in lanes: LANES copies of one molecule, one in each element of a vector
+// Energy and gradient of PAINET as a potential by SIMD: W copies of one molecule, one in each element of a vector
 // register. What it computes, and in which order, is `energy.py`; the gradient is that of its every step, backwards.
 //
-// `langevin` moves the copies by it, in double precision. A value is a V, or a D: one number for each copy. Arrays are
-// [..][LANES]; weights are the same for all copies. Sizes of the network come as macros from lanes.py, which compiles this
-// at first use. No copy depends on the others, but for the number of rounds that rigid bonds take.
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
+// `langevin` moves the copies by it and by the bath of md_reference/simd, in double precision. A value is a V, or a D: one
+// number for each copy. Arrays are [..][W]; weights are the same for all copies. Sizes of the network come as macros from
+// simd.py, which compiles this at first use. No copy depends on the others, but for the number of rounds that rigid bonds
+// take.
+#include "bath.h"
 
 #define N_SENT (N_SCALARS + N_VECTORS)
 #define N_FOUND (N_SCALARS + N_VECTORS + N_TENSORS)
 #define N_EDGE (N_STEPS * N_FOUND + N_MEMBERS)
 #define N_ATTENDED (N_HEADS * HEAD_DIM)
 
-typedef float V __attribute__((vector_size(4 * LANES), may_alias));
-// As numpy and torch lay arrays.
-typedef double D __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
-typedef float U __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
-
 static const float HALF_WIDTH = 2.5f, SOFTENING_NM2 = 1e-8f, ROOT_TWO = 1.41421356f, LEAST_NORM = 1e-12f;
 
 struct Linear { const float *weight, *turned, *bias; };  // [out][in], [in][out], [out]
-
-// Rigid bonds, in the words of rigid.py, and the bath.
-struct Bath {
-    int64_t n_bonds;
-    const int32_t *bonds;  // [n_bonds][2]
-    const double *length2, *per_mass, *inverse;  // [n_bonds], [n_bonds][2], [n_bonds][n_bonds]
-    const double *atoms;   // [n][2]: 1/mass, share of the molecule's
-    double timestep, kept, unit;
-};
 
 struct Step {
     Linear send, first, second, third, qkv, out;
@@ -63,20 +48,18 @@ static inline V *take(V *&work, int64_t n) {
     return found;
 }
 
-static inline V splat(float a) { return a - (V){}; }
-
-static inline V above_zero(V a) { return a > 0.0f ? a : splat(0.0f); }
+INLINE V above_zero(V a) { return larger(a, splat(0.0f)); }
 
 static void silu(const V *x, V *y, int64_t n) {
     const float *a = (const float *)x;
     float *b = (float *)y;
-    _Pragma("omp simd") for (int64_t k = 0; k < n * LANES; k++) b[k] = a[k] / (1.0f + expf(-a[k]));
+    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) b[k] = a[k] / (1.0f + expf(-a[k]));
 }
 
 static void silu_back(const V *x, V *dy, int64_t n) {
     const float *a = (const float *)x;
     float *d = (float *)dy;
-    _Pragma("omp simd") for (int64_t k = 0; k < n * LANES; k++) {
+    _Pragma("omp simd") for (int64_t k = 0; k < n * W; k++) {
         const float g = 1.0f / (1.0f + expf(-a[k]));
         d[k] *= g * (1.0f + a[k] * (1.0f - g));
     }
@@ -135,10 +118,7 @@ static void measure(const Network *net, const D *x, Edge *edges, V *energy) {
                 e->apart[a] = __builtin_convertvector(x[3 * i + a] - x[3 * j + a], V);
                 square += e->apart[a] * e->apart[a];
             }
-            for (int l = 0; l < LANES; l++) e->distance[l] = sqrtf(square[l]);
-            float *log_d = (float *)&e->log;
-            const float *d = (const float *)&e->distance;
-            _Pragma("omp simd") for (int l = 0; l < LANES; l++) log_d[l] = logf(d[l]);
+            e->distance = root(square), e->log = log_ratio(e->distance);
             const V inside = above_zero(1.0f - p[2] * e->distance * e->distance), cube = inside * inside * inside;
             for (int k = 0; k < N_RADIAL; k++) {
                 const V u = ((e->log - p[0]) * p[1] - (float)k) / HALF_WIDTH, bump = above_zero(1.0f - u * u);
@@ -151,7 +131,7 @@ static void measure(const Network *net, const D *x, Edge *edges, V *energy) {
         }
 }
 
-static void measure_back(const Network *net, const Edge *edges, const V *d_radial, const V *d_shape, U *grad) {
+static void measure_back(const Network *net, const Edge *edges, const V *d_radial, const V *d_shape, Vu *grad) {
     const int64_t n = net->n;
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++) {
@@ -320,9 +300,7 @@ static inline V dot(const V *a, const V *b) {
 
 // Vectors of unit length, in place, and what they were long.
 static void normalise(V *q, V *norm) {
-    const V square = dot(q, q);
-    for (int l = 0; l < LANES; l++) (*norm)[l] = sqrtf(square[l]);
-    *norm = *norm > LEAST_NORM ? *norm : splat(LEAST_NORM);
+    *norm = larger(root(dot(q, q)), splat(LEAST_NORM));
     for (int d = 0; d < HEAD_DIM; d++) q[d] /= *norm;
 }
 
@@ -496,8 +474,17 @@ static int64_t laid_out(int64_t n, V *work, Kept *kept, Back *b, Edge **edges, V
     return work - begin;
 }
 
-// Of an atom, what `langevin` needs beside: a hydrogen has no more than two bonds.
-#define ROOM 37
+// What the bath gives velocities in a step, as it was drawn: [n][3][W].
+struct Given {
+    const Vu *drawn;
+    __attribute__((always_inline)) Three<double> operator()(const Bath<double> *, int atom) const {
+        const Vu *d = drawn + 3 * atom;
+        return {__builtin_convertvector(d[0], D), __builtin_convertvector(d[1], D), __builtin_convertvector(d[2], D)};
+    }
+};
+
+// Of an atom, what `langevin` needs beside: a gradient, in double precision forces and moves.
+#define ROOM 15
 
 extern "C" {
 
@@ -506,10 +493,10 @@ int64_t work_floats(int64_t n) {
     Back b;
     Edge *edges;
     V *x, *h, *carried, *scratch;
-    return LANES * (laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch) + ROOM * n);
+    return W * (laid_out(n, 0, kept, &b, &edges, &x, &h, &carried, &scratch) + ROOM * n);
 }
 
-// `positions` [n][3][LANES] nm -> the members' `energy` [N_MEMBERS][LANES] and the `gradient` [n][3][LANES] of their mean,
+// `positions` [n][3][W] nm -> the members' `energy` [N_MEMBERS][W] and the `gradient` [n][3][W] of their mean,
 // per nm, in the network's unit.
 void evaluate(const Network *net, const double *positions, float *energy, float *gradient, float *work) {
     const int64_t n = net->n;
@@ -518,7 +505,7 @@ void evaluate(const Network *net, const double *positions, float *energy, float 
     Back b;
     Edge *edges;
     V *x, *h, *carried, *scratch, walls = splat(0.0f), of_heads[N_HEADS], total[N_MEMBERS];
-    U *grad = (U *)gradient;
+    Vu *grad = (Vu *)gradient;
     laid_out(n, (V *)work, kept, &b, &edges, &x, &h, &carried, &scratch);
     for (int a = 0; a < 3; a++) {
         D mean = {};
@@ -570,100 +557,22 @@ void evaluate(const Network *net, const double *positions, float *energy, float 
     memcpy(energy, total, sizeof total);
 }
 
-// `moving` and `off` are room for a vector and a value of each bond.
-static void along(const Bath *bath, const D *x, D *out) {
-    for (int64_t k = 0; k < bath->n_bonds; k++)
-        for (int a = 0; a < 3; a++) out[3 * k + a] = x[3 * bath->bonds[2 * k] + a] - x[3 * bath->bonds[2 * k + 1] + a];
-}
-
-static inline D dot3(const D *a, const D *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-// Moves atoms along bonds by what meets `off`, for all bonds at once.
-static void correct(const Bath *bath, const D *bonds, const D *off, D *x) {
-    for (int64_t k = 0; k < bath->n_bonds; k++) {
-        D step = {};
-        for (int64_t m = 0; m < bath->n_bonds; m++) step += off[m] * bath->inverse[m * bath->n_bonds + k];
-        for (int a = 0; a < 3; a++) {
-            x[3 * bath->bonds[2 * k] + a] += step * bonds[3 * k + a] * bath->per_mass[2 * k];
-            x[3 * bath->bonds[2 * k + 1] + a] -= step * bonds[3 * k + a] * bath->per_mass[2 * k + 1];
-        }
-    }
-}
-
-static bool beyond(const D off, double limit) {
-    double most = 0.0;
-    for (int l = 0; l < LANES; l++) most = fabs(off[l]) > most ? fabs(off[l]) : most;
-    return most > limit;
-}
-
-static void project(const Bath *bath, const D *bonds, D *v, D *moving, D *off) {
-    for (int round = 0; round < RIGID_ROUNDS; round++) {
-        bool any = false;
-        along(bath, v, moving);
-        for (int64_t k = 0; k < bath->n_bonds; k++) {
-            off[k] = -dot3(bonds + 3 * k, moving + 3 * k);
-            any |= beyond(off[k], RIGID_TOLERANCE);
-        }
-        if (!any) return;
-        correct(bath, bonds, off, v);
-    }
-}
-
-static void place(const Bath *bath, const D *bonds, D *x, D *moving, D *off) {
-    for (int round = 0; round < RIGID_ROUNDS; round++) {
-        bool any = false;
-        along(bath, x, moving);
-        for (int64_t k = 0; k < bath->n_bonds; k++) {
-            off[k] = 0.5 * (bath->length2[k] - dot3(moving + 3 * k, moving + 3 * k));
-            any |= beyond(off[k], RIGID_TOLERANCE * bath->length2[k]);
-        }
-        if (!any) return;
-        correct(bath, bonds, off, x);
-    }
-}
-
-static void rest(const Bath *bath, int64_t n, D *v) {
-    for (int a = 0; a < 3; a++) {
-        D mean = {};
-        for (int64_t i = 0; i < n; i++) mean += bath->atoms[2 * i + 1] * v[3 * i + a];
-        for (int64_t i = 0; i < n; i++) v[3 * i + a] -= mean;
-    }
-}
-
-// Positions nm and velocities nm/ps [n][3][LANES], in place, after steps that `draws` [n_steps][n][3][LANES] holds normal
-// numbers for; `lost` [n][LANES]: what the bath gives of them.
-void langevin(const Network *net, const Bath *bath, const double *lost, double *positions, double *velocities,
-              const float *draws, int64_t n_steps, float *work) {
+// Positions nm and velocities nm/ps [n][3][W], in place, after steps in which the bath gives velocities what is `drawn`
+// [n_steps][n][3][W]; `unit` of the network's energy, kJ/mol. The centre of mass is at rest.
+void langevin(const Network *net, const Bath<double> *bath, double unit, double *positions, double *velocities,
+              const float *drawn, int64_t n_steps, float *work) {
     const int64_t n = net->n;
-    const double dt = bath->timestep;
-    D *x = (D *)positions, *v = (D *)velocities;
-    const D *of_bath = (const D *)lost;
-    const U *draw = (const U *)draws;
-    V *room = (V *)work + work_floats(n) / LANES - ROOM * n;
-    D *gone = (D *)take(room, 6 * n), *bonds = (D *)take(room, 12 * n), *moving = (D *)take(room, 12 * n);
-    D *off = (D *)take(room, 4 * n);
-    float *gradient = (float *)take(room, 3 * n), energy[N_MEMBERS * LANES];
-    rest(bath, n, v);
+    V *room = (V *)work + work_floats(n) / W - ROOM * n;
+    float *gradient = (float *)take(room, 3 * n), energy[N_MEMBERS * W];
+    D *force = (D *)take(room, 6 * n), *move = (D *)take(room, 6 * n);
+    typedef Three<double> D3;
+    const Replicas<double> r = {(D3 *)positions, 0, (D3 *)velocities, (D3 *)force, (D3 *)move};
     for (int64_t step = 0; step < n_steps; step++) {
         evaluate(net, positions, energy, gradient, work);
-        const U *g = (const U *)gradient;
-        for (int64_t i = 0; i < n; i++)
-            for (int a = 0; a < 3; a++)
-                v[3 * i + a] -= dt * bath->unit * bath->atoms[2 * i] * __builtin_convertvector(g[3 * i + a], D);
-        if (bath->n_bonds) {
-            along(bath, x, bonds);
-            project(bath, bonds, v, moving, off);
-        }
-        for (int64_t i = 0; i < n; i++)
-            for (int a = 0; a < 3; a++) {
-                x[3 * i + a] += 0.5 * dt * v[3 * i + a];
-                v[3 * i + a] = bath->kept * v[3 * i + a] + of_bath[i] * __builtin_convertvector(*draw++, D);
-            }
-        rest(bath, n, v);
-        for (int64_t k = 0; k < 3 * n; k++) gone[k] = x[k] += 0.5 * dt * v[k];
-        if (!bath->n_bonds) continue;
-        place(bath, bonds, x, moving, off);
-        for (int64_t k = 0; k < 3 * n; k++) v[k] += (x[k] - gone[k]) / dt;
+        for (int64_t k = 0; k < 3 * n; k++) force[k] = -unit * __builtin_convertvector(((const Vu *)gradient)[k], D);
+        Given given = {(const Vu *)drawn + step * 3 * n};
+        // Copies whose bonds cannot be met go on as far as they came.
+        advance<true>(bath, &r, &given);
     }
 }
 }

@@ -1,8 +1,8 @@
-"""The potential in lanes: copies of a molecule at once, each in its lane of the processor's vector registers.
+"""The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
 
-`lanes.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
-writing what a pair of atoms sees to memory, and moves the copies by it. This machine's C++ compiler makes it at first
-use, in seconds.
+`simd.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
+writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
+md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from md_reference import simd as engine
 from surrogate.models.painet.attention import EnergyAttention
 from surrogate.models.painet.pairs import N_SHELLS
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.edges import radial_grid
 from surrogate.models.painet.potential.energy import WALL, EnergyNetwork, Fabric, Look, Prepared
-from surrogate.models.painet.potential.rigid import ROUNDS, TOLERANCE, RigidBonds
+from surrogate.models.painet.potential.rigid import TOLERANCE, RigidBonds
 from systems.files.native import CompilerError, compiled_program
 
-_SOURCE = Path(__file__).with_name("lanes.cpp")
+_SOURCE = Path(__file__).with_name("simd.cpp")
 _SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", "n_heads", "head_dim", "n_members")
 # Copies at once: of a whole register, and where no more are asked for; of the register in bytes.
-_LANES, _FEW_LANES, _ALIGNED = 16, 4, 64
+_WIDTH, _FEW, _ALIGNED = 16, 4, 64
 _LEAST_NM = 1e-3
 
 
@@ -48,9 +49,9 @@ class _Step(ctypes.Structure):
 
 class _Bath(ctypes.Structure):
     _fields_ = [
-        ("n_bonds", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("bonds", "length2", "per_mass", "inverse", "atoms")),
-        *((name, ctypes.c_double) for name in ("timestep", "kept", "unit")),
+        *((name, ctypes.c_int32) for name in ("n_atoms", "n_bonds")),
+        *((name, ctypes.c_void_p) for name in ("atoms", "bonds", "lengths")),
+        *((name, ctypes.c_double) for name in ("timestep", "keep", "noise", "tolerance")),
     ]
 
 
@@ -66,7 +67,7 @@ class Bath:
     rigid: RigidBonds | None
 
 
-class Lanes:
+class SimdPotential:
     """Frames `(rows, n_atoms, 3)` nm of one molecule -> the members' energies `(rows, n_members)` in kJ/mol and the
     gradient `(rows, n_atoms, 3)` of their mean, by the network's weights as they are now, times `unit` and from `zero`,
     both in kJ/mol."""
@@ -117,21 +118,21 @@ class Lanes:
             WALL,
         )
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Lanes:
+    def __deepcopy__(self, memo: dict[int, Any]) -> SimdPotential:
         return self  # pointers into arrays that never change
 
     @torch.no_grad()
     def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
-        rows, lanes = len(positions_nm), _width(len(positions_nm))
-        x = _laid(positions_nm.double(), lanes)
-        energy = torch.empty(len(x), self.config.n_members, lanes)
-        gradient = torch.empty(len(x), self.n_atoms, 3, lanes)
+        rows, width = len(positions_nm), _width(len(positions_nm))
+        x = _laid(positions_nm.double(), width)
+        energy = torch.empty(len(x), self.config.n_members, width)
+        gradient = torch.empty(len(x), self.n_atoms, 3, width)
 
         def compute(block: int, program: ctypes.CDLL, work: int) -> None:
             places = (x[block].data_ptr(), energy[block].data_ptr(), gradient[block].data_ptr(), work)
             program.evaluate(ctypes.byref(self._network), *map(ctypes.c_void_p, places))
 
-        self._each_block(len(x), lanes, compute)
+        self._each_block(len(x), width, compute)
         members = energy.transpose(1, 2).flatten(0, 1)[:rows].double()
         return self.zero + self.unit * members, self.unit * _back(gradient, rows).double()
 
@@ -139,34 +140,35 @@ class Lanes:
     def langevin(self, x: Tensor, v: Tensor, draw: Tensor, bath: Bath) -> tuple[Tensor, Tensor]:
         """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
         n_steps, 3) holds normal numbers for."""
-        rows, lanes, n_steps = len(x), _width(len(x)), draw.shape[2]
-        at, moving = _laid(x.double(), lanes), _laid(v.double(), lanes)
-        lost, draws = _laid(bath.lost.expand(rows, -1, 1), lanes), _laid(draw.transpose(1, 2).float(), lanes)
-        atoms = torch.cat([1.0 / bath.masses, bath.masses / bath.masses.sum()], dim=-1)
+        rows, width, n_steps = len(x), _width(len(x)), draw.shape[2]
+        at, moving = _laid(x.double(), width), _laid(v.double(), width)
+        drawn = _laid((bath.lost[..., None] * draw).transpose(1, 2).float(), width)
+        # What the bath gives is drawn: no thermal speeds.
+        atoms = torch.cat([1.0 / bath.masses, torch.zeros_like(bath.masses)], dim=-1)
         if (rigid := bath.rigid) is None:
-            bonds, arrays = torch.zeros(0, 2, dtype=torch.int32), [atoms] * 4
+            bonds, lengths = torch.zeros(0, 2, dtype=torch.int32), atoms
         else:
             bonds = torch.stack([rigid.first, rigid.second], dim=-1).to(torch.int32)
-            arrays = [rigid.length2, rigid.per_mass.contiguous(), rigid.inverse.contiguous(), atoms]
-        places = (array.data_ptr() for array in (bonds, *arrays))
-        settings = _Bath(len(bonds), *places, bath.timestep_ps, bath.kept, self.unit)
+            lengths = rigid.length2.sqrt()
+        places = (array.data_ptr() for array in (atoms, bonds, lengths))
+        settings = _Bath(self.n_atoms, len(bonds), *places, bath.timestep_ps, bath.kept, 1.0, TOLERANCE)
 
         def compute(block: int, program: ctypes.CDLL, work: int) -> None:
-            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (lost, at, moving, draws)]
-            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), *of_block, ctypes.c_int64(n_steps),
-                             ctypes.c_void_p(work))  # fmt: skip
+            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (at, moving, drawn)]
+            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), ctypes.c_double(self.unit), *of_block,
+                             ctypes.c_int64(n_steps), ctypes.c_void_p(work))  # fmt: skip
 
-        self._each_block(len(at), lanes, compute)
+        self._each_block(len(at), width, compute)
         return _back(at, rows), _back(moving, rows)
 
-    def _each_block(self, n_blocks: int, lanes: int, compute: Callable[[int, ctypes.CDLL, int], None]) -> None:
+    def _each_block(self, n_blocks: int, width: int, compute: Callable[[int, ctypes.CDLL, int], None]) -> None:
         """Call `compute(block, program, room to work in)` for each block of copies, on as many cores as torch takes."""
-        program, n_threads = _program(self.config, lanes), min(torch.get_num_threads(), n_blocks)
+        program, n_threads = _program(self.config, width), min(torch.get_num_threads(), n_blocks)
 
         def some(thread: int) -> None:
-            if (work := self._work.get((lanes, thread))) is None:
+            if (work := self._work.get((width, thread))) is None:
                 work = _aligned(int(program.work_floats(ctypes.c_int64(self.n_atoms))))
-                self._work[lanes, thread] = work
+                self._work[width, thread] = work
             for block in range(thread, n_blocks, n_threads):
                 compute(block, program, work.ctypes.data)
 
@@ -185,31 +187,31 @@ class Lanes:
         return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
 
 
-def lanes_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int, *, unit: float = 1.0, zero: float = 0.0
-             ) -> Lanes | None:  # fmt: skip
-    """Return the potential in lanes, compiled for so many frames; None where it does not run in them: not in single
-    precision on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
+def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int, *, unit: float = 1.0,
+                      zero: float = 0.0) -> SimdPotential | None:  # fmt: skip
+    """Return the potential by SIMD, compiled for so many frames; None where it does not run so: not in single precision
+    on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
     if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
         return None
     try:
         _program(network.config, _width(rows))
     except (CompilerError, OSError):
         return None
-    return Lanes(network, fabric, made, unit, zero)
+    return SimdPotential(network, fabric, made, unit, zero)
 
 
 def _width(rows: int) -> int:
-    return _LANES if rows > _FEW_LANES else _FEW_LANES
+    return _WIDTH if rows > _FEW else _FEW
 
 
-def _laid(values: Tensor, lanes: int) -> Tensor:
-    """`values` (rows, ..) -> (blocks, .., lanes), a copy, which the program moves in place; lanes that have no row
+def _laid(values: Tensor, width: int) -> Tensor:
+    """`values` (rows, ..) -> (blocks, .., width), a copy, which the program moves in place; places that have no row
     hold the last."""
-    n_blocks = -(-len(values) // lanes)
-    if n_blocks * lanes > len(values):
-        values = values[torch.arange(n_blocks * lanes).clamp(max=len(values) - 1)]
+    n_blocks = -(-len(values) // width)
+    if n_blocks * width > len(values):
+        values = values[torch.arange(n_blocks * width).clamp(max=len(values) - 1)]
     # One whole block that comes `_back` from here lies as it is wanted: `contiguous` would not copy it.
-    return values.unflatten(0, (n_blocks, lanes)).movedim(1, -1).clone(memory_format=torch.contiguous_format)
+    return values.unflatten(0, (n_blocks, width)).movedim(1, -1).clone(memory_format=torch.contiguous_format)
 
 
 def _back(laid: Tensor, rows: int) -> Tensor:
@@ -217,17 +219,16 @@ def _back(laid: Tensor, rows: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _program(config: PotentialConfig, lanes: int) -> ctypes.CDLL:
+def _program(config: PotentialConfig, width: int) -> ctypes.CDLL:
     sizes = {name.upper(): getattr(config, name) for name in _SIZES}
-    rigid = {"RIGID_ROUNDS": ROUNDS, "RIGID_TOLERANCE": TOLERANCE}
-    program = compiled_program(_SOURCE, {"LANES": lanes, **sizes, **rigid})
+    program = compiled_program(_SOURCE, {"W": width, **sizes}, Path(engine.__path__[0]))
     program.work_floats.restype = ctypes.c_int64
     return program
 
 
 @lru_cache(maxsize=1)
 def _pool(n_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(n_threads, "lanes")
+    return ThreadPoolExecutor(n_threads, "simd")
 
 
 def _aligned(n_floats: int) -> npt.NDArray[Any]:
