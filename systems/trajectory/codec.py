@@ -105,6 +105,10 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
 
         if not is_plain_h5md(path):
             return Hdf5Reader(path, top)
+    if is_hdf5 or path.suffix.lower() == ".h5md":
+        from systems.trajectory.h5md_file import H5mdReader
+
+        return H5mdReader(path, top)
     if path.suffix.lower() == ".dcd":
         from systems.trajectory.dcd_file import DcdReader
 
@@ -119,7 +123,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         return XyzReader(path, top)
     from systems.trajectory.foreign_scenes import is_mdtraj_format
 
-    if is_mdtraj_format(path) and not is_hdf5:
+    if is_mdtraj_format(path):
         from systems.trajectory.foreign_readers import MdtrajReader
 
         return MdtrajReader(path, top)

@@ -193,8 +193,7 @@ class MdanalysisReader(TrajectoryReader):
         if not path.exists():
             raise TrajectoryError(f"{path} does not exist.")
         self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
-        # What reaches this reader with an HDF5 suffix is H5MD.
-        self._format = format_of(path) if path.suffix.lower() not in (".h5", ".hdf5") else format_of(Path(".h5md"))
+        self._format = format_of(path)
         self.notes = unit_note(self._format)
         self._kept: IntArray | None = None
         stated = None

@@ -70,7 +70,7 @@ FORMATS = (
     Format("HOOMD XML", (".hoomdxml",), "MDTraj", NONE, NONE, EVERY, "types, bonds",
            _COUNTED + "; nm", unit_taken="nm"),
     Format("OpenMM XML", (".xml",), "MDTraj", NONE, "nm", SOME, NONE, _COUNTED),
-    Format("H5MD", (".h5md",), "MDAnalysis", SOME, "as stated", SOME, NONE, _STEP, positions=SOME, mda="H5MD"),
+    Format("H5MD", (".h5md",), "surromd", SOME, "as stated", SOME, NONE, _STEP),
     Format("LAMMPS dump", (".lammpsdump", ".dump"), "MDAnalysis", NONE, NONE, EVERY, "elements", _STEP + "; Å",
            unit_taken="Å", mda="LAMMPSDUMP"),
     Format("TNG", (".tng",), "MDAnalysis", EVERY, "as stated", SOME, NONE, positions=SOME),

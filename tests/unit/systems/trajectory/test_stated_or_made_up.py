@@ -221,6 +221,38 @@ def test_hdf5_is_read_as_stated(folder: Path, tmp_path: Path, frames: np.ndarray
         open_trajectory(path)
 
 
+def test_h5md_with_fixed_steps_and_without_units(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
+    import h5py
+
+    path = tmp_path / "a.h5md"
+    path.write_bytes((folder / "mda.h5md").read_bytes())
+    with h5py.File(path, "r+") as file:
+        (group,) = file["particles"].values()
+        del group["position/time"], group["position/step"], group["box/edges"]
+        group["position/step"] = 5
+        group["position/time"] = 2500.0
+        group["position/time"].attrs.update(unit="fs", offset=5000.0)
+        group["box/edges"] = np.diag(10.0 * BOX)
+        group["box/edges"].attrs["unit"] = "Angstrom"
+    for one in (path, folder / "mda.h5md"):
+        with open_trajectory(one, top=folder / "top.pdb") as reader:
+            assert reader.read(1, 5, 2) == pytest.approx(frames[1:5:2], abs=1e-6)
+            assert reader.times_known and reader.time_ps == pytest.approx(TIMES)
+            cells = reader.read_cells(0, 2)
+            assert cells is not None and cells == pytest.approx(np.repeat(BOX[None], 2, axis=0), abs=1e-6)
+            assert not reader.notes
+    with h5py.File(path, "r+") as file:
+        (group,) = file["particles"].values()
+        del group["position/time"].attrs["unit"]
+    with open_trajectory(path) as reader:
+        assert not reader.times_known and "times state no unit" in reader.notes[0]
+    with h5py.File(path, "r+") as file:
+        (group,) = file["particles"].values()
+        del group["position/value"].attrs["unit"]
+    with pytest.raises(TrajectoryError, match="state no unit of length"):
+        open_trajectory(path)
+
+
 def test_hdf5_topologies_without_bonds(folder: Path, tmp_path: Path) -> None:
     made = mdtraj.load(str(folder / "mdtraj.h5"))
     made.topology._bonds = []
