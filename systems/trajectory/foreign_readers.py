@@ -26,7 +26,7 @@ from systems.trajectory.foreign_scenes import (
 )
 from systems.trajectory.format_table import NONE, SOME, format_of
 from systems.trajectory.frame_block import Float32Array, Float64Array
-from systems.trajectory.frame_orders import IntArray, gro_frames, moved_note, orders, pdb_names
+from systems.trajectory.frame_orders import IntArray, arc_names, gro_frames, moved_note, orders, pdb_names
 
 _PASS_FRAMES = 4096
 _NM = 0.1
@@ -94,6 +94,8 @@ class MdtrajReader(TrajectoryReader):
             self.times_known = all(_GRO_TIME.search(title) for title in titles)
         elif suffix.endswith((".pdb", ".pdb.gz")):
             self._put_in_order(frames, pdb_names(path))
+        elif suffix.endswith(".arc"):
+            self._put_in_order(frames, arc_names(path))
         return frames
 
     def _put_in_order(self, frames: Any, names: Iterable[Sequence[str]]) -> None:

@@ -57,7 +57,7 @@ FORMATS = (
            _COUNTED + "; Å and ps whatever is stated", streamed=True),
     Format("PDB", (".pdb", ".pdb.gz"), "MDTraj", NONE, "Å", SOME, _BONDS, _COUNTED + "; the first model's atoms"),
     Format("PDBx/mmCIF", (".pdbx", ".cif", ".mmcif", ".pdbx.gz", ".cif.gz", ".mmcif.gz"), "MDTraj", NONE, "Å", SOME,
-           _BONDS, _COUNTED + "; the first model's atoms"),
+           _BONDS, _COUNTED),
     Format("GRO", (".gro",), "MDTraj", SOME, "nm", EVERY, "names, residues", _COUNTED + "; the first frame's atoms"),
     Format("MOL2", (".mol2",), "MDTraj", NONE, "Å", NONE, _BONDS, _COUNTED),
     Format("Tinker ARC", (".arc",), "MDTraj", NONE, "Å", SOME, "names, bonds", _COUNTED + "; the first frame's atoms"),

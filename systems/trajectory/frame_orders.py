@@ -81,6 +81,20 @@ def pdb_names(path: Path) -> Iterator[list[str]]:
         yield names
 
 
+def arc_names(path: Path) -> Iterator[list[str]]:
+    """Yield name and type of all atoms of each frame of a Tinker archive."""
+    with open_text(path) as file:
+        for title in file:
+            words = title.split()
+            if not words or not words[0].isdigit():
+                return
+            names: list[str] = []
+            while len(names) < int(words[0]) and (row := file.readline().split()):
+                if len(row) > 5 and not row[1].replace(".", "").isdigit():  # else the cell
+                    names.append(f"{row[1]} {row[5]}")
+            yield names
+
+
 def gro_frames(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield the title, and residue and name of all atoms, of each frame of a GRO file."""
     with open_text(path) as file:

@@ -384,6 +384,37 @@ def test_frames_in_another_order(folder: Path, tmp_path: Path, frames: np.ndarra
         open_trajectory(path)
 
 
+def test_models_of_mmcif_in_another_order(folder: Path, tmp_path: Path, frames: np.ndarray) -> None:
+    """As OpenMM writes them; with the second model's atoms shuffled MDTraj refuses them itself."""
+    from openmm import app, unit
+
+    path, topology = tmp_path / "a.cif", app.PDBFile(str(folder / "top.pdb")).topology
+    with path.open("w") as file:
+        app.PDBxFile.writeHeader(topology, file)
+        for k, x in enumerate(frames):
+            app.PDBxFile.writeModel(topology, x * unit.nanometer, file, modelIndex=k + 1)
+    with open_trajectory(path) as reader:
+        assert reader.read() == pytest.approx(frames, abs=6e-5) and not reader.notes
+    lines = path.read_text().splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith(("ATOM", "HETATM"))) + 22
+    lines[first : first + 22] = lines[first : first + 22][::-1]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(TrajectoryError, match="does not match the order of atoms"):
+        open_trajectory(path)
+
+
+def test_atoms_of_tinker_archives_that_move_are_refused(tmp_path: Path) -> None:
+    rows = ["1  O   0.0 0.0 0.1   1  2 3", "2  H   0.9 0.0 0.0   2  1", "3  H  -0.3 0.9 0.0   2  1"]
+    moved = [rows[1].replace("2", "1", 1), rows[0].replace("1", "2", 1), rows[2]]
+    path = tmp_path / "a.arc"
+    path.write_text("\n".join([" 3 water", *rows, " 3 water", *rows]) + "\n")
+    with open_trajectory(path) as reader:
+        assert reader.n_frames == 2
+    path.write_text("\n".join([" 3 water", *rows, " 3 water", *moved]) + "\n")
+    with pytest.raises(TrajectoryError, match="do not tell the order"):
+        open_trajectory(path)
+
+
 def test_elements_of_ase_that_change_are_refused(tmp_path: Path, frames: np.ndarray, alanine_dipeptide: Scene) -> None:
     ase = pytest.importorskip("ase")
     from ase.io.trajectory import Trajectory
