@@ -1,4 +1,5 @@
-"""The directives `definitions` and `flags`: what the code says of the judge's terms and of frames' flags, as tables."""
+"""The directives `definitions`, `flags` and `formats`: what the code says of the judge's terms, of frames' flags and of
+other programs' files, as tables."""
 
 from __future__ import annotations
 
@@ -36,6 +37,15 @@ class FlagsTable(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
+class FormatTable(SphinxDirective):
+    """`{formats}`: the formats that are read, and what their files state."""
+
+    def run(self) -> list[nodes.Node]:
+        from systems.trajectory.format_table import markdown
+
+        return self.parse_text_to_nodes(markdown())
+
+
 def _plain(text: str) -> str:
     """Return a text in which nothing is Markdown."""
     return "".join("\\" + c if c in "\\`*_[]<>|$" else c for c in text)
@@ -45,4 +55,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("definitions", Definitions)
     app.add_directive("flags", FlagsTable)
+    app.add_directive("formats", FormatTable)
     return {"parallel_read_safe": True}

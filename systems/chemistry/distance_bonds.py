@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -16,10 +17,11 @@ from systems.scene import Scene
 _TOLERANCE_NM = 0.04
 
 
-def with_bonds_by_distance(scene: Scene) -> Scene:
+def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -> Scene:
     """Return the scene with bonds, by covalent radii, for residues that hold an atom without any; else as it is.
 
-    Two atoms are bonded when they are nearer than the sum of their radii and 0.04 nm. Ions and rare gases stay alone.
+    Two atoms are bonded when they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum
+    of their radii and 0.04 nm. Ions and rare gases stay alone.
     """
     bonded = np.zeros(scene.n_atoms, dtype=bool)
     bonded[scene.bonds.ravel()] = True
@@ -29,7 +31,7 @@ def with_bonds_by_distance(scene: Scene) -> Scene:
     if not len(open_residues) or not scene.positions_nm.any():
         return scene
     atoms = np.flatnonzero(np.isin(residue, open_residues))
-    found = bonds_by_distance([scene.elements[i] for i in atoms], scene.positions_nm[atoms])
+    found = bonds_by_distance([scene.elements[i] for i in atoms], scene.positions_nm[atoms], cell_nm)
     known = {tuple(b) for b in scene.bonds.tolist()}
     orders = dict(zip(map(tuple, scene.bonds.tolist()), scene.bond_orders.tolist(), strict=True))
     rows = sorted(known | {(int(atoms[i]), int(atoms[j])) for i, j in found.tolist()})
@@ -40,13 +42,23 @@ def with_bonds_by_distance(scene: Scene) -> Scene:
     )
 
 
-def bonds_by_distance(elements: Sequence[str], positions_nm: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm; hydrogen bonds to its nearest."""
+def bonds_by_distance(
+    elements: Sequence[str], positions_nm: npt.ArrayLike, cell_nm: npt.ArrayLike | None = None
+) -> npt.NDArray[np.int64]:
+    """Return the pairs i < j nearer than the sum of their covalent radii and 0.04 nm; hydrogen bonds to its nearest.
+
+    With a cell `(3, 3)` nm that is wide enough to tell images apart the nearest ones count.
+    """
     x = np.asarray(positions_nm, dtype=np.float64)
     radii = np.array([covalent_radius_nm(e) for e in elements])
-    near = near_pairs(x, 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM, "the molecule")
+    reach = 2.0 * float(radii.max(initial=0.0)) + _TOLERANCE_NM
+    atoms = np.arange(len(x))
+    if cell_nm is not None and _least_width_nm(np.asarray(cell_nm, dtype=np.float64)) > 2.0 * reach:
+        atoms, x = _with_images(x, np.asarray(cell_nm, dtype=np.float64), reach)
+    near = near_pairs(x, reach, "the molecule")
     length = np.linalg.norm(x[near[:, 0]] - x[near[:, 1]], axis=1)
-    close = length < radii[near[:, 0]] + radii[near[:, 1]] + _TOLERANCE_NM
+    near = np.sort(atoms[near], axis=1)
+    close = (length < radii[near[:, 0]] + radii[near[:, 1]] + _TOLERANCE_NM) & (near[:, 0] < near[:, 1])
     best: dict[int, tuple[float, int]] = {}
     rows = []
     for (i, j), d in sorted(zip(map(tuple, near[close].tolist()), length[close].tolist(), strict=True)):
@@ -77,3 +89,24 @@ def refuse_long_bonds(
             f"the bond {label(i)} - {label(j)} is {10 * length[k]:.2f} Å long{more}: the molecule is broken; make it "
             "whole (unwrap it from its periodic cell, or write the cell into the file), or correct the coordinates."
         )
+
+
+def _least_width_nm(cell: npt.NDArray[np.float64]) -> float:
+    """Return the least distance between opposite faces, 0 of a cell without volume (placeholders in PDB files)."""
+    if not abs(np.linalg.det(cell)) > 0.0:
+        return 0.0
+    return float(1.0 / np.linalg.norm(np.linalg.inv(cell), axis=0).max())
+
+
+def _with_images(
+    x: npt.NDArray[np.float64], cell: npt.NDArray[np.float64], reach_nm: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return which atoms, and where `(n, 3)` nm: all of them inside the cell, and their images up to `reach_nm`
+    outside."""
+    inverse = np.linalg.inv(cell)
+    inside = (x @ inverse) % 1.0
+    margin = reach_nm * np.linalg.norm(inverse, axis=0)
+    shifts = np.array(list(itertools.product((0, -1, 1), repeat=3)), dtype=np.float64)
+    places = (inside[None] + shifts[:, None]).reshape(-1, 3)
+    kept = ((places > -margin) & (places < 1.0 + margin)).all(axis=1)
+    return np.tile(np.arange(len(x)), len(shifts))[kept], places[kept] @ cell

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.foreign_scenes import scene_from_structure, with_orders
+from systems.trajectory.foreign_scenes import named_scene, scene_from_structure
 from systems.trajectory.frame_block import Float32Array, Float64Array
+from systems.trajectory.frame_orders import order_of
 
 _NM = 0.1
 
@@ -43,7 +42,13 @@ class AseReader(TrajectoryReader):
             raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
         self.n_atoms = len(first)
         self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
-        stated = _scene(first, path) if top is None else scene_from_structure(top, name=path.stem)
+        self._elements = [str(x) for x in first.get_chemical_symbols()]
+        if top is None:
+            cell = first.cell.array * _NM if first.pbc.all() else None
+            names = [f"{e}{k + 1}" for k, e in enumerate(self._elements)]
+            stated = named_scene(path, names, self._elements, first.positions * _NM, cell)
+        else:
+            stated = scene_from_structure(top, name=path.stem)
         if stated.n_atoms != self.n_atoms:
             self.close()
             raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
@@ -52,9 +57,7 @@ class AseReader(TrajectoryReader):
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
         for k, frame in enumerate(self._stored(start, stop, stride)):
-            if len(frame) != self.n_atoms:
-                raise TrajectoryError(f"{self.path}: frame {start + k * stride} has {len(frame)} atoms, not as many as "
-                                      f"the first ({self.n_atoms}).")  # fmt: skip
+            order_of(list(frame.get_chemical_symbols()), self._elements, self.path, start + k * stride)
             out[k] = frame.positions * _NM
         return out
 
@@ -78,25 +81,3 @@ class AseReader(TrajectoryReader):
         if self._frames is not None:
             self._frames.close()
         self._frames = None
-
-
-def _scene(atoms: Any, path: Path) -> Scene:
-    """Return the Scene of ASE's atoms, one residue, bonds by covalent radii."""
-    elements = tuple(str(x) for x in atoms.get_chemical_symbols())
-    n = len(elements)
-    scene = Scene(
-        name=path.stem,
-        atom_names=tuple(f"{e}{k + 1}" for k, e in enumerate(elements)),
-        elements=elements,
-        residue_of_atom=np.zeros(n, dtype=np.int64),
-        residue_names=("MOL",),
-        residue_ids=("1",),
-        chain_of_residue=("A",),
-        bonds=np.empty((0, 2), dtype=np.int64),
-        bond_orders=np.zeros(0),
-        formal_charges=np.zeros(n, dtype=np.int64),
-        masses_da=np.asarray(atoms.get_masses(), dtype=np.float64),
-        positions_nm=np.asarray(atoms.positions, dtype=np.float64) * _NM,
-        provenance={"source": path.name},
-    )
-    return with_orders(with_bonds_by_distance(scene))

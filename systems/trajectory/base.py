@@ -172,6 +172,7 @@ class TrajectoryReader(ABC):
 
     `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames. `run_id` is
     the number of the run that wrote the file, and `checksums` are those of its frames `(n_frames,)`, where it has them.
+    `notes`: sentences on what was assumed or left out, for people.
     """
 
     path: Path
@@ -184,6 +185,7 @@ class TrajectoryReader(ABC):
     chunk_idx: npt.NDArray[np.int32] | None
     scalars: dict[str, Float64Array]
     times_known: bool = True
+    notes: tuple[str, ...] = ()
     run_id: str = ""
     checksums: Mapping[str, Checksums] = MappingProxyType({})
 
@@ -252,6 +254,11 @@ class TrajectoryReader(ABC):
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
                  trace: TracebackType | None) -> None:  # fmt: skip
         self.close()
+
+
+def unused_top_note(top: Path) -> str:
+    """Return the line on a topology that was given and is not needed."""
+    return f"{top} is not used: the file holds its own topology."
 
 
 def check_same_topology(path: Path, stored: Scene, scene: Scene) -> None:

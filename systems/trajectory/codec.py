@@ -12,6 +12,7 @@ from systems.files.atomic_file import journal_path
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
 from systems.trajectory.claim import Claim
+from systems.trajectory.format_table import XYZ_SUFFIXES
 from systems.trajectory.frame_block import FrameBlock
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
@@ -103,7 +104,11 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         from systems.trajectory.hdf5_file import Hdf5Reader, is_plain_h5md
 
         if not is_plain_h5md(path):
-            return Hdf5Reader(path)
+            return Hdf5Reader(path, top)
+    if is_hdf5 or path.suffix.lower() == ".h5md":
+        from systems.trajectory.h5md_file import H5mdReader
+
+        return H5mdReader(path, top)
     if path.suffix.lower() == ".dcd":
         from systems.trajectory.dcd_file import DcdReader
 
@@ -112,9 +117,13 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         from systems.trajectory.ase_file import AseReader
 
         return AseReader(path, top)
+    if path.name.lower().endswith(XYZ_SUFFIXES):
+        from systems.trajectory.xyz_file import XyzReader
+
+        return XyzReader(path, top)
     from systems.trajectory.foreign_scenes import is_mdtraj_format
 
-    if is_mdtraj_format(path) and not is_hdf5:
+    if is_mdtraj_format(path):
         from systems.trajectory.foreign_readers import MdtrajReader
 
         return MdtrajReader(path, top)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology, unused_top_note
 from systems.trajectory.dcd_layout import (
     DcdLayout,
     cell_blocks,
@@ -193,11 +193,12 @@ class DcdReader(TrajectoryReader):
             _check_against_meta(path, layout, self.n_frames, completed=self.record.get("completed") is True)
             if top is not None:
                 _scene_from_top(top, path, self.n_atoms)
+                self.notes = (unused_top_note(top),)
         else:
             self.n_frames = layout.whole_frames()
             self.time_ps, self.times_known = layout.times_ps(self.n_frames), layout.states_time
             self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
-            self.scene = None
+            self.scene, self.notes = None, layout.notes
             if top is not None or is_our_topology(pdb):
                 self.scene = _scene_from_top(top or pdb, path, self.n_atoms)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
@@ -230,7 +231,12 @@ class DcdReader(TrajectoryReader):
             return None
         blocks = np.asarray(self._frames["cell"][start:stop:stride])
         check_read(self, CELLS, blocks, slice(start, stop, stride))
-        return cells_of_blocks(blocks, self._layout.byte_order)
+        try:
+            return cells_of_blocks(blocks, self._layout.byte_order, self._layout.charmm_version)
+        except ValueError as error:
+            raise TrajectoryError(
+                f"{self.path}: its unit cell is no cell ({error}); take the cell out of it."
+            ) from error
 
     def close(self) -> None:
         self._frames = None

@@ -26,6 +26,14 @@ AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit o
 _HEADER_BYTES = 92
 _MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
 _TITLE = b"Written by surromd"
+_LAMMPS_TITLE = b"Written by LAMMPS"
+_LEAST_LAMMPS_FS = 0.05
+_LAMMPS_NOTE = "written by LAMMPS; its time step is taken to be in fs (`units real`)."
+_LAMMPS_UNKNOWN = (
+    "written by LAMMPS with a time step that is too short for fs (`units metal` or `lj`); its times are not used."
+)
+_LAST_VERSION_WITH_ANGLES = 24
+_LIKELY_DEG = (40.0, 140.0)
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,8 @@ class DcdLayout:
     path: Path = Path()
     has_our_title: bool = False
     states_time: bool = True
+    charmm_version: int = 24
+    notes: tuple[str, ...] = ()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, DcdLayout):
@@ -72,7 +82,7 @@ class DcdLayout:
                 if fields[8] != 0 or (charmm and fields[11] != 0):
                     raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
                 title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
-                has_our_title = _TITLE in file.read(title + 4)
+                titles = file.read(title + 4)
                 _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
                 first_frame_at = file.tell()
         except OSError as error:
@@ -82,15 +92,23 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
         if not 1 <= n_atoms < _MOST_ATOMS:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        # The time step is float32: digits beyond its seventh are noise.
-        interval_ps = float(f"{float(delta) * AKMA_PS * max(int(fields[2]), 1):.6g}")
+        unit_ps = AKMA_PS
+        notes: tuple[str, ...] = ()
         # MDTraj and VMD write a time step of one unit, whatever the times were.
-        states_time = bool(np.isfinite(interval_ps) and interval_ps > 0) and not (delta == 1.0 and fields[2] == 1)
+        states_time = not (delta == 1.0 and fields[2] == 1)
+        if _LAMMPS_TITLE in titles:
+            # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
+            unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
+            notes = (_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN,)
+        # The time step is float32: digits beyond its seventh are noise.
+        interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
+        states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
         if not (np.isfinite(interval_ps) and interval_ps > 0):
             interval_ps = 1.0
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
         return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
-                         first_time_ps, interval_ps, size, path, has_our_title, states_time)  # fmt: skip
+                         first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
+                         int(fields[19]), notes)  # fmt: skip
 
     @property
     def frame_dtype(self) -> np.dtype[Any]:
@@ -157,16 +175,36 @@ def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
     return out
 
 
-def cells_of_blocks(blocks: npt.NDArray[np.int32], byte_order: str) -> npt.NDArray[np.float64] | None:
-    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks, None of such as hold zeros.
+def cells_of_blocks(
+    blocks: npt.NDArray[np.int32], byte_order: str, charmm_version: int = _LAST_VERSION_WITH_ANGLES
+) -> npt.NDArray[np.float64] | None:
+    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks `(n, 14)`, None of such as hold zeros.
 
-    Some programs write the cosines of the angles.
+    Between the lengths stand angles in degrees (most programs), their cosines (NAMD), or the elements of CHARMM's
+    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: it is known by numbers that are no
+    angles. Raises ValueError where the numbers are none of the three.
     """
     raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
-    angles = raw[:, [4, 3, 1]]
-    if (np.abs(angles) <= 1.0).all():
+    lengths, angles = raw[:, [0, 2, 5]], raw[:, [4, 3, 1]]
+    if not len(raw) or (lengths == 0.0).any():
+        return read_cells(0.1 * lengths, angles)
+    if (np.abs(angles) <= 1.0).all() and charmm_version <= _LAST_VERSION_WITH_ANGLES:
         angles = np.degrees(np.arccos(angles))
-    return read_cells(0.1 * raw[:, [0, 2, 5]], angles)
+    likely = bool(((angles >= _LIKELY_DEG[0]) & (angles <= _LIKELY_DEG[1])).all())
+    if not _are_angles(angles) or (charmm_version > _LAST_VERSION_WITH_ANGLES and not likely):
+        shape = raw[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
+        if np.isfinite(shape).all() and (np.linalg.eigvalsh(shape) > 0.0).all():
+            return 0.1 * shape
+    if not _are_angles(angles):
+        raise ValueError("neither angles, nor cosines, nor a shape matrix")
+    return read_cells(0.1 * lengths, angles)
+
+
+def _are_angles(angles: npt.NDArray[np.float64]) -> bool:
+    """Whether a cell can have these angles `(n, 3)`, degrees."""
+    alpha, beta, gamma = np.cos(np.radians(angles)).T
+    volume = 1.0 - alpha**2 - beta**2 - gamma**2 + 2.0 * alpha * beta * gamma
+    return bool(((angles > 0.0) & (angles < 180.0)).all() and (volume > 0.0).all())
 
 
 def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float, *, has_cell: bool = False) -> bytes:

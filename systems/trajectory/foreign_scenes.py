@@ -19,9 +19,8 @@ from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import parsed
 from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
+from systems.trajectory.format_table import OTHER, format_of
 
-# What stands in a file name where MDAnalysis would not know the format by itself.
-MDANALYSIS_FORMATS = {".h5": "H5MD", ".hdf5": "H5MD", ".h5md": "H5MD", ".extxyz": "XYZ", ".dump": "LAMMPSDUMP"}
 _NM = 0.1
 
 
@@ -137,7 +136,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     """
     import MDAnalysis
 
-    format_ = MDANALYSIS_FORMATS.get(top.suffix.lower())
+    format_ = "XYZ" if top.suffix.lower() == ".extxyz" else format_of(top).mda
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -196,8 +195,37 @@ def is_mdtraj_format(path: Path) -> bool:
     """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
     from mdtraj.formats.registry import FormatRegistry
 
-    name = path.name.lower()
-    return any(name.endswith(s) for s in FormatRegistry.loaders) and not name.endswith((".xyz", ".xyz.gz", ".gsd"))
+    if format_of(path) is not OTHER:
+        return format_of(path).reader in ("MDTraj", "surromd")
+    return any(path.name.lower().endswith(s) for s in FormatRegistry.loaders)
+
+
+def named_scene(
+    path: Path,
+    names: Sequence[str],
+    elements: Sequence[str],
+    positions_nm: npt.ArrayLike,
+    cell_nm: npt.ArrayLike | None,
+) -> Scene:
+    """Return the Scene of atoms that a file only names, one residue; bonds by distance, across the cell `(3, 3)` nm
+    too, orders by valence."""
+    n = len(elements)
+    scene = Scene(
+        name=path.stem,
+        atom_names=tuple(names),
+        elements=tuple(elements),
+        residue_of_atom=np.zeros(n, dtype=np.int64),
+        residue_names=("MOL",),
+        residue_ids=("1",),
+        chain_of_residue=("A",),
+        bonds=np.empty((0, 2), dtype=np.int64),
+        bond_orders=np.zeros(0),
+        formal_charges=np.zeros(n, dtype=np.int64),
+        masses_da=np.array([atomic_weight_da(e) for e in elements]),
+        positions_nm=np.asarray(positions_nm, dtype=np.float64),
+        provenance={"source": path.name},
+    )
+    return with_orders(with_bonds_by_distance(scene, cell_nm))
 
 
 def _mass_da(symbol: str, atom: Any) -> float:
@@ -216,6 +244,12 @@ def _order(bond: Any) -> float:
 def _chain_id(chain: Any) -> str:
     given = getattr(chain, "chain_id", None)
     return str(given) if given else chr(ord("A") + chain.index % 26)
+
+
+def bonds_completed(scene: Scene, cells_nm: npt.NDArray[np.float64] | None) -> Scene:
+    """Return the scene with bonds by distance where residues lack them, and orders then; cells `(1, 3, 3)` nm."""
+    completed = with_bonds_by_distance(scene, None if cells_nm is None else cells_nm[0])
+    return scene if len(completed.bonds) == len(scene.bonds) else with_orders(completed)
 
 
 def with_orders(scene: Scene) -> Scene:

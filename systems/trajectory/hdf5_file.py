@@ -9,7 +9,7 @@ may have (velocities, forces, a cell) is in `extra_columns`.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,9 @@ from systems.files.checksums import Checksums, check_frames_read, frame_checksum
 from systems.files.outside import UNREADABLE
 from systems.files.whole_file import refuse_existing
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology, unused_top_note
 from systems.trajectory.extra_columns import PER_ATOM, check_wanted, extra_values, lay_out_extras, read_cells
+from systems.trajectory.foreign_details import counted_note
 from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
 from systems.trajectory.frame_store import (
     CELLS,
@@ -43,6 +44,7 @@ from systems.trajectory.frame_store import (
     read_record,
     read_run_id,
 )
+from systems.trajectory.stated_units import nm_per, ps_per
 from systems.trajectory.topology_file import refuse_other_topology, topology_bytes, topology_path, write_topology
 
 _CHUNK_BYTES = 131_072
@@ -115,44 +117,65 @@ class Hdf5Writer(TrajectoryWriter):
 
 
 class Hdf5Reader(TrajectoryReader):
-    """Reads our own HDF5 trajectories and MDTraj's. Raises TrajectoryError when the file is damaged or incomplete."""
+    """Reads our own HDF5 trajectories and MDTraj's. `top` gives the bonds to a topology of MDTraj's without any.
 
-    def __init__(self, path: Path) -> None:
+    Raises TrajectoryError when the file is damaged or incomplete, InputError when `top` does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None = None) -> None:
         self.path = path
         self._file = open_hdf5(path)
         try:
             with damage_reported(path):
-                self._read_headers()
+                self._read_headers(top)
         except BaseException:
             self._file.close()
             raise
 
-    def _read_headers(self) -> None:
+    def _read_headers(self, top: Path | None) -> None:
         if "coordinates" not in self._file:
             raise TrajectoryError(f"{self.path} holds no /coordinates: it is not an MDTraj or surromd trajectory.")
         self.n_frames = consistent_length(self._file, self.path)
         self._coordinates = self._file["coordinates"]
         if self._coordinates.ndim != 3 or self._coordinates.shape[2] != 3:
             raise TrajectoryError(f"{self.path}: /coordinates of shape {self._coordinates.shape}, not (n, n_atoms, 3).")
-        self._scale = _nm_per_unit(self._coordinates, self.path)
+        self._scale = _per_unit(self._file, "coordinates", nm_per, self.path)
         self.n_atoms = int(self._coordinates.shape[1])
         columns = read_columns(self._file, self.path, self.n_frames)
         self.time_ps, self.flags, self.chunk_idx, self.scalars = columns
         self.checksums, self.run_id = read_checksums(self._file, self.n_frames), read_run_id(self._file)
         self.times_known = "surromd" in self._file or "time" in self._file
         self.record = read_record(self._file) if "surromd" in self._file else {}
-        self.scene = self._read_scene()
+        if "surromd" not in self._file and "time" in self._file:
+            self.time_ps = self.time_ps * _per_unit(self._file, "time", ps_per, self.path)
+            self.notes = counted_note(self.time_ps)
+        self.scene = self._read_scene(top)
         if self.scene is not None and self.scene.n_atoms != self.n_atoms:
             raise TrajectoryError(f"{self.path}: {self.n_atoms} atoms a frame, but {self.scene.n_atoms} in its scene.")
 
-    def _read_scene(self) -> Scene | None:
+    def _read_scene(self, top: Path | None) -> Scene | None:
+        unused = () if top is None else (unused_top_note(top),)
         if "surromd" in self._file:
+            self.notes += unused
             return Scene.from_dict(get_json(self._file, "surromd/scene"))
-        if "topology" not in self._file or self.n_frames == 0:
-            return None
-        from systems.trajectory.foreign_scenes import scene_from_topology_json
+        from systems.trajectory.foreign_scenes import bonds_completed, scene_from_structure, scene_from_topology_json
 
-        return scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
+        own = None
+        if "topology" in self._file and self.n_frames:
+            own = scene_from_topology_json(self._file["topology"][0], self._read(0, 1, 1)[0], self.path)
+        if top is not None and (own is None or not len(own.bonds)):
+            stated = scene_from_structure(top, name=self.path.stem)
+            if stated.n_atoms != self.n_atoms or (own is not None and stated.elements != own.elements):
+                raise InputError(f"{top} holds other atoms than {self.path} ({self.n_atoms}); give the matching one.")
+            return stated.with_positions(self._read(0, 1, 1)[0]) if self.n_frames else stated
+        if own is None:
+            return None
+        self.notes += unused
+        scene = bonds_completed(own, self._read_cells(0, 1, 1))
+        added = len(scene.bonds) - len(own.bonds)
+        if added:
+            self.notes += (f"{added} bonds that its topology lacks were found by distance.",)
+        return scene
 
     def _read(self, start: int, stop: int, stride: int) -> Float32Array:
         frames = self._gather(self._coordinates, start, stop, stride)
@@ -173,6 +196,8 @@ class Hdf5Reader(TrajectoryReader):
             raise InputError(f"{self.path} is closed.")
         with damage_reported(self.path):
             cells = read_cells(self._file, start, stop, stride)
+            if cells is not None and "surromd" not in self._file and "cell_lengths" in self._file:
+                cells *= _per_unit(self._file, "cell_lengths", nm_per, self.path)
         if cells is not None:
             check_read(self, CELLS, cells, slice(start, stop, stride))
         return cells
@@ -243,13 +268,14 @@ def check_read(reader: TrajectoryReader, name: str, stored: npt.NDArray[Any], fr
     check_frames_read(reader.path, reader.checksums[name][frames], found, frames.start, frames.step)
 
 
-def _nm_per_unit(dataset: h5py.Dataset, path: Path) -> float:
-    units = dataset.attrs.get("units", b"nanometers")
-    name = units.decode() if isinstance(units, bytes) else str(units)
-    known = {"nanometers": 1.0, "nanometer": 1.0, "nm": 1.0, "angstroms": 0.1, "angstrom": 0.1}
-    if name not in known:
-        raise TrajectoryError(f"{path}: coordinates are in {name!r}; known units are {', '.join(known)}.")
-    return known[name]
+def _per_unit(file: h5py.File, name: str, per: Callable[[Any], float | None], path: Path) -> float:
+    """Return what one of a dataset's `units` is in nm or ps, 1 where it states none (MDTraj's convention)."""
+    units = file[name].attrs.get("units")
+    factor = 1.0 if units is None else per(units)
+    if factor is None:
+        shown = units.decode(errors="replace") if isinstance(units, bytes) else units
+        raise TrajectoryError(f"{path}: {name} are in {shown!r}, a unit that is not known; write it in nm and ps.")
+    return factor
 
 
 def _lay_out(file: h5py.File, scene: Scene, columns: Sequence[str]) -> None:

@@ -49,6 +49,7 @@ def open_matched(path: Path, template: Scene | None, top: Path | None, notes: li
     if reader.n_frames == 0:
         reader.close()
         raise InputError(f"{path}: no frames.")
+    notes.extend(f"{path}: {note}" for note in reader.notes)
     scene = reader.scene
     order: IntArray | None = None
     if scene is None and template is None:

@@ -267,3 +267,21 @@ def test_a_heavy_atom_candidate_is_judged_on_what_it_has(tmp_path: Path, simulat
     wrong = part.segments[0][:] * np.array([-1.0, 1.0, 1.0], dtype=np.float32)
     mirrored = compare(reference, [replace(part, segments=[wrong])], replicate, options=quick).judgements[0]
     assert mirrored.status in ("broken", "different"), "a mirror image is found without hydrogens, too"
+
+
+def test_what_a_file_does_not_state_is_asked_for_and_said(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    """LAMMPS text states neither times nor a unit of length: no comparison without a lag, and none without a line."""
+    mdtraj = pytest.importorskip("mdtraj")
+    frames = np.repeat(alanine_dipeptide.positions_nm[None], 12, axis=0)
+    made = mdtraj.Trajectory(frames, alanine_dipeptide.to_mdtraj_topology(), time=0.5 * np.arange(12))
+    made.unitcell_vectors = np.repeat(3.0 * np.eye(3)[None], 12, axis=0)
+    made[0].save_pdb(str(tmp_path / "top.pdb"))
+    top = tmp_path / "top.pdb"
+    for suffix in ("lammpstrj", "xtc"):
+        made.save(str(tmp_path / f"a.{suffix}"))
+    with pytest.raises(InputError, match="state the time between frames"):
+        load_ensemble([tmp_path / "a.lammpstrj"], template=alanine_dipeptide, top=top)
+    said = load_ensemble([tmp_path / "a.lammpstrj"], template=alanine_dipeptide, top=top, lag_ps=0.5)
+    assert any("states no unit of length; Å is taken" in note for note in said.notes)
+    stated = load_ensemble([tmp_path / "a.xtc"], template=alanine_dipeptide, top=top)
+    assert stated.lag_ps == 0.5 and not any("unit of length" in note for note in stated.notes)
