@@ -77,7 +77,10 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
     _check_cell(scene, spec)
     if spec.force_field == QUANTUM:
         return build_quantum_system(
-            scene, hydrogen_mass_da=spec.hydrogen_mass_da, constrain_hydrogens=spec.constrain_hydrogens
+            scene,
+            solvent=spec.solvent,
+            hydrogen_mass_da=spec.hydrogen_mass_da,
+            constrain_hydrogens=spec.constrain_hydrogens,
         )
     if spec.force_field in PROTEIN_FORCE_FIELDS:
         system = build_templated(scene, spec, native_gb=native_gb)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from systems.chemistry.distance_bonds import changed_bond
 from systems.errors import PreparationError, first_line
 from systems.scene import FloatArray, Scene
 
@@ -23,20 +24,27 @@ _HEAVIEST = 86
 _UPHILL_KJ_MOL = 1e9
 # A force costs some hundred ms at 50 atoms and grows with the third power.
 LARGEST = 200
-# Bonds to hydrogen are at rest long before torsions are.
+# Bonds to hydrogen are at rest long before torsions are; protons of zwitterions move last.
 _MINIMISER_STEPS = 60
+# Implicit solvents by their name in tblite. ALPB: Ehlert, Stahn, Spicher and Grimme, J. Chem. Theory Comput. 17, 4250
+# (2021).
+_SOLVENTS = {"alpb-water": "water"}
 
 
 def build_quantum_system(
-    scene: Scene, *, hydrogen_mass_da: float | None = None, constrain_hydrogens: bool = False
+    scene: Scene,
+    *,
+    solvent: str = "vacuum",
+    hydrogen_mass_da: float | None = None,
+    constrain_hydrogens: bool = False,
 ) -> Any:
-    """Return an `openmm.System` whose one force is GFN2-xTB, without a cell.
+    """Return an `openmm.System` whose one force is GFN2-xTB, without a cell, in vacuum or `alpb-water`.
 
     `hydrogen_mass_da`: taken from the atom a hydrogen is bonded to; None leaves natural masses. With
     `constrain_hydrogens` bonds to hydrogen are as long as in the nearest minimum of the energy, and rigid.
     Every force is an SCF from scratch, so that it depends on positions alone and a resumed run repeats an undisturbed
-    one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon and for scenes too
-    large.
+    one. Raises PreparationError where tblite or PythonForce is missing, for elements beyond radon, for scenes too
+    large, and where that minimum is another molecule.
     """
     import openmm
 
@@ -46,7 +54,7 @@ def build_quantum_system(
         raise PreparationError(
             f"scene {scene.name!r} has {scene.n_atoms} atoms; gfn2-xtb is offered up to {LARGEST}. Use a force field."
         )
-    potential = Potential(scene)
+    potential = Potential(scene, solvent)
     potential(scene.positions_nm)  # what the method refuses is known before anything runs
     system = openmm.System()
     for mass_da in _masses_da(scene, hydrogen_mass_da).tolist():
@@ -57,9 +65,24 @@ def build_quantum_system(
     system.addForce(force)
     if constrain_hydrogens and (bonds := _hydrogen_bonds(scene)):
         rest_nm = _minimum_nm(scene, system)
+        refuse_rearranged(scene, rest_nm)
         for hydrogen, other in bonds:
             system.addConstraint(hydrogen, other, float(np.linalg.norm(rest_nm[hydrogen] - rest_nm[other])))
     return system
+
+
+def refuse_rearranged(scene: Scene, positions_nm: FloatArray) -> None:
+    """Raise PreparationError where a minimum `(n_atoms, 3)` nm has other bonds than the scene."""
+    if what := changed_bond(scene, positions_nm):
+        raise PreparationError(
+            f"scene {scene.name!r} becomes another molecule when GFN2-xTB minimises it: {what}. Give the form that it "
+            "becomes (a neutral one for a zwitterion), or simulate it with `solvent='alpb-water'`."
+        )
+
+
+def check_minimum(scene: Scene) -> None:
+    """Raise PreparationError where GFN2-xTB, in vacuum, minimises a scene to another molecule."""
+    refuse_rearranged(scene, _minimum_nm(scene, build_quantum_system(scene)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +132,8 @@ def _minimum_nm(scene: Scene, system: Any) -> FloatArray:
     platform = openmm.Platform.getPlatform("Reference")
     context = openmm.Context(system, openmm.VerletIntegrator(0.001), platform)
     context.setPositions(scene.positions_nm)
-    openmm.LocalEnergyMinimizer.minimize(context, maxIterations=_MINIMISER_STEPS)
+    signs = set(np.sign(scene.formal_charges).tolist())
+    openmm.LocalEnergyMinimizer.minimize(context, maxIterations=0 if {-1, 1} <= signs else _MINIMISER_STEPS)
     return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value, dtype=np.float64)
 
 
@@ -139,10 +163,10 @@ class Potential:
     """GFN2-xTB of one molecule: positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm.
 
     Charge from the scene's formal charges, unpaired electrons from `provenance["multiplicity"]` (where it says nothing,
-    the fewest possible). Raises PreparationError as `build_quantum_system`.
+    the fewest possible). `solvent`: vacuum or alpb-water. Raises PreparationError as `build_quantum_system`.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, solvent: str = "vacuum") -> None:
         from openmm.app import Element
 
         try:
@@ -165,11 +189,13 @@ class Potential:
             "GFN2-xTB", numbers, scene.positions_nm / NM_PER_BOHR, charge=charge, uhf=unpaired
         )
         self._calculator.set("verbosity", 0)
-        self._scene = scene
+        if solvent in _SOLVENTS:
+            self._calculator.add("alpb-solvation", _SOLVENTS[solvent])
+        self._scene, self._solvent = scene, solvent
         self._openmp = _openmp()
 
-    def __reduce__(self) -> tuple[type[Potential], tuple[Scene]]:
-        return Potential, (self._scene,)
+    def __reduce__(self) -> tuple[type[Potential], tuple[Scene, str]]:
+        return Potential, (self._scene, self._solvent)
 
     def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
         try:

@@ -17,7 +17,8 @@ _WITH_LIGANDS = tuple(f"{name}+gaff2" for name in PROTEIN_FORCE_FIELDS if name !
 FORCE_FIELDS = (*PROTEIN_FORCE_FIELDS, "gaff2", *_WITH_LIGANDS, QUANTUM, MODEL, "auto")
 IMPLICIT_SOLVENTS = ("obc2", "gbn2", "amber99-obc")
 EXPLICIT_SOLVENTS = ("tip3p", "opc")
-SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, "vacuum", "auto")
+QUANTUM_SOLVENTS = ("alpb-water",)
+SOLVENTS = (*IMPLICIT_SOLVENTS, *EXPLICIT_SOLVENTS, *QUANTUM_SOLVENTS, "vacuum", "auto")
 
 
 def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | None:
@@ -47,11 +48,12 @@ class ForceFieldSpec:
 
     `solvent`: 'obc2' (GBSA-OBC2, Onufriev 2004, with mbondi2 radii as in OpenMM's implicit/obc2.xml), 'gbn2' (Nguyen
     2013, mbondi3), 'amber99-obc' (the radii of OpenMM's amber99_obc.xml, ff99SB-ILDN only), 'tip3p' or 'opc' (explicit,
-    for scenes with a periodic cell: `solvation.solvate`), 'vacuum', or 'auto'.
+    for scenes with a periodic cell: `solvation.solvate`), 'alpb-water' (Ehlert 2021; gfn2-xtb only), 'vacuum', or
+    'auto'.
     """
 
     force_field: str = option("ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")
-    solvent: str = option("obc2, gbn2, tip3p, opc, vacuum, amber99-obc.", "obc2")
+    solvent: str = option("obc2, gbn2, tip3p, opc, vacuum, amber99-obc; alpb-water for gfn2-xtb.", "obc2")
     hydrogen_mass_da: float | None = option("Repartitioned mass, or 'natural'.", 3.0, read=parse_hydrogen_mass_da)
     constrain_hydrogens: bool = True
 
@@ -68,8 +70,16 @@ class ForceFieldSpec:
             )
         if self.solvent == "amber99-obc" and self.force_field != "ff99SB-ILDN":
             raise PreparationError("solvent 'amber99-obc' goes with `force_field='ff99SB-ILDN'`; use obc2 otherwise.")
-        if self.force_field in (QUANTUM, MODEL) and self.solvent not in ("vacuum", "auto"):
-            raise PreparationError(f"{self.force_field} has no solvent; leave `solvent` out or give vacuum.")
+        if self.solvent in QUANTUM_SOLVENTS and self.force_field != QUANTUM:
+            raise PreparationError(
+                f"solvent {self.solvent!r} goes with `level='{QUANTUM}'`; use obc2 or tip3p otherwise."
+            )
+        own = {QUANTUM: QUANTUM_SOLVENTS, MODEL: ()}.get(self.force_field, SOLVENTS)
+        if self.solvent not in (*own, "vacuum", "auto"):
+            instead = "".join(f"{name}, " for name in own)
+            raise PreparationError(
+                f"{self.force_field} has no solvent {self.solvent!r}; give {instead}vacuum, or leave `solvent` out."
+            )
         if self.force_field == "charmm36" and self.solvent == "opc":
             raise PreparationError("charmm36 has no parameters for OPC water and its ions; use `solvent='tip3p'`.")
 

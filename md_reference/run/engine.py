@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import solute_of
+from md_reference.forces.quantum import refuse_rearranged
+from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
 from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
 from md_reference.run.machine import platform_properties
@@ -199,7 +201,8 @@ class Engine:
     def minimise(self, *, max_iterations: int = 0) -> float:
         """Minimise in place (L-BFGS until converged when 0) and return the energy in kJ/mol.
 
-        Raises SimulationError when the energy is not finite, as with atoms on top of each other.
+        Raises SimulationError when the energy is not finite, as with atoms on top of each other, and PreparationError
+        where quantum forces lead to another molecule.
         """
         import openmm
 
@@ -213,6 +216,8 @@ class Engine:
         energy = self.energy()
         if not math.isfinite(energy):
             raise SimulationError("minimisation failed: the energy is no longer finite")
+        if self.spec.force_field == QUANTUM:
+            refuse_rearranged(self.scene, self.positions())
         return energy
 
     def thermalise(self) -> None:

@@ -14,11 +14,12 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import is_water, molecules_of
-from md_reference.forces.quantum import Potential
+from md_reference.forces.quantum import Potential, check_minimum
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
+from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.graph import turn_torsions
 from systems.errors import PreparationError, SimulationError
 from systems.parent_watch import end_with_parent
@@ -43,30 +44,36 @@ _DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
 _DEAR_LIGHT = replace(_DEAR, timestep_ps=0.0005, hydrogen_mass_da=None)
 # Every so many-th hot state has one of its torsions turned to any angle.
 _TURN_EVERY = 3
+# Bonds of hot states are stretched, which a potential must learn; those longer than this, in radii, are broken.
+_BROKEN = 1.6
 _worker: Potential | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
     """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in
-    kJ/mol/nm; `failed`: how many more were asked for, at which the truth finds no answer."""
+    kJ/mol/nm; `failed`: how many more were asked for, at which the truth finds no answer; `rearranged`: those that are
+    another molecule, at which it was not asked."""
 
     positions_nm: FloatArray
     energies_kj_mol: FloatArray
     forces_kj_mol_nm: FloatArray
     failed: int = 0
+    rearranged: int = 0
 
 
 class Teacher:
     """GFN2-xTB of one molecule. Use as a context manager or call `close`.
 
-    Raises PreparationError for what GFN2-xTB refuses.
+    `n_rearranged` counts the states that were left out since they are another molecule.
+    Raises PreparationError for what GFN2-xTB refuses, and for a molecule whose minimum is another one.
     """
 
     def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
         self.scene = scene
         self._potential = Potential(scene)
-        self._potential(scene.positions_nm)  # what the method refuses is known before anything runs
+        check_minimum(scene)  # what the method refuses is known before anything runs
+        self.n_rearranged = 0
         n_workers = workers or available_cores()
         self._pool: Any = None
         if n_workers > 1:
@@ -88,8 +95,11 @@ class Teacher:
             self._pool = None
 
     def label(self, positions_nm: FloatArray) -> Labels:
-        """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out."""
-        states = list(np.asarray(positions_nm, dtype=np.float64))
+        """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out, as are those
+        of another molecule."""
+        asked = list(np.asarray(positions_nm, dtype=np.float64))
+        states = [state for state in asked if not changed_bond(self.scene, state, stretch=_BROKEN)]
+        self.n_rearranged += len(asked) - len(states)
         if self._pool is None:
             answers = [_answer(self._potential, state) for state in states]
         else:
@@ -101,6 +111,7 @@ class Teacher:
             np.array([energy for _, (energy, _) in good]),
             np.array([forces for _, (_, forces) in good]).reshape(shape),
             len(states) - len(good),
+            len(asked) - len(states),
         )
 
     def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:

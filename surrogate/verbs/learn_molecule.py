@@ -61,4 +61,7 @@ def learn_molecule(
         if not options.quiet:
             tell(request.out.name, f"{scene.name} ({scene.formula}) by {QUANTUM}; weights know this molecule alone")
         after_s = trial_s(PainetPotential(config), scene)
-        return trainer.learn(truth, request, advance, before_s=time.monotonic() - began, after_s=after_s)
+        out = trainer.learn(truth, request, advance, before_s=time.monotonic() - began, after_s=after_s)
+        if truth.n_rearranged and not options.quiet:
+            tell(out.name, f"{truth.n_rearranged} states left out: their bonds are those of another molecule")
+        return out

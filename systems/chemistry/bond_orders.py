@@ -46,7 +46,7 @@ def perceive(
     for i, j in bonds.tolist():
         neighbours[i].append(j)
         neighbours[j].append(i)
-    found = _Kekule(elements, bonds, neighbours)
+    found = _Kekule(elements, bonds, neighbours, positions_nm)
     orders, charges, bad = found.orders, found.charges, found.bad
     valence = np.zeros(len(elements))
     np.add.at(valence, bonds.ravel(), np.repeat(orders, 2))
@@ -74,6 +74,8 @@ def perceive(
         better = lewis_structure([elements[i] for i in atoms], own)
         if better is None and positions_nm is not None:  # with every carbon flat, one of them may be an ion
             better = lewis_structure([elements[i] for i in atoms], own, carbon_ions=True)
+            if better is not None and _has_lone_carbon_ion(elements, neighbours, atoms, better[1]):
+                better = None  # it may be an anion as well as a cation, or miss a hydrogen
         if better is None:
             raise ValenceError(sorted(molecule & set(bad)) or sorted(molecule & doubtful))
         if positions_nm is not None:
@@ -93,13 +95,30 @@ def bent_carbons(
     for i in sorted(atoms):
         if elements[i] != "C" or len(neighbours[i]) not in (2, 3):
             continue
-        arms = positions_nm[neighbours[i]] - positions_nm[i]
-        arms = arms / np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-9)
+        arms = _arms(neighbours[i], i, positions_nm)
         if (len(arms) == 3 and abs(float(np.linalg.det(arms))) > _FLAT) or (
             len(arms) == 2 and float(arms[0] @ arms[1]) > _STRAIGHT
         ):
             bent.append(i)
     return bent
+
+
+def _arms(near: Sequence[int], i: int, positions_nm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Unit vectors `(n, 3)` from an atom to its neighbours."""
+    arms = positions_nm[list(near)] - positions_nm[i]
+    return np.asarray(arms / np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-9))
+
+
+def _has_lone_carbon_ion(
+    elements: Sequence[str], neighbours: Sequence[Sequence[int]], atoms: Sequence[int], charges: npt.NDArray[np.int64]
+) -> bool:
+    """Whether a carbon is charged beside nothing but hydrogens and saturated carbons, as in CH3."""
+
+    def is_saturated(j: int) -> bool:
+        return elements[j] == "H" or (elements[j] == "C" and len(neighbours[j]) == 4)
+
+    charged = (i for i, q in zip(atoms, charges.tolist(), strict=True) if q and elements[i] == "C")
+    return any(all(is_saturated(j) for j in neighbours[i]) for i in charged)
 
 
 def _refuse_bent(
@@ -120,8 +139,14 @@ class _Kekule:
     zero where it has too many bonds.
     """
 
-    def __init__(self, elements: Sequence[str], bonds: npt.NDArray[np.int64], neighbours: list[list[int]]) -> None:
-        self._elements, self._neighbours = elements, neighbours
+    def __init__(
+        self,
+        elements: Sequence[str],
+        bonds: npt.NDArray[np.int64],
+        neighbours: list[list[int]],
+        positions_nm: npt.NDArray[np.float64] | None,
+    ) -> None:
+        self._elements, self._neighbours, self._positions_nm = elements, neighbours, positions_nm
         self.charges = np.zeros(len(elements), dtype=np.int64)
         self.order = {(min(i, j), max(i, j)): 1 for i, j in bonds.tolist()}
         self._open = [self._open_valence(i) for i in range(len(elements))]
@@ -162,6 +187,10 @@ class _Kekule:
             room = 0
             if symbol == "N" and degree == 3 and len(ends) >= 2:
                 room, self.charges[i] = 1, 1
+            elif symbol in ("O", "S", "Se") and len(ends) == degree == 2:  # ozone, SO2: neutral
+                room, self.charges[i] = (1, 1) if symbol == "O" else (2, 0)
+            elif symbol in ("S", "Se") and len(ends) == degree == 3 and self._is_flat(i):  # SO3; sulfite is no plane
+                room = 3
             elif (symbol, degree) in (("P", 4), ("S", 3), ("Se", 3)):
                 room = 1
             elif symbol in ("S", "Se") and degree == 4:
@@ -171,6 +200,11 @@ class _Kekule:
                 self._open[j] -= 1
             if not ends[:room] and ((symbol in ("S", "Se") and degree == 3) or (symbol == "P" and degree == 4)):
                 self.charges[i] = 1  # sulfonium, phosphonium
+
+    def _is_flat(self, i: int) -> bool:
+        if self._positions_nm is None:
+            return False
+        return abs(float(np.linalg.det(_arms(self._neighbours[i], i, self._positions_nm)))) < _FLAT
 
     def _pair(self) -> None:
         """Double bonds between open valences, then triple ones."""

@@ -15,6 +15,8 @@ from systems.errors import PreparationError
 from systems.scene import Scene
 
 _TOLERANCE_NM = 0.04
+# A bond longer than so many sums of covalent radii is none.
+_BOND_STRETCH = 1.3
 
 
 def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -> Scene:
@@ -110,3 +112,28 @@ def _with_images(
     places = (inside[None] + shifts[:, None]).reshape(-1, 3)
     kept = ((places > -margin) & (places < 1.0 + margin)).all(axis=1)
     return np.tile(np.arange(len(x)), len(shifts))[kept], places[kept] @ cell
+
+
+def changed_bond(scene: Scene, positions_nm: npt.ArrayLike, *, stretch: float = _BOND_STRETCH) -> str:
+    """Return what of the scene's bonds does not hold at `positions_nm` (n_atoms, 3), in words; empty where all hold.
+
+    A bond is lost where it is longer than `stretch` sums of covalent radii; a hydrogen has moved where it is nearest,
+    in units of that sum, to an atom it is not bonded to.
+    """
+    if not len(scene.bonds):
+        return ""
+    x = np.asarray(positions_nm, dtype=np.float64)
+    radii = np.array([covalent_radius_nm(e) for e in scene.elements])
+    length = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    reach = length / (radii[:, None] + radii[None])
+    np.fill_diagonal(reach, np.inf)
+    bonded = np.zeros_like(reach, dtype=bool)
+    first, second = scene.bonds.T
+    bonded[first, second] = bonded[second, first] = True
+    name = scene.atom_names
+    for h in (k for k, e in enumerate(scene.elements) if e == "H" and bonded[k].any()):
+        nearest, parent = int(np.argmin(reach[h])), int(np.argmin(np.where(bonded[h], reach[h], np.inf)))
+        if not bonded[h, nearest]:
+            return f"{name[h]} moves from {name[parent]} to {name[nearest]} ({length[h, parent] * 10:.2f} Å away)"
+    i, j = scene.bonds[int(np.argmax(reach[first, second]))].tolist()
+    return f"{name[i]} - {name[j]} breaks ({length[i, j] * 10:.2f} Å)" if reach[i, j] > stretch else ""

@@ -38,6 +38,7 @@ _CYCLOPENTADIENIDE: _State = (3, -1, 20.0)
 _CYANIDE: _State = (3, -1, 20.0)
 _AZIDE_END: _State = (2, -1, 13.0)
 _OXONIUM: _State = (3, 1, 22.0)
+_OZONE: _State = (3, 1, 0.0)
 # Real molecules take milliseconds; a protein without its hydrogens may be hopeless.
 _LONGEST_S = 30.0
 # Of a net charge on a group of conjugated atoms, an elementary charge.
@@ -120,6 +121,8 @@ def _states(
         states = _MIDDLE
     elif symbol == "N" and len(near) == 1 and around[0][0] in ("N", "P", "S"):
         states = (*states, _AZIDE_END)
+    elif symbol == "O" and around == [("O", 1)] * 2:
+        states = (_OZONE,)
     elif symbol == "O" and (i in rings or around == [("C", 1)]):
         states = (*states, _OXONIUM)
     return states

@@ -45,7 +45,7 @@ def note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: np
                 residue.missing.append("OXT")
             if found is None:
                 needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
-            if template.name == "CYS" and residue.key[2].upper() not in ("CYM", "CYX", "CYS2"):
+            if template.name == "CYS" and residue.key[2].upper() != "CYM":
                 needed["SG"] = 0 if "SG" in links or "SG" not in heavy else 1
         residue.lacks_hydrogens = any(hydrogens(heavy[a]) < n for a, n in needed.items() if a in heavy)
         if template.name == "HIS" and {"ND1", "NE2"} <= set(heavy):

@@ -55,7 +55,9 @@ def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequen
     """Return Modeller's name of the protonation that the residue's own hydrogens or name show, or None."""
     name = residue.key[2].upper()
     named = {"HSD": "HID", "HSE": "HIE", "HSP": "HIP", "ASPP": "ASH", "GLUP": "GLH", "LSN": "LYN"}.get(name, name)
-    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN", "CYX"):
+    if named in ("CYX", "CYS2"):  # without its partner it is a cysteine like any other
+        return "CYX" if "SG" in links_of(residue, neighbours) else None
+    if named in ("HID", "HIE", "HIP", "ASH", "GLH", "LYN"):
         return named
     if named == "CYM":
         return "CYX"

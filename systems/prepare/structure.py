@@ -13,7 +13,7 @@ from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.components import component
 from systems.chemistry.element_data import atomic_weight_da
 from systems.chemistry.residues import template_for
-from systems.errors import PreparationError
+from systems.errors import PreparationError, listed
 from systems.prepare.read.records import AtomRecord
 from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
@@ -48,6 +48,8 @@ def scene_from_records(
             f"the bonds of {faulty}{more} fit no valence; give the structure with all hydrogens, "
             "and with CONECT records if its geometry is unusual."
         ) from error
+    if "repairs" in provenance and (said := _perceived_charges(atoms, bonds, charges)):
+        provenance = provenance | {"repairs": [*provenance["repairs"], said]}
     residue_of_atom, keys = residue_runs(atoms)
     return Scene(
         name=name,
@@ -64,6 +66,20 @@ def scene_from_records(
         positions_nm=positions_nm,
         provenance=provenance,
     )
+
+
+def _perceived_charges(
+    atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64], charges: npt.NDArray[np.int64]
+) -> str:
+    """A line about charges that follow from bonds alone: of atoms of unknown residues, and of thiolates not named so;
+    monatomic ions are theirs by name."""
+    bonded = set(bonds.ravel().tolist())
+    found = [
+        f"{atom_label(atom)} {q:+d}"
+        for i, (atom, q) in enumerate(zip(atoms, charges.tolist(), strict=True))
+        if q and i in bonded and (not _is_known(atom) or (atom.element == "S" and atom.residue_name != "CYM"))
+    ]
+    return f"charges that no file states, by bonds and hydrogens: {listed(found)}" if found else ""
 
 
 def _is_known(atom: AtomRecord) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import InputError, PreparationError, UnknownNameError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
+from systems.scene import FloatArray, Scene
 
 pytest.importorskip("tblite")
 SPEC = ForceFieldSpec("gfn2-xtb", "vacuum", None, constrain_hydrogens=False)
@@ -160,9 +163,42 @@ def test_level_and_settings_go_together() -> None:
         settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.005})
 
 
-def test_impossible_electrons_are_refused() -> None:
-    from dataclasses import replace
+ZWITTERION = "[NH3+]CC(=O)[O-]"
 
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_a_zwitterion_that_vacuum_makes_neutral_is_refused_by_the_bond_that_moves(rigid: bool) -> None:
+    def minimum_nm(smiles: str, solvent: str) -> tuple[Scene, FloatArray]:
+        scene = scene_from_smiles(smiles)
+        spec = replace(SPEC, solvent=solvent, constrain_hydrogens=rigid)
+        with Engine(scene, Conditions(force=spec, platform="Reference", timestep_ps=0.0005)) as engine:
+            engine.minimise()
+            return scene, engine.positions()
+
+    with pytest.raises(PreparationError, match=r"H\d moves from N1 to O\d .*`solvent='alpb-water'`") as caught:
+        minimum_nm(ZWITTERION, "vacuum")
+    assert "\n" not in str(caught.value)
+    # The neutral form in vacuum and the zwitterion in water stay what they are.
+    for smiles, solvent in (("NCC(=O)O", "vacuum"), (ZWITTERION, "alpb-water")):
+        scene, at = minimum_nm(smiles, solvent)
+        i, j = scene.bonds[np.array([scene.elements[i] == "N" and scene.elements[j] == "H" for i, j in scene.bonds])].T
+        assert (np.linalg.norm(at[i] - at[j], axis=1) < 0.112).all()
+
+
+def test_water_by_alpb_stabilises_ions_and_is_of_this_level_alone() -> None:
+    for smiles, least, most in ((ZWITTERION, 60.0, 300.0), ("C", -20.0, 20.0)):
+        scene = scene_from_smiles(smiles)
+        dry, wet = (Potential(scene, solvent)(scene.positions_nm)[0] for solvent in ("vacuum", "alpb-water"))
+        assert least < dry - wet < most, smiles
+    copied = pickle.loads(pickle.dumps(Potential(scene, "alpb-water")))
+    assert copied(scene.positions_nm)[0] == pytest.approx(wet, abs=1e-6)
+    with pytest.raises(PreparationError, match="gfn2-xtb"):
+        ForceFieldSpec("ff14SB", "alpb-water")
+    with pytest.raises(PreparationError, match="give alpb-water, vacuum"):
+        ForceFieldSpec("gfn2-xtb", "obc2")
+
+
+def test_impossible_electrons_are_refused() -> None:
     scene = scene_from_smiles("CO")
     wrong = replace(scene, provenance=scene.provenance | {"multiplicity": 2})
     with pytest.raises(PreparationError, match="unpaired"):

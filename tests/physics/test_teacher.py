@@ -14,6 +14,7 @@ from md_reference.forces.quantum import Potential
 from md_reference.run.teacher import Teacher
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
+from systems.scene import FloatArray, Scene
 
 pytest.importorskip("tblite")
 
@@ -37,11 +38,45 @@ def test_answers_are_the_potentials_own_whoever_computes_them() -> None:
 
 def test_states_without_an_answer_are_left_out_and_counted() -> None:
     scene = scene_from_smiles("CO")
-    states = np.stack([scene.positions_nm, np.zeros_like(scene.positions_nm)])
+    states = scene.positions_nm + np.array([0.0, 1.0])[:, None, None]
+
+    def silent(positions_nm: FloatArray) -> tuple[float, FloatArray]:
+        if positions_nm[0, 0] > 0.5:
+            raise PreparationError("no electronic ground state")
+        return 0.0, np.zeros_like(positions_nm)
+
     with Teacher(scene, workers=1) as teacher:
+        teacher._potential = silent  # type: ignore[assignment]
         found = teacher.label(states)
-    assert found.failed == 1
+    assert (found.failed, found.rearranged) == (1, 0)
     np.testing.assert_array_equal(found.positions_nm, states[:1])
+
+
+def test_states_of_another_molecule_are_left_out_and_counted() -> None:
+    scene = scene_from_smiles("NCC(=O)O")
+    moved, stretched = scene.positions_nm.copy(), scene.positions_nm.copy()
+    acid = next(j for i, j in scene.bonds.tolist() if (scene.elements[i], scene.elements[j]) == ("O", "H"))
+    moved[acid] = moved[0] + 0.102 * _away(moved, 0, scene)
+    first, second = scene.bonds[0]
+    stretched[first] += 0.4 * (stretched[first] - stretched[second])
+    with Teacher(scene, workers=1) as teacher:
+        found = teacher.label(np.stack([scene.positions_nm, moved, stretched]))
+        assert teacher.label(scene.positions_nm[None]).rearranged == 0
+        assert teacher.n_rearranged == 1
+    assert (found.rearranged, found.failed) == (1, 0)
+    np.testing.assert_array_equal(found.positions_nm, np.stack([scene.positions_nm, stretched]))
+
+
+def _away(x: FloatArray, atom: int, scene: Scene) -> FloatArray:
+    """The direction `(3,)` in which an atom has no neighbours."""
+    near = [j if i == atom else i for i, j in scene.bonds.tolist() if atom in (i, j)]
+    arm = x[atom] - x[near].mean(axis=0)
+    return arm / np.linalg.norm(arm)
+
+
+def test_a_molecule_that_the_truth_makes_another_is_not_learned() -> None:
+    with pytest.raises(PreparationError, match="moves from N1 to O"), Teacher(scene_from_smiles("[NH3+]CC(=O)[O-]")):
+        pass
 
 
 def test_hot_states_keep_their_bonds_and_turn_their_torsions() -> None:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import networkx as nx
-import numpy as np
 
 from md_reference.forces.small_molecules import parameter_cache
 from md_reference.forces.small_molecules.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
@@ -19,10 +18,10 @@ from md_reference.forces.small_molecules.parameter_cache import Entry
 from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.forces.small_molecules.programs import scratch_folder
 from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
-from systems.chemistry.element_data import covalent_radius_nm
+from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError, StorageError
-from systems.scene import FloatArray, Scene
+from systems.scene import Scene
 from systems.units import format_wall
 
 METHOD = "gaff2-am1bcc"
@@ -31,7 +30,6 @@ _ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl
 # `charge_cost` says how SQM's cost grows: hours from here on.
 LARGEST = 250
 _CHARGE_TOLERANCE_E = 0.01
-_BOND_STRETCH = 1.3
 # The angle of hydrogen cyanide in gaff2.dat; `_run_parmchk2` says what it is for.
 _CANARY = "ha-c1-n1"
 _PARMCHK2_RUNS = 100
@@ -263,17 +261,7 @@ def _check(scene: Scene, made: Prmtop) -> None:
 def _rearranged(scene: Scene, pdb: Path) -> bool:
     """Return whether the geometry sqm ended with has lost a bond or moved a hydrogen to another atom."""
     lines = [line for line in pdb.read_text().splitlines() if line.startswith(("ATOM", "HETATM"))]
-    x: FloatArray = np.array([[float(line[k : k + 8]) for k in (30, 38, 46)] for line in lines]) / 10.0
-    radius = np.array([covalent_radius_nm(e) for e in scene.elements])
-    gaps = np.linalg.norm(x[:, None] - x[None], axis=-1)
-    np.fill_diagonal(gaps, np.inf)
-    i, j = scene.bonds.T
-    if (gaps[i, j] > _BOND_STRETCH * (radius[i] + radius[j])).any():
-        return True
-    bonded = np.zeros_like(gaps, dtype=bool)
-    bonded[i, j] = bonded[j, i] = True
-    reach = gaps / (radius[:, None] + radius[None])
-    return any(not bonded[h, np.argmin(reach[h])] for h, e in enumerate(scene.elements) if e == "H")
+    return bool(changed_bond(scene, [[float(line[k : k + 8]) / 10.0 for k in (30, 38, 46)] for line in lines]))
 
 
 def _sdf(scene: Scene) -> str:

@@ -263,3 +263,74 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
 def test_d_residues_in_sequences_are_refused_with_the_reason(text: str, named: str) -> None:
     with pytest.raises(PreparationError, match=rf"{named} is a D-residue; sequences are built of L-residues alone"):
         prepare(f"sequence:{text}")
+
+
+# ---- charges that no file states ----------------------------------------------------------------------------------
+
+
+def _molecule_pdb(path: Path, name: str, elements: str, positions_angstrom: list[tuple[float, float, float]]) -> str:
+    """A file of one residue, its first atom bonded to all others."""
+    rows = [
+        f"HETATM{k:5d}  {element}{k:<2d} {name} A   1    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {element}\n"
+        for k, (element, (x, y, z)) in enumerate(zip(elements, positions_angstrom, strict=True), 1)
+    ]
+    bonds = [f"CONECT    1{k:5d}\n" for k in range(2, len(elements) + 1)]
+    return _write(path, *rows, *bonds)
+
+
+BENT = [(0.0, 0.0, 0.363), (1.238, 0.0, -0.363), (-1.238, 0.0, -0.363)]
+FLAT = [(0.0, 0.0, 0.0), (1.43, 0.0, 0.0), (-0.715, 1.238, 0.0), (-0.715, -1.238, 0.0)]
+PYRAMID = [(0.0, 0.0, 0.55), *((x, y, 0.0) for x, y, _ in FLAT[1:])]
+
+
+@pytest.mark.parametrize(
+    ("elements", "positions", "charges", "orders"),
+    [
+        ("SOO", BENT, [0, 0, 0], [2, 2]),
+        ("OOO", BENT, [-1, 0, 1], [1, 2]),
+        ("SOOO", FLAT, [0, 0, 0, 0], [2, 2, 2]),
+        ("SOOO", PYRAMID, [-1, -1, 0, 0], [1, 1, 2]),
+        ("NOO", BENT, [-1, 0, 0], [1, 2]),
+    ],
+    ids=["sulfur dioxide", "ozone", "sulfur trioxide", "sulfite", "nitrite"],
+)
+def test_a_neutral_structure_is_preferred_where_one_fits(
+    tmp_path: Path, elements: str, positions: list[tuple[float, float, float]], charges: list[int], orders: list[int]
+) -> None:
+    scene = prepare(_molecule_pdb(tmp_path / "x.pdb", "UNX", elements, positions))
+    assert sorted(scene.formal_charges.tolist()) == charges
+    assert sorted(scene.bond_orders.tolist()) == orders
+    said = [line for line in scene.provenance["repairs"] if line.startswith("charges that no file states")]
+    assert len(said) == any(charges) and all(line.count("-1") == charges.count(-1) for line in said)
+
+
+def test_a_carbon_that_may_be_either_ion_is_refused(tmp_path: Path) -> None:
+    flat = [(0.76 * x, 0.76 * y, z) for x, y, z in FLAT]
+    with pytest.raises(PreparationError, match="all hydrogens"):
+        prepare(_molecule_pdb(tmp_path / "x.pdb", "UNX", "CHHH", flat))
+    assert prepare(_molecule_pdb(tmp_path / "y.pdb", "UNX", "BHHH", flat)).formal_charges.tolist() == [0] * 4
+
+
+def _cysteines(path: Path, name: str, *, hydrogens: bool) -> str:
+    scene = prepare("ACE-CYS-NME")
+    kept = [
+        line.replace("CYS", name)
+        for line in pdb_text(scene).splitlines()
+        if line.startswith("ATOM") and line[12:16].strip() != "HG" and (hydrogens or line[76:78].strip() != "H")
+    ]
+    return _write(path, "\n".join(kept) + "\n")
+
+
+@pytest.mark.parametrize("hydrogens", [True, False])
+def test_a_cysteine_named_as_bonded_without_its_partner_is_neutral(tmp_path: Path, hydrogens: bool) -> None:
+    scene = prepare(_cysteines(tmp_path / "x.pdb", "CYX", hydrogens=hydrogens))
+    assert not scene.formal_charges.any()
+    assert "protonation at pH 7: CYS neutral: CYX A2" in scene.provenance["repairs"]
+    # A thiolate that the file names is one, and a basic pH makes one and says so.
+    named = prepare(_cysteines(tmp_path / "y.pdb", "CYM", hydrogens=hydrogens))
+    assert named.formal_charges.sum() == -1
+    basic = prepare(str(tmp_path / "x.pdb"), ph=11.0)
+    assert basic.formal_charges.sum() == -1
+    assert any(
+        line.startswith("charges that no file states") and "SG -1" in line for line in basic.provenance["repairs"]
+    )
