@@ -21,6 +21,7 @@ from surrogate.cli.parameters import (
     OutOpt,
     SceneArg,
     WeightsOpt,
+    literal,
     usage_error,
     with_options,
 )
@@ -206,7 +207,16 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
     print_written(api.reference(scene, out, options=options), as_json, options.quiet)
 
 
-@app.command()
+_CAMPAIGN = """An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):\n
+scenes = ["alanine-dipeptide", "pdb/*.pdb"]\n
+temperatures = ["300K", "350K"]\n
+replicas = 4\n
+time = "100ns"\n
+save_every = "10ps"
+"""
+
+
+@app.command(epilog=literal(_CAMPAIGN))
 @with_options
 def campaign(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
@@ -327,7 +337,9 @@ def compare(
 def info(
     path: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's folder."),
+        typer.Argument(
+            metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's or a run's folder."
+        ),
     ],
     scene: Annotated[
         str | None, typer.Argument(metavar="SCENE", help="Of weights: say whether they cover it, and how nearly.")

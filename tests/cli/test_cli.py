@@ -57,6 +57,12 @@ def test_a_rollout_of_a_pdb_file_loads_no_library_that_it_does_not_need(tmp_path
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_help_of_a_campaign_shows_a_file() -> None:
+    shown = run("campaign", "--help").stdout
+    assert 'temperatures = ["300K", "350K"]' in shown
+    assert "temperatures" not in run("reference", "--help").stdout, "control"
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
     result = run(command, "--help")
