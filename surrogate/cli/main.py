@@ -6,6 +6,7 @@ import atexit
 import gc
 import os
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -356,6 +357,17 @@ def info(
         print_pairs(found)
 
 
+def _hush_readers() -> None:
+    """Keep warnings of MDTraj and MDAnalysis from the terminal: what matters in a file our readers say, in a line."""
+    show = warnings.showwarning
+
+    def shown(message: Any, category: Any, filename: str, *where: Any, **more: Any) -> None:
+        if not {"mdtraj", "MDAnalysis"} & set(Path(filename).parts):
+            show(message, category, filename, *where, **more)
+
+    warnings.showwarning = shown
+
+
 def main() -> None:
     """Entry point of the command `surromd`."""
     # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when
@@ -365,6 +377,8 @@ def main() -> None:
     # when the process ends, took a third of a short command's time.
     gc.set_threshold(_YOUNG_OBJECTS)
     atexit.register(gc.freeze)
+    if os.environ.get("SURROMD_DEBUG") != "1":
+        _hush_readers()
     try:
         with interrupted_by_signals():
             app(prog_name="surromd")
