@@ -26,8 +26,9 @@ def prepare(spec: str, options: Preparation) -> Scene:
     Atoms keep the file's order and names when nothing has to be added. What was added, chosen or left out stands, a
     line each, in `scene.provenance["repairs"]`. `ph` decides the protonation of amino acids where hydrogens are
     missing. Waters are left out unless `keep_water` (for explicit solvent; `drop_water` states the default), and with
-    them free ions, which no N, O or S of the rest holds, unless `keep_ligand`. Other ions and ligands beside a peptide
-    are refused until one says what becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
+    them free ions, which no N, O or S of the rest holds, and agents of crystallisation and buffers (glycerol, DMSO,
+    sulfate and the like), unless `keep_ligand`. Other ions and ligands beside a peptide are refused until one says what
+    becomes of them; so is a chain that breaks, unless `cap_breaks` closes both ends
     with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """

@@ -234,11 +234,21 @@ def name_of(source: str) -> str:
     kind = _kind(source)
     text = source.partition(":")[2] if kind else Path(source).name.removesuffix(".gz")
     stem = text if kind or "." not in text else text.rsplit(".", 1)[0]
-    plain = re.sub(r"[^A-Za-z0-9._+-]+", "_", stem).strip("._-+")[:_LONGEST_NAME]
-    if plain == stem and kind.lower() != "smiles":
-        return plain
     # SMILES differ in case and in signs that file names cannot have.
-    return f"{plain or kind or 'scene'}-{sha256(source.encode()).hexdigest()[:6]}"
+    return _hashed(stem, source, kind) if kind.lower() == "smiles" else file_name_of(stem, source, kind)
+
+
+def file_name_of(name: str, source: str = "", kind: str = "") -> str:
+    """A name that files can have, of one that need not be: where they differ with a hash of `source`, else of it."""
+    return name if _plain(name) == name else _hashed(name, source or name, kind)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._+-]+", "_", name).strip("._-+")[:_LONGEST_NAME]
+
+
+def _hashed(name: str, source: str, kind: str) -> str:
+    return f"{_plain(name) or kind or 'scene'}-{sha256(source.encode()).hexdigest()[:6]}"
 
 
 def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> list[Run]:

@@ -21,9 +21,10 @@ from systems.scene import Scene
 class Unmatched(Exception):
     """No template of the force field has the bonds of this residue."""
 
-    def __init__(self, residue: str) -> None:
-        super().__init__(residue)
-        self.residue = residue
+    def __init__(self, scene: Scene, residue: int) -> None:
+        self.residue = _describe(scene, residue)
+        self.is_atom = int((scene.residue_of_atom == residue).sum()) == 1
+        super().__init__(self.residue)
 
 
 def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) -> Any:
@@ -43,9 +44,14 @@ def build_templated(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = Tru
     try:
         return permuted(_build(regrouped, spec, native_gb), order)
     except Unmatched as error:
+        advice = (
+            "hydrogens as they are; leave `force_field` out, or give `force_field='ff14SB+gaff2'`, for residues that "
+            "it lacks"
+        )
+        if error.is_atom:  # whatever was asked for, lone atoms are the templates'
+            advice = "a lone atom that is none of its ions; give the whole molecule, or use `level='gfn2-xtb'`"
         raise PreparationError(
-            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, hydrogens as they are; "
-            "leave `force_field` out, or give `force_field='ff14SB+gaff2'`, for residues that it lacks."
+            f"{spec.force_field} has no parameters for {error.residue} of scene {scene.name!r}, {advice}."
         ) from error
 
 
@@ -100,7 +106,7 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         elif spec.force_field != "charmm36" and not names:
             # CHARMM's terminal residues are patches, which only createSystem tries; sugars have names, not bonds alone.
             for residue in force_field.getUnmatchedResidues(topology):
-                raise Unmatched(_describe(scene, residue.index))
+                raise Unmatched(scene, residue.index)
         system = force_field.createSystem(
             topology,
             residueTemplates=_chosen_templates(topology)
@@ -118,7 +124,7 @@ def _build(scene: Scene, spec: ForceFieldSpec, native_gb: bool) -> Any:
         reason = (str(error).splitlines() or ["no reason given"])[0]
         absent = re.match(r"No template found for residue (\d+)", reason)
         if absent:
-            raise Unmatched(_describe(scene, int(absent[1]))) from error
+            raise Unmatched(scene, int(absent[1])) from error
         raise PreparationError(f"{spec.force_field} cannot describe scene {scene.name!r}: {reason}") from error
     if spec.solvent == "obc2" and native_gb:
         system.addForce(implicit_solvent.native_obc2(topology, system))

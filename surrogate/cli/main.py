@@ -6,6 +6,7 @@ import atexit
 import gc
 import os
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +22,7 @@ from surrogate.cli.parameters import (
     OutOpt,
     SceneArg,
     WeightsOpt,
+    literal,
     usage_error,
     with_options,
 )
@@ -206,7 +208,16 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
     print_written(api.reference(scene, out, options=options), as_json, options.quiet)
 
 
-@app.command()
+_CAMPAIGN = """An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):\n
+scenes = ["alanine-dipeptide", "pdb/*.pdb"]\n
+temperatures = ["300K", "350K"]\n
+replicas = 4\n
+time = "100ns"\n
+save_every = "10ps"
+"""
+
+
+@app.command(epilog=literal(_CAMPAIGN))
 @with_options
 def campaign(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
@@ -327,7 +338,9 @@ def compare(
 def info(
     path: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's folder."),
+        typer.Argument(
+            metavar="FILE", help="A trajectory, windows, weights (or their name), a campaign's or a run's folder."
+        ),
     ],
     scene: Annotated[
         str | None, typer.Argument(metavar="SCENE", help="Of weights: say whether they cover it, and how nearly.")
@@ -344,6 +357,17 @@ def info(
         print_pairs(found)
 
 
+def _hush_readers() -> None:
+    """Keep warnings of MDTraj and MDAnalysis from the terminal: what matters in a file our readers say, in a line."""
+    show = warnings.showwarning
+
+    def shown(message: Any, category: Any, filename: str, *where: Any, **more: Any) -> None:
+        if not {"mdtraj", "MDAnalysis"} & set(Path(filename).parts):
+            show(message, category, filename, *where, **more)
+
+    warnings.showwarning = shown
+
+
 def main() -> None:
     """Entry point of the command `surromd`."""
     # Threads that spin while they wait make a step a hundred times slower where other work shares the cores. Read when
@@ -353,6 +377,8 @@ def main() -> None:
     # when the process ends, took a third of a short command's time.
     gc.set_threshold(_YOUNG_OBJECTS)
     atexit.register(gc.freeze)
+    if os.environ.get("SURROMD_DEBUG") != "1":
+        _hush_readers()
     try:
         with interrupted_by_signals():
             app(prog_name="surromd")

@@ -9,15 +9,17 @@ from typing import Any
 from surrogate.data.shipped import shipped_weights
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.options import PathLike
-from systems.errors import InputError, OutOfDomainError
+from systems.errors import InputError, OutOfDomainError, first_line
+from systems.files.outside import UNREADABLE, content
+from systems.files.schema import parsed
 from systems.units import format_time_ps
 
 UNSEEN = "a molecule that the weights were not trained on: compare with MD of it before you trust it"
 
 
 def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
-    """Return what a trajectory, a windows or weights file or a campaign's folder is and where it came from (JSON-able).
-    Shipped weights may be given by name.
+    """Return what a trajectory, a windows or weights file or the folder of a campaign or a run is and where it came
+    from (JSON-able). Shipped weights may be given by name.
 
     `scene`: anything that a rollout takes; of weights it is then said whether they cover it, and how near what they
     were trained on comes to it. Raises InputError when there is no such file, or `scene` is asked of other files,
@@ -31,7 +33,28 @@ def info(path: PathLike, scene: str | None = None) -> dict[str, Any]:
         if named.suffix.lower() != ".safetensors":
             raise InputError(f"{path} is no weights file; what covers {scene} can be asked of weights alone.")
         return _coverage(named, scene)
-    return describe_campaign(named) if named.is_dir() else describe_file(named)
+    if not named.is_dir():
+        return describe_file(named)
+    return _run(named) or describe_campaign(named)
+
+
+def _run(folder: Path) -> dict[str, Any] | None:
+    """Return what the folder of a run, or of runs of many molecules, says of itself; None for another folder."""
+    path = next((file for file in (folder / "run.json", folder / "results.json") if file.is_file()), None)
+    if path is None:
+        return None
+    try:
+        found = parsed(content(path))
+        if path.name == "run.json":
+            outcome, stages = found["outcome"], len(found["stages"])
+            summary = outcome["headline"] if outcome else f"not done; {stages} stages have ended"
+            return {"file": str(folder), "type": "run", "summary": summary, **found}
+        lines = {line["name"]: f"failed: {line['failed']}" if line["failed"] else line["headline"] for line in found}
+    except UNREADABLE as error:
+        raise InputError(f"{path} cannot be read as the record of a run ({first_line(error)}).") from None
+    n_done = sum(not line["failed"] for line in found)
+    summary = f"{n_done} of {len(found)} molecules judged"
+    return {"file": str(folder), "type": "runs", "summary": summary, "molecules": lines}
 
 
 def _coverage(path: Path, scene: str) -> dict[str, Any]:

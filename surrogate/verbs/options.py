@@ -200,7 +200,7 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
 class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting, Quiet):
     """What `run` can be told. `workers` and `scheduler` are those of many molecules."""
 
-    budget_s: float = option("Wall time to spend in all, such as 1h.")
+    budget_s: float = option("Wall time to spend in all, such as 1h.", 600.0)
     way: str = option("MD, a surrogate, or what pays best here.", "auto", choices=("auto", "md", "surrogate"))
     weights: str | Path | None = option(
         "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"

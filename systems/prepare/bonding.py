@@ -72,11 +72,17 @@ def find_bonds(
     free = _free_atoms(residues, bonds, notes)
     _note_bonds_across_ends(peptide, of_atom, chain_ends, notes)
     bonds |= _bonds_by_distance(atoms, near, length, free, ions, bonds, notes)
-    bonds |= _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
+    to_parents, strays = _hydrogen_bonds_to_parents(atoms, x, bonds, of_atom, free, ions)
+    bonds |= to_parents
     bonds |= _disulfides(atoms, near, length, bonds, of_atom)
     bonds |= _links_of_components(atoms, near, length, of_atom, ions)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
     note_missing(residues, atoms, bonded)
+    for i, error in strays.items():
+        if not of_atom[i].missing:
+            raise error
+    if strays:
+        notes.append(f"hydrogens left out whose atoms are missing: {listed([atom_label(atoms[i]) for i in strays])}")
     unmade = [
         f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({10 * np.linalg.norm(x[i] - x[j]):.2f} Å)"
         for i, j in conect
@@ -251,12 +257,13 @@ def _hydrogen_bonds_to_parents(
     of_atom: dict[int, Residue],
     free: set[int],
     ions: set[int],
-) -> set[tuple[int, int]]:
-    """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing."""
+) -> tuple[set[tuple[int, int]], dict[int, PreparationError]]:
+    """Each hydrogen to the nearest heavy atom of its residue, or of all where the residue's names say nothing; and what
+    is wrong with those of standard residues that are far from everything: their heavy atoms may be missing."""
     bonded = {i for pair in bonds for i in pair}
     heavy = np.array([i for i, a in enumerate(atoms) if a.element != "H" and i not in ions], dtype=np.int64)
     tree: Any = None
-    found = set()
+    found, strays = set(), {}
     for i, atom in enumerate(atoms):
         if atom.element != "H" or i in bonded:
             continue
@@ -274,9 +281,13 @@ def _hydrogen_bonds_to_parents(
             parent, distance = int(heavy[k]), float(gap)
         if distance > _HYDROGEN_NM:
             nearest = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
-            raise PreparationError(f"Hydrogen {atom_label(atom)} is {nearest}; correct or remove it.")
-        found.add(_pair(i, parent))
-    return found
+            error = PreparationError(f"Hydrogen {atom_label(atom)} is {nearest}; correct or remove it.")
+            if not of_atom[i].heavy or template_for(of_atom[i].key[2]) is None:
+                raise error
+            strays[i] = error
+        else:
+            found.add(_pair(i, parent))
+    return found, strays
 
 
 def _links_of_components(

@@ -15,29 +15,50 @@ from systems.errors import PreparationError, listed
 from systems.prepare.bonded_residues import Bonding
 from systems.prepare.bonding import are_ions
 from systems.prepare.read.records import AtomRecord
+from systems.prepare.waters import WATER_BOND_ANGSTROM
 
-_WATER_BOND_ANGSTROM = 1.3
 _BOUND_ANGSTROM = 3.0
+# Nearer than waters come to each other, farther than a bond between oxygens.
+_PEROXIDE_ANGSTROM = 1.8
+# What crystals are grown from and frozen in, and what peptides are delivered as salts of: component and heavy atoms.
+_AGENTS = {
+    "1PE": "C10O6", "ACN": "C3O", "ACT": "C2O2", "ACY": "C2O2", "AZI": "N3", "BCT": "CO3", "BME": "C2OS",
+    "BTB": "C8NO5", "CAC": "AsC2O2", "CCN": "C2N", "CIT": "C6O7", "CO3": "CO3", "DIO": "C4O2", "DMF": "C3NO",
+    "DMS": "C2OS", "DTT": "C4O2S2", "EDO": "C2O2", "EOH": "C2O", "EPE": "C8N2O4S", "FLC": "C6O7", "FMT": "CO2",
+    "GOL": "C3O3", "IMD": "C3N2", "IPA": "C3O", "MES": "C6NO4S", "MLI": "C3O4", "MOH": "CO", "MPD": "C6O2",
+    "MRD": "C6O2", "NH4": "N", "NO3": "NO3", "P6G": "C12O7", "PEG": "C4O3", "PG4": "C8O5", "PGE": "C6O4",
+    "PGO": "C3O2", "PO4": "O4P", "SCN": "CNS", "SO4": "O4S", "TFA": "C2F3O2", "TLA": "C4O6", "TRS": "C4NO3",
+}  # fmt: skip
 
 
 def is_water(atoms: Sequence[AtomRecord]) -> bool:
     """Whether the atoms of a residue are one or more waters: told by elements and distances, never by name alone.
 
-    Each oxygen has two hydrogens of its own within 1.3 Å; where hydrogens are left out (all, or one of two), the
-    residue's name must be one of water's.
+    Each oxygen has two hydrogens of its own within 1.3 Å. Under one of water's names also what is left of waters that
+    are cut or split by a cell: oxygens apart from each other with two hydrogens each at most, and hydrogens alone.
     """
     oxygens = [a.position_angstrom for a in atoms if a.element == "O"]
     hydrogens = [a.position_angstrom for a in atoms if a.element == "H"]
-    if not oxygens or len(oxygens) + len(hydrogens) < len(atoms):
+    if len(oxygens) + len(hydrogens) < len(atoms):
         return False
-    if len(hydrogens) < 2 * len(oxygens):
-        return is_water_name(atoms[0].residue_name) and (not hydrogens or len(oxygens) == 1)
+    if is_water_name(atoms[0].residue_name):
+        return not oxygens or (len(hydrogens) <= 2 * len(oxygens) and _are_apart(oxygens))
+    if len(hydrogens) < 2 * len(oxygens) or not oxygens:
+        return False
     if len(oxygens) == 1:  # of a box of water, each
-        return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < _WATER_BOND_ANGSTROM for h in hydrogens)
+        return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < WATER_BOND_ANGSTROM for h in hydrogens)
     from scipy.spatial import cKDTree
 
     gaps, owners = cKDTree(oxygens).query(hydrogens)
-    return bool((gaps < _WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
+    return bool((gaps < WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
+
+
+def _are_apart(oxygens: Sequence[tuple[float, float, float]]) -> bool:
+    if len(oxygens) == 1:  # of a box of water, each
+        return True
+    from scipy.spatial import cKDTree
+
+    return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
 
 
 def settle_solvent(
@@ -49,9 +70,16 @@ def settle_solvent(
     within 3 Å. Of a file that holds nothing else, all stays.
     """
     runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
+    runs = [run for run in runs if not is_water_name(atoms[run[0]].residue_name)]
+    named: dict[tuple[str, str, str], list[int]] = {}  # all oxygens may stand before all hydrogens
+    for i in kept:
+        if is_water_name(atoms[i].residue_name):
+            named.setdefault(atoms[i].residue_key, []).append(i)
+    runs += named.values()
     water = [run for run in runs if is_water([atoms[i] for i in run])]
     ions = [[i] for run in runs if are_ions([atoms[i] for i in run]) for i in run]
     wet = {i for run in water for i in run}
+    cut = {i for run in water if not any(atoms[i].element == "O" for i in run) for i in run}
     apart = wet | {i for run in ions for i in run}
     solute = [i for i in kept if i not in apart]
     if not solute:
@@ -61,10 +89,11 @@ def settle_solvent(
     free = set() if keep_ions else _free(atoms, [run[0] for run in ions], solute)
     count = Counter(atoms[i].residue_name for i in kept if i in free)
     names = listed([f"{n} {name}" if n > 1 else name for name, n in count.items()])
-    gone = [*waters, *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else [])]
+    halves = [f"{len(cut)} hydrogen{'s' if len(cut) > 1 else ''} of waters without oxygen"] if cut else []
+    gone = [*waters, *halves, *([f"free ion{'s' if len(free) > 1 else ''} {names}"] if free else [])]
     if gone:
         notes.append(f"{' and '.join(gone)} left out")
-    return [i for i in kept if i not in wet and i not in free], sorted(wet) if keep_water else []
+    return [i for i in kept if i not in wet and i not in free], sorted(wet - cut) if keep_water else []
 
 
 def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int]) -> set[int]:
@@ -93,6 +122,23 @@ def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:
     for residue in bonding.residues:  # a hydrogen-less or oddly bonded ligand can fall apart: whole residues only
         if not set(residue.atoms) <= found:
             found -= set(residue.atoms)
+    return sorted(found)
+
+
+def agent_atoms(atoms: Sequence[AtomRecord], ligands: Sequence[int], notes: list[str]) -> list[int]:
+    """Indices of those ligands that are agents of crystallisation, buffers and counter-ions, by name and by elements;
+    `notes` says which are left out."""
+    found, names = [], []
+    for _, run in groupby(sorted(ligands, key=lambda i: atoms[i].residue_key), key=lambda i: atoms[i].residue_key):
+        members = list(run)
+        count = Counter(atoms[i].element for i in members if atoms[i].element != "H")
+        heavy = "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
+        if _AGENTS.get(atoms[members[0]].residue_name.upper()) == heavy:
+            found += members
+            names.append(atoms[members[0]].residue_name)
+    if found:
+        said = listed([f"{n} {name}" if n > 1 else name for name, n in Counter(names).items()])
+        notes.append(f"crystallisation agents and buffers left out (`keep_ligand=True` keeps them): {said}")
     return sorted(found)
 
 

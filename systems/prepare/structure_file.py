@@ -19,7 +19,7 @@ from systems.prepare.bonding import find_bonds, links_residues
 from systems.prepare.clashes import check_contacts
 from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
 from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
-from systems.prepare.heterogens import ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
+from systems.prepare.heterogens import agent_atoms, ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
 from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mmcif_file import is_component
 from systems.prepare.read.modified_residues import describe_residue, standardise
@@ -31,6 +31,8 @@ from systems.prepare.waters import complete_waters
 from systems.prepare.whole import made_whole
 from systems.scene import Scene
 
+# Of a standard residue's atoms in any protonation, bonds to hydrogen among them.
+_MOST_BONDS = {"C": 4, "N": 4, "O": 2, "S": 2}
 _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
@@ -62,6 +64,12 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     if bonding.unmade:
         repairs.append(f"stated bonds that are not made: {listed(bonding.unmade)}")
     ligands = ligand_atoms(structure.atoms, bonding)
+    if not (options.keep_ligand or options.drop_ligand):
+        agents = agent_atoms(structure.atoms, ligands, repairs)
+        if agents:
+            structure = structure.without(agents)
+            bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
+            ligands = ligand_atoms(structure.atoms, bonding)
     if ligands:
         stays = settle_ligands(
             structure.atoms, ligands, keep=options.keep_ligand, drop=options.drop_ligand, notes=repairs
@@ -96,6 +104,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
         hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)
     say_inverted(hands, repairs)
+        _refuse_surplus_hydrogens(bonding, atoms)
     if ligands and stays:
         bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
         atoms = [*atoms, *others.atoms]
@@ -246,6 +255,20 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
                 f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
                 f"standard residues alone: add all its heavy atoms{instead}."
             )
+
+
+def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
+    """Of standard residues: more hydrogens on an atom than any protonation has."""
+    neighbours = bonding.neighbours
+    for residue in bonding.residues:
+        for name, i in residue.heavy.items() if template_for(residue.key[2]) is not None else ():
+            hydrogens = [atoms[j].name for j in neighbours[i] if atoms[j].element == "H"]
+            surplus = len(neighbours[i]) - _MOST_BONDS.get(atoms[i].element, len(neighbours[i]))
+            if hydrogens and surplus > 0:
+                raise PreparationError(
+                    f"{residue.label} {name} has {len(hydrogens)} hydrogens ({' '.join(hydrogens)}), {surplus} too "
+                    "many; remove what it cannot have, or all hydrogens, which are then placed anew."
+                )
 
 
 def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:

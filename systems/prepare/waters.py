@@ -12,6 +12,7 @@ from systems.prepare.read.records import AtomRecord
 
 FloatArray = npt.NDArray[np.float64]
 
+WATER_BOND_ANGSTROM = 1.3
 _OH_ANGSTROM = 0.9572
 _HALF_HOH = np.radians(104.52 / 2)
 _SEEN_ANGSTROM = 3.5
@@ -23,8 +24,8 @@ def complete_waters(
 ) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
     """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`.
 
-    A hydrogen belongs to the nearest oxygen. Oxygens without their two are given new ones, turned away from what
-    stands near (of `others` and the waters); `notes` says to how many.
+    A hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away
+    from what stands near (of `others` and the waters); `notes` says to how many.
     """
     from scipy.spatial import cKDTree
 
@@ -34,7 +35,9 @@ def complete_waters(
     tree = cKDTree(places)
     for atom in waters:
         if atom.element == "H":
-            own[int(tree.query(atom.position_angstrom)[1])].append(atom)
+            gap, k = tree.query(atom.position_angstrom)
+            if gap < WATER_BOND_ANGSTROM:
+                own[int(k)].append(atom)
     bare = [k for k, hydrogens in enumerate(own) if len(hydrogens) != 2]
     around = np.array([a.position_angstrom for a in [*others, *waters]])
     crowd = cKDTree(around)

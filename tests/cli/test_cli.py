@@ -57,6 +57,39 @@ def test_a_rollout_of_a_pdb_file_loads_no_library_that_it_does_not_need(tmp_path
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_help_of_a_campaign_shows_a_file() -> None:
+    shown = run("campaign", "--help").stdout
+    assert 'temperatures = ["300K", "350K"]' in shown
+    assert "temperatures" not in run("reference", "--help").stdout, "control"
+
+
+DUMP = "".join(
+    f"ITEM: TIMESTEP\n{k}\nITEM: NUMBER OF ATOMS\n1\nITEM: BOX BOUNDS pp pp pp\n0 9\n0 9\n0 9\n"
+    f"ITEM: ATOMS id type x y z\n1 1 1.0 2.0 {k}.0\n"
+    for k in range(3)
+)
+
+
+@pytest.mark.parametrize("debug", ["0", "1"])
+def test_warnings_of_other_libraries_do_not_reach_the_terminal(tmp_path: Path, debug: str) -> None:
+    (tmp_path / "x.lammpsdump").write_text(DUMP)
+    (tmp_path / "x.pdb").write_text(
+        "HETATM    1 AR   AR  A   1       1.000   2.000   0.000  1.00  0.00          AR\nEND\n"
+    )
+    code = (
+        "import sys, warnings; from surrogate.cli import main as cli; from systems.trajectory.codec import *\n"
+        "def read():\n"
+        "    reader = open_trajectory(cli.Path(sys.argv[1]), top=cli.Path(sys.argv[2]))\n"
+        "    warnings.warn('our own'); reader.read(0, 2)\n"
+        "cli.app = lambda **_: read(); cli.main()"
+    )
+    files = [str(tmp_path / "x.lammpsdump"), str(tmp_path / "x.pdb")]
+    done = subprocess.run([sys.executable, "-c", code, *files], capture_output=True, text=True, check=True,
+                          env={**os.environ, "SURROMD_DEBUG": debug})  # fmt: skip
+    assert "our own" in done.stderr, "control"
+    assert ("MDAnalysis" in done.stderr) == (debug == "1"), done.stderr
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
     result = run(command, "--help")

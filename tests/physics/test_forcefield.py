@@ -242,3 +242,13 @@ def test_unknown_names_are_one_line_with_the_nearest(arguments: dict[str, str], 
 def test_the_radii_of_one_force_field_are_refused_with_another() -> None:
     with pytest.raises(PreparationError, match="ff99SB-ILDN"):
         ForceFieldSpec("ff14SB", "amber99-obc")
+
+
+@pytest.mark.parametrize("smiles", ["[H]", "[H+]", "[O]"])
+def test_a_lone_atom_that_is_no_ion_blames_no_flag(smiles: str) -> None:
+    with pytest.raises(PreparationError, match="a lone atom") as caught:
+        build_system(prepare(f"smiles:{smiles}"), ForceFieldSpec("auto", "auto"))
+    assert "force_field" not in str(caught.value) and "gfn2-xtb" in str(caught.value)
+    assert build_system(prepare("smiles:[Cl-]"), ForceFieldSpec("auto", "auto")).getNumParticles() == 1, "control"
+    with pytest.raises(PreparationError, match="leave `force_field` out"):
+        build_system(prepare("smiles:CCO"), ForceFieldSpec("ff14SB", "auto"))

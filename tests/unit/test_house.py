@@ -134,3 +134,17 @@ def test_no_modules_import_each_other(tmp_path: Path, monkeypatch: pytest.Monkey
     (room / "second.py").write_text("def b():\n    from circular_example import first\n\n    return first.a\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert circles("circular_example") == [["circular_example.first", "circular_example.second"]]
+
+
+def untyped(root: Path) -> set[str]:
+    """Return the packages whose annotations a type checker of other people does not see: installed without py.typed."""
+    data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    return {p for p in PACKAGES if "py.typed" not in data.get(p, []) or not (root / p / "py.typed").is_file()}
+
+
+def test_every_package_is_typed_where_it_is_installed(repository: Path, tmp_path: Path) -> None:
+    assert not untyped(repository)
+    (tmp_path / "systems").mkdir()
+    (tmp_path / "systems" / "py.typed").touch()
+    (tmp_path / "pyproject.toml").write_text('[tool.setuptools.package-data]\nsystems = ["py.typed"]\n')
+    assert untyped(tmp_path) == {"md_reference", "surrogate"}

@@ -18,7 +18,7 @@ from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, u
 from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
 from surrogate.judge.read.stored_frames import StoredFrames
 from surrogate.judge.read.truth_asked import reweighting_notes
-from systems.errors import InputError
+from systems.errors import InputError, listed
 from systems.scene import Scene
 from systems.selection import part_of
 from systems.units import format_time_ps
@@ -28,6 +28,8 @@ Flags = npt.NDArray[np.uint16]
 IntArray = npt.NDArray[np.int64]
 
 IN_MEMORY_BYTES = 128 * 2**20
+# What a note begins with of files that hold fewer frames than were asked for.
+STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
@@ -160,6 +162,7 @@ def load_ensemble(
     lags: list[float] = []
     notes: list[str] = []
     kept: list[IntArray] = []
+    stopped: list[str] = []
     for path in paths:
         opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
         reader, template = opened.reader, opened.template
@@ -184,8 +187,10 @@ def load_ensemble(
         records.append(dict(reader.record))
         scalars.append(reader.scalars)
         if records[-1].get("completed") is False:
-            notes.append(f"{path}: its writer was stopped before the end ({reader.n_frames} frames).")
+            stopped.append(f"{path} ({reader.n_frames} frames)")
     assert template is not None
+    if stopped:
+        notes.append(f"{STOPPED}: {listed(stopped, 3)}.")
     if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
         raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
     notes += unseen_notes(name, records) + intervention_notes(name, records) + reweighting_notes(name, records, scalars)

@@ -87,12 +87,17 @@ class Decision:
         return sum(stage.seconds for stage in self.stages if stage.name == name)
 
 
-def decide(rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: float | None = None) -> Decision:
+def decide(
+    rates: Rates, budget_s: float, way: str = "auto", *, save_every_ps: float | None = None, whole_s: float = 0.0
+) -> Decision:
     """Return how `budget_s` (what is left of it, in s of wall time) is spent; `way`: md, surrogate or auto.
+
+    `whole_s`: the budget that was asked for, of which measuring has taken some seconds already; it decides whether a
+    potential has time to learn, so that the least budget that is named is enough when it is given.
 
     Raises InputError for a budget in which nothing can be judged.
     """
-    chosen, why = _choose(rates, budget_s, way)
+    chosen, why = _choose(rates, max(budget_s, whole_s), way)
     shares = _shares(rates, chosen)
     least_s = least_budget_s(rates, chosen)
     if budget_s < least_s:
@@ -206,7 +211,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
             force_ms = 1e3 * rates.step_s
             return "potential", (f"a force of the truth takes {force_ms:.3g} ms; a potential learns it", none)
         least = format_wall(LEAST_TRAINING_S)
-        return "md", (f"a potential needs {least} or more to learn in: MD, however little", none)
+        return "md", (f"a potential needs a budget of {least} or more to learn in: MD, however little", none)
     if way == "surrogate":
         return "trained", ("asked for; MD is cheap, and what it is trained on would answer by itself", none)
     day = format_time_ps(rates.md_ps_per_s * 86_400, 2)

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import math
 import queue
+import re
 import uuid
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from md_reference.campaign.campaign_file import SCENE_FILES, ClusterSpec, SceneSpec, name_of, read_campaign
+from md_reference.campaign.campaign_file import (
+    SCENE_FILES,
+    ClusterSpec,
+    SceneSpec,
+    file_name_of,
+    name_of,
+    read_campaign,
+)
 from md_reference.campaign.cluster import open_client
 from md_reference.campaign.scheduler import result_of
 from md_reference.campaign.worker import guarded, poll, stop
@@ -21,7 +30,7 @@ from surrogate.verbs.run.one_scene import describe_run, run_scene
 from surrogate.verbs.run.results_page import write_results
 from surrogate.verbs.run.run_record import RUN_NAME, read_run
 from surrogate.verbs.telling import tell
-from systems.errors import InputError, SimulationError
+from systems.errors import InputError, PreparationError, SimulationError
 from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import deferred_interrupt
@@ -33,6 +42,8 @@ if TYPE_CHECKING:
 
 LIST_NAME = "molecules.txt"
 _LIST_SUFFIXES = (".smi", ".smiles")
+# What other programs call the first column of a list; no SMILES reads so.
+_TITLE = re.compile(r"\W*([a-z]+[ _-]?)?smi(les)?\W*", re.IGNORECASE)
 _POLL_EVERY_S = 2.0
 # Workers that were asked to stop have so long to come to the end of a frame.
 _STOP_PATIENCE_S = 60.0
@@ -40,10 +51,12 @@ _STOP_PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Molecules:
-    """Molecules to run, and on what: jobs of a `cluster`, if their file names one."""
+    """Molecules to run, and on what: jobs of a `cluster`, if their file names one. `unreadable`: the reasons of those
+    that are none, by name."""
 
     scenes: tuple[SceneSpec, ...]
     cluster: ClusterSpec | None = None
+    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -59,14 +72,15 @@ class MoleculeTask:
 
 def molecules_in(given: str | Path | Scene) -> Molecules | None:
     """Return the molecules that a user means by a list of SMILES, a folder of structures or a campaign's file; None for
-    one scene. Raises InputError for a list that is empty or cannot be read."""
+    one scene. Every SMILES is read, so that one that is none takes no share of a budget. Raises InputError for a list
+    that names no molecule."""
     if not isinstance(given, str | Path):
         return None
     path = Path(given)
     if path.suffix == ".toml":
         campaign = read_campaign(path)
-        return Molecules(campaign.scenes, campaign.cluster)
-    if path.suffix in _LIST_SUFFIXES:
+        return Molecules(campaign.scenes, campaign.cluster, _unreadable(campaign.scenes))
+    if path.suffix.lower() in _LIST_SUFFIXES:
         found = _smiles(path)
     elif path.is_dir():
         found = [(str(file.resolve()), "") for file in sorted(path.iterdir()) if file.suffix.lower() in SCENE_FILES]
@@ -78,17 +92,39 @@ def molecules_in(given: str | Path | Scene) -> Molecules | None:
     names = [spec.name.lower() for spec in specs]
     if twice := next((name for name in names if names.count(name) > 1), ""):
         raise InputError(f"{path}: two molecules are called {twice!r}; name them apart.")
-    return Molecules(tuple(specs))
+    unreadable = _unreadable(specs)
+    if len(unreadable) == len(specs):
+        raise InputError(f"{path}: no line begins with a SMILES that can be read: {unreadable[specs[0].name]}")
+    return Molecules(tuple(specs), None, unreadable)
 
 
 def _smiles(path: Path) -> list[tuple[str, str]]:
-    """Return the molecules of a list: a SMILES a line, and a name behind it if there is one."""
+    """Return the molecules of a list: a SMILES a line, and a name behind it, to the next tab, if there is one. A
+    first line that names its columns is none."""
     try:
-        lines = content(path).decode().splitlines()
+        lines = content(path).decode("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as a list of SMILES: {error}.") from None
     words = [line.split(maxsplit=1) for line in lines if line.strip() and not line.startswith("#")]
-    return [(f"smiles:{first}", name_of(rest[0].strip()) if rest else "") for first, *rest in words]
+    if words and _TITLE.fullmatch(words[0][0]):
+        del words[0]
+    names = [rest[0].partition("\t")[0].strip() if rest else "" for _, *rest in words]
+    return [(f"smiles:{line[0]}", file_name_of(name) if name else "") for line, name in zip(words, names, strict=True)]
+
+
+def _unreadable(specs: Sequence[SceneSpec]) -> dict[str, str]:
+    """Return why, by name, of those that are given as SMILES and are none."""
+    from systems.prepare.read.smiles import parse_smiles
+
+    found = {}
+    for spec in specs:
+        kind, _, text = spec.source.partition(":")
+        if kind.lower() == "smiles":
+            try:
+                parse_smiles(text.strip(), [])
+            except PreparationError as error:
+                found[spec.name] = str(error)
+    return found
 
 
 def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[str, Any]:
@@ -98,14 +134,17 @@ def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[st
     InputError for a folder that is not ours or a budget too short to judge each, KeyboardInterrupt with what is kept.
     """
     _open_folder(molecules, folder, options)
-    lacking = [spec for spec in molecules.scenes if not _is_done(folder / spec.name)]
-    failed: dict[str, str] = {}
+    failed = dict(molecules.unreadable)
+    lacking = [spec for spec in molecules.scenes if spec.name not in failed and not _is_done(folder / spec.name)]
+    if not options.quiet:
+        for name, reason in failed.items():
+            tell(name, reason)
     if lacking:
         with open_client(workers=options.workers, scheduler=options.scheduler, cluster=molecules.cluster,
                          folder=folder) as client:  # fmt: skip
             each = replace(options, budget_s=_share_s(len(lacking), client, molecules.cluster, options.budget_s))
             with progress_bar(f"run {len(lacking)} molecules", quiet=options.quiet) as advance:
-                failed = _hand_out(lacking, folder, each, client, advance)
+                failed |= _hand_out(lacking, folder, each, client, advance)
     results = [_result(spec, folder / spec.name, failed.get(spec.name, "")) for spec in molecules.scenes]
     write_results(folder, results)
     n_done = sum(not result["failed"] for result in results)

@@ -284,7 +284,7 @@ def _decide(
     # On a machine so busy that measuring took what the stages need, they get it all the same.
     least_s = min(options.budget_s, least_budget_s(rates, "md"))
     left_s = max(options.budget_s - spent_s(), least_s)
-    decision = decide(rates, left_s, options.way, save_every_ps=options.save_every_ps)
+    decision = decide(rates, left_s, options.way, save_every_ps=options.save_every_ps, whole_s=options.budget_s)
     weights = rates.rolls.weights if decision.way == "rollout" and rates.rolls else ""
     return replace(record, rates=rates, decision=decision, weights=weights)
 

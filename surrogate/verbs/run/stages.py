@@ -277,6 +277,13 @@ def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs
     return Costs(rolling_s, training_s, md_ps_per_s, record.settings["budget_s"])
 
 
+def worth_saying(notes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a comparison's notes without the one that files were stopped: the clock ends a stage, as is planned."""
+    from surrogate.judge.read.ensemble import STOPPED
+
+    return tuple(note for note in notes if not note.startswith(STOPPED))
+
+
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.judge.report.report import Foreword, write_report
 
@@ -288,6 +295,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
+    comparison = replace(comparison, notes=worth_saying(comparison.notes))
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     costs = costs_of(record, comparison, held_ps)
     bursts_file = site.folder / BURSTS_NAME

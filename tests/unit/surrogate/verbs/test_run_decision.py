@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from md_reference.run.machine import available_cores
+from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import Decision, PlannedStage, decide, report_s, seconds_of_first, table
 from surrogate.verbs.run.rates import Rates, Rolls, measured_stretch
 from surrogate.verbs.run.stage_clock import Pace
@@ -91,8 +92,13 @@ def test_stages_before_the_last_leave_the_others_what_was_planned() -> None:
 def test_dear_truth_is_learned_where_there_is_time_to() -> None:
     assert decide(DEAR, 3600.0).way == "potential"
     short = decide(DEAR, 60.0)
-    assert short.way == "md" and "needs 4 min" in short.why[0]
+    assert short.way == "md" and "needs a budget of 4 min" in short.why[0]
     assert decide(DEAR, 3600.0, "md").way == "md"
+
+
+def test_the_least_budget_that_is_named_is_enough_although_measuring_took_some_of_it() -> None:
+    assert decide(DEAR, 230.0, whole_s=240.0).way == "potential"
+    assert decide(DEAR, 230.0, whole_s=239.0).way == "md", "control"
 
 
 @pytest.mark.parametrize("rates", [COVERED, UNCOVERED, DEAR])
@@ -138,3 +144,7 @@ def test_a_budget_in_which_nothing_can_be_judged_is_refused() -> None:
     with pytest.raises(InputError, match="busy"):
         decide(replace(COVERED, stretch=6.0), 22.0)
     decide(COVERED, 22.0)
+
+
+def test_a_budget_that_is_not_given_is_ten_minutes() -> None:
+    assert RunOptions().budget_s == 600.0 and RunOptions(budget_s=60.0).budget_s == 60.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from quick_report import judged_at_once
 from surrogate import api
 from surrogate.verbs.options import TrainOptions
-from surrogate.verbs.run import one_scene, stages
+from surrogate.verbs.run import many_scenes, one_scene, stages
 from surrogate.verbs.run.many_scenes import molecules_in
 from surrogate.verbs.run.rates import Rates, Rolls
 from surrogate.verbs.run.results_page import write_results
@@ -79,6 +80,8 @@ def test_md_that_was_made_to_train_on_is_not_made_in_vain(tmp_path: Path, monkey
     found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
     ended = [(stage["name"], stage["status"]) for stage in found["stages"]]
     assert ended == [("training md", "done"), ("train", "failed"), ("held-out md", "done"), ("report", "done")]
+    told = api.info(tmp_path / "run")
+    assert told["type"] == "run" and told["summary"] == found["outcome"]["headline"]
     assert found["trajectory"] == found["training"] == ["reference/training_r0.h5", "reference/training_r1.h5"]
     assert found["held_out"] == ["reference/held_out_r0.h5", "reference/held_out_r1.h5"]
     assert "training diverged" in found["outcome"]["notes"][0]
@@ -157,16 +160,66 @@ def test_molecules_are_a_list_a_folder_or_a_campaign(tmp_path: Path) -> None:
     assert molecules_in("smiles:CCO") is None and molecules_in(pdbs / "mine.pdb") is None
 
 
+def test_a_title_line_is_no_molecule(tmp_path: Path) -> None:
+    for title in ("smiles\tid", "SMILES name", "canonical_smiles", '# a comment\n"Smiles"\tid', "\ufeffsmiles id"):
+        (tmp_path / "t.smi").write_text(f"{title}\nCCO\te1\nCCN\te2\n", encoding="utf-8")
+        found = molecules_in(tmp_path / "t.smi")
+        assert found is not None and [s.name for s in found.scenes] == ["e1", "e2"] and not found.unreadable
+    (tmp_path / "t.smi").write_text("CCO smiles\nCCN e2\n")
+    found = molecules_in(tmp_path / "t.smi")
+    assert found is not None and [s.name for s in found.scenes] == ["smiles", "e2"], "control"
+
+
+def test_a_list_with_a_title_that_others_reported(shared_data: Path) -> None:
+    found = molecules_in(shared_data / "reports" / "o_title.smi")
+    assert found is not None and [s.source for s in found.scenes] == ["smiles:CCO", "smiles:CCN"]
+
+
+def test_names_with_slashes_and_dots_keep_all_that_they_say(tmp_path: Path) -> None:
+    (tmp_path / "m.smi").write_text("CCO a/x\nCCN b/x\nCCC drug 1.5\nCCF ok-1.2\nCCS e1\t3.4\n")
+    found = molecules_in(tmp_path / "m.smi")
+    assert found is not None
+    names = [s.name for s in found.scenes]
+    assert names[0].startswith("a_x-") and names[1].startswith("b_x-") and names[2].startswith("drug_1.5-")
+    assert names[3:] == ["ok-1.2", "e1"], "control: a name that a file can have stays"
+    assert not any("/" in name for name in names)
+
+
+def test_lines_that_are_no_molecule_are_known_before_the_budget_is_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared: list[int] = []
+
+    def share_s(n: int, *_: object) -> float:
+        shared.append(n)
+        raise InputError("enough")
+
+    monkeypatch.setattr(many_scenes, "_share_s", share_s)
+    monkeypatch.setattr(many_scenes, "open_client", lambda **_: nullcontext())
+    (tmp_path / "m.smi").write_text("C1CC broken\nCCO fine\nC[Na] metal\n")
+    with pytest.raises(InputError, match="enough"):
+        api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, quiet=True)
+    assert shared == [1]
+    found = molecules_in(tmp_path / "m.smi")
+    assert found is not None and found.unreadable.keys() == {"broken", "metal"}
+    assert "cannot be read" in found.unreadable["broken"] and "Na" in found.unreadable["metal"]
+    (tmp_path / "none.smi").write_text("not a molecule\nat all\n")
+    with pytest.raises(InputError, match=r"none\.smi: no line begins with a SMILES"):
+        molecules_in(tmp_path / "none.smi")
+
+
 @pytest.mark.slow
 def test_what_fails_among_many_is_listed_with_its_reason(tmp_path: Path) -> None:
-    (tmp_path / "m.smi").write_text("C1CC broken\nC[Na] metal\n")
+    (tmp_path / "m.smi").write_text("C1CC broken\n[H] atom\n")
     found = api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, workers=1, quiet=True)
-    assert found["failed"].keys() == {"broken", "metal"} and found["summary"] == "0 of 2 molecules judged"
+    assert found["failed"].keys() == {"broken", "atom"} and found["summary"] == "0 of 2 molecules judged"
+    told = api.info(tmp_path / "runs")
+    assert told["type"] == "runs" and told["molecules"]["broken"].startswith("failed: ")
     assert "failed: " in (tmp_path / "runs" / "index.html").read_text("utf-8")
     with pytest.raises(InputError, match=r"resume=True"):
         api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, workers=1, quiet=True)
     with pytest.raises(InputError, match="15 s each"):
-        api.run(tmp_path / "m.smi", tmp_path / "more", budget_s=30.0, workers=1, quiet=True)
+        api.run(tmp_path / "m.smi", tmp_path / "more", budget_s=15.0, workers=1, quiet=True)
 
 
 def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from systems.chemistry.element_data import element_symbol, ion_symbol
-from systems.errors import InputError
+from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.prepare.bonding import find_bonds
 from systems.prepare.heterogens import is_water
@@ -57,6 +57,8 @@ def _write(path: Path, *parts: str) -> str:
         ("O H1 H2 H3", "HOH", "OHHH", False),  # hydronium
         ("O H", "OH", "OH", False),
         ("C O H1", "SOL", "COH", False),
+        ("H1 H2", "TIP3", "HH", True),  # a file that is cut
+        ("H1 H2", "LIG", "HH", False),
     ],
 )
 def test_water_is_told_by_its_elements(names: str, residue: str, elements: str, is_one: bool) -> None:
@@ -165,3 +167,76 @@ def test_kept_waters_are_completed_beside_the_peptide(tmp_path: Path) -> None:
     assert np.sort(gaps, axis=1)[:, 1].min() > 1.5  # but for its own oxygen
     with pytest.raises(InputError, match="exclude each other"):
         prepare(path, keep_water=True, drop_water=True)
+
+
+CUT = _line(920, "H1", "TIP3", 7, (9.0, 9.0, 9.0), "H")
+GLYCEROL = [("C1", "C", (0.0, 0.0, 0.0)), ("O1", "O", (-0.7, 1.2, 0.0)), ("C2", "C", (1.5, 0.0, 0.0)),
+            ("O2", "O", (2.0, -0.7, 1.2)), ("C3", "C", (2.1, 1.4, 0.0)), ("O3", "O", (3.5, 1.4, 0.0))]  # fmt: skip
+
+
+def _charmm_order() -> str:
+    """Three waters as CHARMM sorts them by atom, one of them split by the cell, and half of a fourth."""
+    places = [(25.0, 25.0, 5.0 * k) for k in range(3)]
+    waters = [_water(k + 1, at, "TIP3").splitlines(keepends=True) for k, at in enumerate(places)]
+    waters[1][1] = _line(901, "H1", "TIP3", 2, (-25.0, 25.0, 5.0), "H")
+    return "".join(water[part] for part in range(3) for water in waters) + CUT
+
+
+def test_waters_in_any_order_and_halves_of_waters_are_left_out(tmp_path: Path) -> None:
+    scene = prepare(_write(tmp_path / "x.pdb", PEPTIDE, _charmm_order()))
+    assert scene.provenance["repairs"] == ["3 water molecules and 1 hydrogen of waters without oxygen left out"]
+    assert scene.topology_hash == ALA2.topology_hash
+    stray = CUT.replace("TIP3", "LIG ")
+    with pytest.raises(PreparationError, match="H1"):  # control: under another name it is no water's
+        prepare(_write(tmp_path / "y.pdb", PEPTIDE, stray))
+
+
+def test_waters_in_any_order_are_whole_when_they_are_kept(tmp_path: Path) -> None:
+    scene = prepare(_write(tmp_path / "x.pdb", PEPTIDE, _charmm_order()), keep_water=True)
+    assert scene.n_atoms == 22 + 9
+    assert any("hydrogens placed on 1" in note for note in scene.provenance["repairs"])
+    i, j = scene.bonds.T
+    assert np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=1).max() < 0.2
+
+
+def _glycerol(residue: str, *, n_atoms: int = 6) -> str:
+    return "".join(
+        _line(930 + k, name, residue, 50, (20.0 + x, 20.0 + y, 20.0 + z), element)
+        for k, (name, element, (x, y, z)) in enumerate(GLYCEROL[:n_atoms])
+    )
+
+
+def test_crystallisation_agents_are_left_out_with_a_line(tmp_path: Path) -> None:
+    path = _write(tmp_path / "x.pdb", PEPTIDE, _glycerol("GOL"))
+    scene = prepare(path)
+    assert scene.provenance["repairs"] == [
+        "crystallisation agents and buffers left out (`keep_ligand=True` keeps them): GOL"
+    ]
+    assert scene.topology_hash == ALA2.topology_hash
+    with pytest.raises(PreparationError, match="GOL W50 has no hydrogens"):  # kept where it is asked for
+        prepare(path, keep_ligand=True)
+    dropped = prepare(path, drop_ligand=True).provenance["repairs"]
+    assert dropped == ["left out, as asked (`drop_ligand=True`): GOL W50"]
+
+
+@pytest.mark.parametrize(("residue", "n_atoms"), [("LIG", 6), ("GOL", 5)])
+def test_other_molecules_and_parts_under_an_agents_name_still_ask(tmp_path: Path, residue: str, n_atoms: int) -> None:
+    with pytest.raises(PreparationError, match=f"it holds {residue} W50"):
+        prepare(_write(tmp_path / "x.pdb", PEPTIDE, _glycerol(residue, n_atoms=n_atoms)))
+
+
+def test_an_agent_alone_is_the_molecule(tmp_path: Path) -> None:
+    full = prepare("smiles:CS(=O)C")
+    lines = [
+        _line(k + 1, name, "DMS", 1, tuple(10 * full.positions_nm[k]), full.elements[k])
+        for k, name in enumerate(full.atom_names)
+    ]
+    assert prepare(_write(tmp_path / "x.pdb", *lines)).formula == "C2H6OS"
+
+
+def test_one_hydrogen_too_many_is_said_so(tmp_path: Path, shared_data: Path) -> None:
+    lines = (shared_data / "reports" / "n_fourH.pdb").read_text().splitlines(keepends=True)
+    with pytest.raises(PreparationError, match=r"ALA A1 N has 4 hydrogens \(H1 H H2 H3\), 1 too many"):
+        prepare(_write(tmp_path / "x.pdb", *lines[:-1]))
+    without = [line for line in lines[:-1] if line[12:16].strip() != "H" or "ALA" not in line]
+    assert prepare(_write(tmp_path / "y.pdb", *without)).formal_charges.sum() == 0, "control: NH3+ and COO-"

@@ -372,7 +372,7 @@ def test_hard_files_prepare_or_are_refused_in_one_line(shared_data: Path) -> Non
         "ace.pdb": 17,
         "charges.pdb": 39,
         "conect_error.pdb": 17,
-        "elements.pdb": 0,
+        "elements.pdb": 17,
         "empty.dcd": 0,
         "incomplete.pdb": 0,
         "maestro_aaqaa_capped.pdb": 173,
@@ -381,6 +381,7 @@ def test_hard_files_prepare_or_are_refused_in_one_line(shared_data: Path) -> Non
         "unordered_res.pdb": 577,
         "varying_occ_tmp.pdb": 0,
     }
-    assert prepare(str(folder / "elements.pdb"), drop_ligand=True).n_atoms == 17
+    notes = prepare(str(folder / "elements.pdb")).provenance["repairs"]
+    assert "crystallisation agents and buffers left out (`keep_ligand=True` keeps them): 2 DMS" in notes
     with pytest.raises(PreparationError, match="DMS A101 has no hydrogens, which a ligand must bring"):
         prepare(str(folder / "elements.pdb"), keep_ligand=True)

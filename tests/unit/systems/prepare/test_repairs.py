@@ -334,3 +334,18 @@ def test_a_cysteine_named_as_bonded_without_its_partner_is_neutral(tmp_path: Pat
     assert any(
         line.startswith("charges that no file states") and "SG -1" in line for line in basic.provenance["repairs"]
     )
+
+
+@pytest.mark.parametrize("lost", [("OG",), ("CB",), ("CB", "OG")])
+def test_missing_atoms_are_added_although_their_hydrogens_are_there(tmp_path: Path, lost: tuple[str, ...]) -> None:
+    whole = prepare("sequence:ACE-SER-NME")
+    lines = [line for line in pdb_text(whole).splitlines(keepends=True) if line.startswith("ATOM")]
+    heavy = [line for line in lines if line[17:20] != "SER" or line[12:16].strip() not in lost]
+    scene = prepare(_write(tmp_path / "x.pdb", *heavy))
+    assert molecule_key(scene) == molecule_key(whole)
+    notes = " | ".join(scene.provenance["repairs"])
+    assert "hydrogens left out whose atoms are missing: SER A2 H" in notes and f"added {' '.join(lost)}" in notes
+    far = [line[:30] + f"{float(line[30:38]) + 5.0:8.3f}" + line[38:] if line[12:16].strip() == "HG" else line
+           for line in lines]  # fmt: skip
+    with pytest.raises(PreparationError, match="Hydrogen SER A2 HG is"):  # control: nothing is missing
+        prepare(_write(tmp_path / "y.pdb", *far))

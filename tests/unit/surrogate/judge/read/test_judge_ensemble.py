@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from surrogate.judge.read.ensemble import Ensemble, alike, load_ensemble
+from surrogate.verbs.run.stages import worth_saying
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
 from systems.scene import Scene
@@ -74,7 +75,9 @@ def test_one_file_is_read_as_it_is(save: Save, frames: np.ndarray, alanine_dipep
     assert np.array_equal(ensemble.segments[0], frames)
     assert ensemble.record["temperature_k"] == 300.0
     assert ensemble.chunk_idx is not None and ensemble.chunk_idx[0].max() == 3
-    assert any("was stopped before the end" in note for note in ensemble.notes)
+    assert any("Stopped before the end" in note and "a.h5 (60 frames)" in note for note in ensemble.notes)
+    assert not any("Stopped" in note for note in worth_saying((*ensemble.notes, "kept"))), "a clock's own stages"
+    assert "kept" in worth_saying((*ensemble.notes, "kept")), "control"
     assert ensemble.scene.topology_hash == alanine_dipeptide.topology_hash
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import mdtraj
 import numpy as np
 import pytest
 
@@ -21,7 +22,10 @@ from systems.errors import InputError, OutOfDomainError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.selection import part_of
+from systems.source import prepare
 from systems.trajectory.codec import open_writer
+from systems.trajectory.foreign_scenes import scene_from_structure
+from systems.trajectory.topology_file import pdb_text
 
 BOX = np.array([[2.4, 0.0, 0.0], [0.7, 2.2, 0.0], [-0.6, 0.5, 2.1]])
 
@@ -285,3 +289,39 @@ def test_what_a_file_does_not_state_is_asked_for_and_said(tmp_path: Path, alanin
     assert any("states no unit of length; Å is taken" in note for note in said.notes)
     stated = load_ensemble([tmp_path / "a.xtc"], template=alanine_dipeptide, top=top)
     assert stated.lag_ps == 0.5 and not any("unit of length" in note for note in stated.notes)
+
+
+def _xtc_and_topology(
+    folder: Path, scene: Scene, order: np.ndarray, *, copies: int = 1
+) -> tuple[Path, Path, np.ndarray]:
+    """Write ten frames of copies of a scene, atoms in this order, and their PDB file; return both and the frames."""
+    lines = [line for line in pdb_text(scene).splitlines() if line.startswith("ATOM")]
+    top, path = folder / "x.pdb", folder / "x.xtc"
+    x = scene.positions_nm + 0.002 * np.random.default_rng(0).normal(size=(10, scene.n_atoms, 3))
+    shifted = np.concatenate([x[:, order] + 3.0 * k for k in range(copies)], axis=1)
+    text = [f"{lines[i][:30]}{''.join(f'{10 * c:8.3f}' for c in scene.positions_nm[i] + 3.0 * k)}{lines[i][54:]}"
+            for k in range(copies) for i in order]  # fmt: skip
+    top.write_text("\n".join([*text, "END", ""]))
+    with mdtraj.formats.XTCTrajectoryFile(str(path), "w") as file:
+        file.write(shifted.astype(np.float32), time=np.arange(1.0, 11.0, dtype=np.float32))
+    return path, top, x
+
+
+def test_a_topology_with_its_atoms_shuffled_is_matched_by_its_bonds(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    order = np.random.default_rng(0).permutation(22)
+    path, top, x = _xtc_and_topology(tmp_path, alanine_dipeptide, order)
+    ensemble = load_ensemble([path], template=alanine_dipeptide, top=top)
+    heavy = [i for i, e in enumerate(alanine_dipeptide.elements) if e != "H"]
+    assert ensemble.segments[0][:, heavy] == pytest.approx(x[:, heavy], abs=2e-3)
+    assert any("reordered" in note for note in ensemble.notes)
+    whole = scene_from_structure(top, name="shuffled")
+    assert len(whole.bonds) == 21 and not whole.bond_orders.any()
+    other = prepare("smiles:CCCCCC(N)=O")
+    with pytest.raises(OutOfDomainError):  # control: it is no wildcard
+        load_ensemble([path], template=other, top=top)
+
+
+def test_copies_under_one_number_are_no_pieces(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+    _, top, _ = _xtc_and_topology(tmp_path, alanine_dipeptide, np.arange(22), copies=2)
+    whole = scene_from_structure(top, name="two")
+    assert whole.n_atoms == 44 and whole.bond_orders.any()
