@@ -103,8 +103,8 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     else:
         hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)
-    say_inverted(hands, repairs)
         _refuse_surplus_hydrogens(bonding, atoms)
+    say_inverted(hands, repairs)
     if ligands and stays:
         bonds = np.concatenate([bonds, others_bonding.bonds + len(atoms)])
         atoms = [*atoms, *others.atoms]
