@@ -48,7 +48,7 @@ class MDConfig(Conditions):
     time_ps: float = option("Simulated time, such as 10ns.")
     save_every_ps: float = option("Interval between saved frames.", 1.0)
     equilibrate_ps: float = option("So long before frames are written.", 100.0)
-    keep: str = option("Atoms written from explicit water: solute, all or auto (solute with --platform simd).", "auto")
+    keep: str = option("Atoms written from explicit water: solute, all or auto (solute on platform simd).", "auto")
     save_velocities: bool = option("Keep them with each frame (.h5).", False)
     save_forces: bool = option("Keep them with each frame (.h5).", False)
 
