@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,7 +89,7 @@ def _frames(path: Path) -> tuple[list[_Frame], tuple[str, ...]]:
                     moved[len(frames)] = order
                     frame = _Frame(frames[0].names, frame.positions_nm[order], frame.cell_nm)
                 frames.append(frame)
-    except (ValueError, IndexError, OSError, EOFError) as error:
+    except (ValueError, IndexError, OSError, EOFError, zlib.error) as error:
         raise TrajectoryError(f"{path} is damaged or cut short in frame {len(frames)} ({error}).") from error
     return frames, moved_note(moved)
 

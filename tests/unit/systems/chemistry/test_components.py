@@ -204,10 +204,10 @@ ADENYLATE = "P OP1 OP2 O5' C5' C4' O4' C3' O3' C2' O2' C1' N9 C8 N7 C5 C6 N6 N1 
 def test_a_phosphate_that_lacks_its_third_oxygen_is_refused(tmp_path: Path) -> None:
     ideal = scene_from_smiles(
         "OP(=O)(O)OC[C@H]1O[C@H]([C@H](O)[C@@H]1O)n1cnc2c(N)ncnc12"
-    )  # AMP: positions do not matter
+    )  # AMP: positions do not matter, but for bonds that are too long
     lines = []
     for k, name in enumerate(ADENYLATE.split()):
-        position = "".join(f"{v:8.3f}" for v in (ideal.positions_nm[k] * 10).tolist())
+        position = "".join(f"{v:8.3f}" for v in (ideal.positions_nm[k] * 2.5).tolist())
         lines.append(f"ATOM  {k + 1:5d}  {name:<4s}  A A   1    {position}  1.00  0.00{name[0]:>12s}")
     path = tmp_path / "a.pdb"
     path.write_text("\n".join([*lines, "END", ""]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import warnings
 from pathlib import Path
 
@@ -447,3 +448,18 @@ def test_folders_outside_ascii(folder: Path, tmp_path: Path, frames: np.ndarray,
         other.write_bytes(b"no frames")
         with pytest.raises(TrajectoryError, match=r"é\.xtc cannot be read"):
             open_trajectory(other)
+
+
+@pytest.mark.parametrize("damage", ["cut", "zeros"])
+def test_a_damaged_compressed_xyz_file_is_one_line(tmp_path: Path, damage: str) -> None:
+    rows = np.random.default_rng(0).random((300, 22, 3))
+    lines = (["22", "x", *("C {:.5f} {:.5f} {:.5f}".format(*atom) for atom in frame)] for frame in rows)
+    text = "".join(f"{line}\n" for frame in lines for line in frame)
+    whole = gzip.compress(text.encode())
+    path = tmp_path / "a.xyz.gz"
+    path.write_bytes(whole[: len(whole) // 2] if damage == "cut" else whole[:300] + bytes(200) + whole[500:])
+    with pytest.raises(TrajectoryError, match="is damaged or cut short in frame"):
+        open_trajectory(path)
+    path.write_bytes(whole)
+    with open_trajectory(path) as reader:
+        assert reader.n_frames == 300
