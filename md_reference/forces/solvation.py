@@ -82,7 +82,7 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0,
     chosen = _ion_sites(water[:, 0], solute, cell, len(kinds), rng)
     ions = water[chosen, 0]
     water = np.delete(water, chosen, axis=0)
-    # The volume of 1 bar: more exact than the mean of 200 ps with a barostat, whose error is 0.3 %.
+    # The volume of 1 bar, which some hundred ps with a barostat do not tell as well.
     wanted_nm3 = len(water) / density + solute_nm3 + sum(_NM3_OF_ION[kind] for kind in kinds)
     scale = (wanted_nm3 / volume_nm3) ** (1 / 3)
     cell, ions, middle = cell * scale, ions * scale, cell.sum(axis=0) / 2

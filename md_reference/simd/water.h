@@ -10,7 +10,7 @@
 // Pieces of the polynomial are as many as a register has elements: they are looked up in one.
 #define DEGREE (W == 16 ? 3 : W == 8 ? 4 : 6)
 #define ENERGY_DEGREE 14
-// Keeps GCC from undoing the order of the pair loops: with it they are a sixth faster.
+// Keeps GCC from undoing the order of the pair loops.
 #if defined(__GNUC__) && !defined(__clang__)
 #define TUNED __attribute__((optimize("no-tree-reassoc", "no-schedule-insns2", "no-tree-ter")))
 #else

@@ -62,7 +62,7 @@ def diffusion(oxygens: FloatArray) -> float:
     return float(np.polyfit(lags * SAVE_PS, square, 1)[0] / 6 * 1e3)
 
 
-def measures(frames: FloatArray, charges: FloatArray, edge: float) -> list[float]:
+def measures(frames: FloatArray, edge: float) -> list[float]:
     """Return the first shell and the diffusion of one run `(n_frames, n_atoms, 3)`."""
     oxygens = frames[:, ::3] - frames[:, ::3].mean(axis=1, keepdims=True)
     return [*first_shell(oxygens, edge), diffusion(oxygens)]
@@ -80,7 +80,7 @@ def permittivity(dipoles: Sequence[FloatArray], edge: float) -> tuple[float, flo
 
 
 def row(name: str, runs: Sequence[FloatArray], charges: FloatArray, edge: float) -> list[str]:
-    found = np.array([measures(run, charges, edge) for run in runs])
+    found = np.array([measures(run, edge) for run in runs])
     error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
     eps = permittivity([np.einsum("fad,a->fd", run, charges) for run in runs], edge)
     values = [*zip(found.mean(axis=0), error, strict=True), eps]
