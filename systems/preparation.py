@@ -12,12 +12,12 @@ from systems.options import option
 class Preparation:
     """How a Scene is made of what a user names: options of `systems.source.prepare`."""
 
-    ph: float = option("Where a peptide's hydrogens are added.", 7.0, within=(0.0, 14.0))
-    keep_ligand: bool = option("Simulate ligands and ions beside a peptide, too.", False)
-    drop_ligand: bool = option("Leave ligands and ions beside a peptide out.", False)
-    drop_water: bool = option("Leave the file's waters out, as is usual.", False)
-    keep_water: bool = option("Keep the file's waters, in explicit solvent.", False)
-    cap_breaks: bool = option("Close a chain that breaks with ACE and NME.", False)
+    ph: float = option("pH at which missing hydrogens of peptides are added.", 7.0, within=(0.0, 14.0))
+    keep_ligand: bool = option("Keep ligands and ions beside a peptide.", False)
+    drop_ligand: bool = option("Remove ligands and ions beside a peptide.", False)
+    drop_water: bool = option("Remove crystal waters (the default).", False)
+    keep_water: bool = option("Keep crystal waters (explicit solvent only).", False)
+    cap_breaks: bool = option("Cap chain breaks with ACE and NME.", False)
 
     def refuse_contradictions(self) -> None:
         """Raise InputError where something shall be both kept and left out."""

@@ -30,8 +30,10 @@ def parse_hydrogen_mass_da(text: str, what: str = "hydrogen mass") -> float | No
 class WaterBox:
     """The periodic cell of water that a scene is put into where the solvent is explicit. Raises InputError."""
 
-    padding_nm: float = option("Distance between periodic images, in explicit water.", 1.0, within=(0.3, 10.0))
-    ionic_strength_molar: float = option("Of NaCl in explicit water, beside counter-ions.", 0.0, within=(0.0, 5.0))
+    padding_nm: float = option("Distance between periodic images in explicit water.", 1.0, within=(0.3, 10.0))
+    ionic_strength_molar: float = option(
+        "NaCl concentration in explicit water, beyond counter-ions.", 0.0, within=(0.0, 5.0)
+    )
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -52,9 +54,13 @@ class ForceFieldSpec:
     'auto'.
     """
 
-    force_field: str = option("ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")
-    solvent: str = option("obc2, gbn2, tip3p, opc, vacuum, amber99-obc; alpb-water for gfn2-xtb.", "obc2")
-    hydrogen_mass_da: float | None = option("Repartitioned mass, or 'natural'.", 3.0, read=parse_hydrogen_mass_da)
+    force_field: str = option("Force field: ff14SB, ff19SB, ff99SB-ILDN, charmm36, gaff2, gfn2-xtb.", "ff14SB")
+    solvent: str = option(
+        "Solvent model: obc2, gbn2, tip3p, opc, vacuum, amber99-obc; alpb-water for gfn2-xtb.", "obc2"
+    )
+    hydrogen_mass_da: float | None = option(
+        "Mass of hydrogens after repartitioning, or 'natural'.", 3.0, read=parse_hydrogen_mass_da
+    )
     constrain_hydrogens: bool = True
 
     def __post_init__(self) -> None:

@@ -30,14 +30,14 @@ class Conditions:
     """
 
     force: ForceFieldSpec = field(default_factory=ForceFieldSpec)
-    temperature_k: float = option("Of the bath.", 300.0)
-    friction_per_ps: float = option("Of the Langevin bath.", 1.0)
-    timestep_ps: float = option("Integration step.", 0.004)
-    ensemble: str = option("nvt, nve or npt.", "nvt")
-    pressure_bar: float = option("Of the barostat (npt).", 1.0)
+    temperature_k: float = option("Thermostat temperature.", 300.0)
+    friction_per_ps: float = option("Langevin friction coefficient.", 1.0)
+    timestep_ps: float = option("Integration time step.", 0.004)
+    ensemble: str = option("Ensemble: nvt, nve or npt.", "nvt")
+    pressure_bar: float = option("Barostat pressure (npt).", 1.0)
     seed: int = 0
     platform: str = option(
-        "OpenMM platform; auto: the fastest, timed here; simd: 16 replicas at once on a core.", "auto"
+        "OpenMM platform; auto: the fastest, timed here; simd: 16 replicas at once on one core.", "auto"
     )
 
 
@@ -47,10 +47,10 @@ class MDConfig(Conditions):
 
     time_ps: float = option("Simulated time, such as 10ns.")
     save_every_ps: float = option("Interval between saved frames.", 1.0)
-    equilibrate_ps: float = option("So long before frames are written.", 100.0)
+    equilibrate_ps: float = option("Equilibration time before the first saved frame.", 100.0)
     keep: str = option("Atoms written from explicit water: solute, all or auto (solute on platform simd).", "auto")
-    save_velocities: bool = option("Keep them with each frame (.h5).", False)
-    save_forces: bool = option("Keep them with each frame (.h5).", False)
+    save_velocities: bool = option("Save velocities (.h5 only).", False)
+    save_forces: bool = option("Save forces (.h5 only).", False)
 
     @property
     def steps_per_frame(self) -> int:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 bench = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Benchmarks: what is fast, and by how much, on this machine.",
+    help="Benchmarks on this machine.",
 )
 
 
@@ -31,7 +31,7 @@ def _benchmarks() -> None:
 @bench.command()
 @with_options
 def reference(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the result here, .json.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output file (.json).")] = None,
     *,
     options: SpeedOptions,
     as_json: JsonOpt = False,
@@ -69,10 +69,12 @@ def reference(
 @bench.command(name="cost-error")
 @with_options
 def cost_error(
-    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Held-out run: a file, folder or glob.")],
-    replicate: Annotated[str, typer.Argument(metavar="REPLICATE", help="Another one, as long.")],
-    weights: Annotated[list[str], typer.Option("--weights", "-w", help="Name or .safetensors file; repeatable.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the tables and the plot.")] = Path("cost-error"),
+    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Held-out reference: a file, folder or glob.")],
+    replicate: Annotated[str, typer.Argument(metavar="REPLICATE", help="Independent reference of the same length.")],
+    weights: Annotated[
+        list[str], typer.Option("--weights", "-w", help="Weights by name or .safetensors file; repeatable.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("cost-error"),
     *,
     options: CostErrorOptions,
     as_json: JsonOpt = False,
@@ -103,9 +105,7 @@ def cost_error(
 @with_options
 def stress(
     weights: Annotated[str, typer.Argument(metavar="WEIGHTS", help="Name of shipped weights, or a .safetensors file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the tables, the plot and the rollouts.")] = Path(
-        "surromd-stress"
-    ),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("surromd-stress"),
     *,
     options: StressOptions,
     as_json: JsonOpt = False,

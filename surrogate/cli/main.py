@@ -117,7 +117,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Reference MD with OpenMM, learned surrogate rollouts, and a judge that compares the two.",
+    help="Reference MD with OpenMM, learned surrogate rollouts, and comparison of the two.",
     epilog="SCENE: library name, path (.pdb, .cif, .sdf, .mol, .mol2), smiles:CCO or sequence:ACE-ALA-NME. "
     "Durations carry units: 50ns, 10ps, 2fs.",
 )
@@ -136,9 +136,7 @@ def _surromd(
 @app.command()
 @with_options
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the report.")] = Path(
-        "surromd-demo"
-    ),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("surromd-demo"),
     *,
     options: DemoOptions,
 ) -> None:
@@ -154,7 +152,7 @@ def demo(
 def run(
     scene: SceneArg,
     *,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for trajectory, report and record.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder.")] = None,
     options: RunOptions,
     as_json: JsonOpt = False,
 ) -> None:
@@ -171,7 +169,7 @@ def run(
 
 @app.command()
 def systems(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this one.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="System to describe.")] = None,
     as_json: JsonOpt = False,
 ) -> None:
     """List the library of named scenes, or describe one."""
@@ -220,8 +218,12 @@ save_every = "10ps"
 @app.command(epilog=literal(_CAMPAIGN))
 @with_options
 def campaign(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML of scenes, temperatures, replicas and settings.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder, instead of the one that FILE names.")] = None,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="TOML file with scenes, temperatures, replicas and settings.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder (default: the one named in FILE).")
+    ] = None,
     *,
     options: CampaignOptions,
     as_json: JsonOpt = False,
@@ -249,7 +251,7 @@ def windows(
         list[str], typer.Argument(metavar="REF...", help="Reference trajectories, folders or globs.")
     ],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .h5.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output file (.h5).")],
     options: WindowsOptions,
     as_json: JsonOpt = False,
 ) -> None:
@@ -267,10 +269,10 @@ def train(
         typer.Argument(metavar="REF_OR_WINDOWS...", help="Trajectories or a windows file; a SCENE with --level."),
     ],
     *,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Weights to write, .safetensors.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output weights (.safetensors).")] = None,
     options: TrainOptions,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print the --config filled in for these references; train nothing.")
+        bool, typer.Option("--explain", help="Print the complete --config for these references without training.")
     ] = False,
     as_json: JsonOpt = False,
 ) -> None:
@@ -304,20 +306,20 @@ def rollout(
 class CompareShown(CompareOptions, Quiet):
     """What `compare` can be told, and what the command does about its result."""
 
-    show_all: bool = option("Print every row, not the verdict alone.", False, words=("all",))
+    show_all: bool = option("Print all metrics, not only the verdict.", False, words=("all",))
     fail_on: str | None = option(
-        "Exit 1 when a candidate is judged so, or worse.", None, choices=("different", "broken")
+        "Exit with 1 if the verdict on any candidate is this or worse.", None, choices=("different", "broken")
     )
 
 
 @app.command()
 @with_options
 def compare(
-    reference: Annotated[str, typer.Argument(metavar="REF", help="The truth: a file, folder, 'glob' or a,b,c.")],
+    reference: Annotated[str, typer.Argument(metavar="REF", help="Reference: a file, folder, 'glob' or a,b,c.")],
     candidates: Annotated[
-        list[str], typer.Argument(metavar="TRAJ...", help="Candidates, each argument one, written as REF.")
+        list[str], typer.Argument(metavar="TRAJ...", help="Candidate trajectories, one argument each, given like REF.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Report to write, .html; .json, .md go beside it.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML report; .json and .md are written beside it.")] = Path(
         "report.html"
     ),
     *,
@@ -343,7 +345,8 @@ def info(
         ),
     ],
     scene: Annotated[
-        str | None, typer.Argument(metavar="SCENE", help="Of weights: say whether they cover it, and how nearly.")
+        str | None,
+        typer.Argument(metavar="SCENE", help="With weights: check whether SCENE lies in their training domain."),
     ] = None,
     as_json: JsonOpt = False,
 ) -> None:

@@ -51,14 +51,14 @@ WeightsOpt = Annotated[
     str | None,
     typer.Option(
         "--weights",
-        help="Name of shipped weights, or a .safetensors file; else those that cover SCENE.",
+        help="Shipped weights by name, or a .safetensors file (default: those that cover SCENE).",
         autocompletion=_weights,
     ),
 ]
-OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Trajectory to write, .h5 or .dcd.")]
-SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Of every random number.")]
-ResumeOpt = Annotated[bool, typer.Option("--resume", help="Go on where an earlier run of the same settings stopped.")]
-OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
+OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Output trajectory (.h5 or .dcd).")]
+SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
+ResumeOpt = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run of the same settings.")]
+OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Overwrite existing output.")]
 
 
 def usage_error(message: str, context: Any = None) -> Exception:
@@ -75,8 +75,8 @@ def _hush(quiet: bool) -> bool:
     return quiet
 
 
-QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no account.", callback=_hush)]
-JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.", callback=_hush)]
+JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

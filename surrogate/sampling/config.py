@@ -28,39 +28,53 @@ class RolloutConfig:
     time_ps: float = option("Simulated time, such as 100ns.")
     save_every_ps: float | None = option("Interval between saved frames.", None, unset="that of the weights")
     lag_ps: float | None = option(
-        "Of one step, of weights for several.", None, unset="the longest that the save interval is a multiple of"
+        "Time step of the surrogate, for weights trained at several.",
+        None,
+        unset="the longest that the save interval is a multiple of",
     )
     guard: str = option(
-        "Frames that no reference shows: mark; draw again; relax by OpenMM; MD instead.", "flag", choices=GUARDS
+        "What to do with invalid frames: flag, resample, repair (minimise with OpenMM), or run MD instead.",
+        "flag",
+        choices=GUARDS,
     )
-    energy_every: int = option("Check the energy of every so many frames (OpenMM).", 0, within=(0, None))
-    md_between_ps: float = option("So much real MD after each chunk.", 0.0, within=(0.0, None))
+    energy_every: int = option("Interval of energy checks with OpenMM, in frames; 0 for none.", 0, within=(0, None))
+    md_between_ps: float = option("Length of MD with OpenMM after each chunk.", 0.0, within=(0.0, None))
     stiff: str | None = option(
         "Bonds and angles.", None, choices=("modelled", "imposed"), unset="imposed, where the weights know how"
     )
-    select: str | None = option("Atoms to write, in MDTraj's words: backbone.", None)
-    atoms: str = option("Write all atoms or no hydrogens.", "all", choices=("all", "heavy"))
-    force: bool = option("Roll a scene that leaves the training domain, marked.", False)
-    temperature_k: float | None = option("Refused if it is not that of weights that learned frames.", None)
-    friction_per_ps: float | None = option("Of the bath, of a learned potential.", None, within=(0.0, None))
-    timestep_ps: float | None = option("Of a learned potential; above 2fs bonds to hydrogen are rigid.", None)
-    hydrogen_mass_da: float | None = option("Of hydrogens, of a learned potential.", None, within=(1.0, 5.0))
-    ensemble: str | None = option("Of a learned potential.", None, choices=("nvt", "nve"), unset="that of the weights")
+    select: str | None = option("Atoms to save, as an MDTraj selection: 'backbone'.", None)
+    atoms: str = option("Save all atoms or heavy atoms only.", "all", choices=("all", "heavy"))
+    force: bool = option("Roll out scenes outside the training domain; frames are flagged.", False)
+    temperature_k: float | None = option("Temperature; for models of frames it must be that of training.", None)
+    friction_per_ps: float | None = option(
+        "Langevin friction coefficient (learned potentials).", None, within=(0.0, None)
+    )
+    timestep_ps: float | None = option(
+        "Integration time step (learned potentials); above 2fs bonds to hydrogen are constrained.", None
+    )
+    hydrogen_mass_da: float | None = option("Mass of hydrogens (learned potentials).", None, within=(1.0, 5.0))
+    ensemble: str | None = option(
+        "Ensemble (learned potentials).", None, choices=("nvt", "nve"), unset="that of the weights"
+    )
     anneal_ps: float = option(
-        "Of a learned potential: replicas start from so much MD at 600 K, cooled.", 0.0, within=(0.0, None)
+        "Length of MD at 600 K that replicas start from after cooling (learned potentials).", 0.0, within=(0.0, None)
     )
     solver: str | None = option(
-        "multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.", None, unset="the one that suits",
+        "ODE solver: multistep, fitted (few steps), gaussian, angular (peptides), euler, dopri5.",
+        None,
+        unset="chosen by the weights",
         section="sampling",
-    )  # fmt: skip
+    )
     solver_steps: int | None = option(
-        "Solver steps per chunk.", None, unset="10, of peptides 6", within=(1, None), section="sampling"
+        "ODE solver steps per chunk.", None, unset="10; peptides 6", within=(1, None), section="sampling"
     )
-    precision: str = option("Of the network.", "auto", choices=("auto", "fp32", "bf16"), section="sampling")
+    precision: str = option(
+        "Floating-point precision of the network.", "auto", choices=("auto", "fp32", "bf16"), section="sampling"
+    )
     compile: bool = option(
-        "Compile the network: a minute, a C++ compiler; for long rollouts.", False, section="sampling"
+        "Compile the network with torch.compile; takes a minute and a C++ compiler.", False, section="sampling"
     )
-    seed: int = option("Of every random number.", 0, within=(0, None))
+    seed: int = option("Random seed.", 0, within=(0, None))
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -31,7 +31,7 @@ def _parse_lag_ps(text: str, what: str) -> float | None:
 class Seeded:
     """Options of verbs that draw random numbers."""
 
-    seed: int = option("Of every random number.", 0, within=(0, None))
+    seed: int = option("Random seed.", 0, within=(0, None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,21 +45,21 @@ class Replicated:
 class Quiet:
     """Options of verbs that show their progress."""
 
-    quiet: bool = option("No progress bar, no account.", False, words=("quiet", "q"))
+    quiet: bool = option("No progress bar and no summary.", False, words=("quiet", "q"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overwriting:
     """Options of verbs that write a file."""
 
-    overwrite: bool = option("Replace existing output.", False)
+    overwrite: bool = option("Overwrite existing output.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resuming:
     """Options of verbs that can go on where they were stopped."""
 
-    resume: bool = option("Go on where an earlier run of the same settings stopped.", False)
+    resume: bool = option("Continue an interrupted run of the same settings.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class Validated:
     """Options of verbs that hold frames out of a training."""
 
     validation: Trajectories | None = option(
-        "Trajectory held out whole; repeatable.", None, unset="the last 5 % of each"
+        "Trajectory kept for validation; repeatable.", None, unset="the last 5 % of each"
     )
 
 
@@ -78,10 +78,12 @@ class MDSettings:
     What is left open (None) is settled for the scene: by the protocol that is asked for, else by its default there.
     """
 
-    protocol: str | None = option("A paper's settings, unless given: md17, md22, mdgen, fast-folders.", None)
+    protocol: str | None = option("Settings of a published protocol: md17, md22, mdgen, fast-folders.", None)
     force_field: str | None = from_field(ForceFieldSpec, "force_field", None, unset="auto")
     solvent: str | None = from_field(ForceFieldSpec, "solvent", None, unset="auto")
-    level: str | None = option("mm or gfn2-xtb, quantum mechanics for molecules.", None, unset="mm")
+    level: str | None = option(
+        "Level of theory: mm (force field) or gfn2-xtb (semiempirical quantum chemistry).", None, unset="mm"
+    )
     padding_nm: float | None = from_field(WaterBox, "padding_nm", None)
     ionic_strength_molar: float | None = from_field(WaterBox, "ionic_strength_molar", None)
     temperature_k: float | None = from_field(MDConfig, "temperature_k", None)
@@ -99,7 +101,7 @@ class MDSettings:
 class PlanOptions(MDSettings, Replicated, Preparation):
     """What `plan` can be told."""
 
-    time_ps: float | None = option("Estimate the wall time of a run this long.", None)
+    time_ps: float | None = option("Run length whose wall time is estimated.", None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,22 +124,22 @@ class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriti
 class OnDask:
     """Options of verbs whose work Dask hands out."""
 
-    workers: int | None = option("Processes here.", None, within=(1, None), unset="one per core")
-    scheduler: str | None = option("Of Dask, such as tcp://host:8786.", None)
+    workers: int | None = option("Number of local worker processes.", None, within=(1, None), unset="one per core")
+    scheduler: str | None = option("Address of a Dask scheduler, such as tcp://host:8786.", None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions(OnDask, Quiet):
     """What `campaign` can be told beside its file."""
 
-    dry_run: bool = option("List the runs and start nothing.", False)
+    dry_run: bool = option("List the runs without starting them.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindowsOptions(Validated, Overwriting, Quiet):
     """What `windows` can be told."""
 
-    velocities: bool = option("Keep velocities, which painet learns from.", False)
+    velocities: bool = option("Store velocities (needed by painet).", False)
     canonical: bool = option("Superpose frames on one pose, unless velocities are kept.", True, words=None)
 
 
@@ -146,9 +148,9 @@ class CompareOptions(Overwriting):
     """What `compare` can be told. Of `top` and `lag_ps` one stands for all, or there is one for the reference, each
     candidate and the replicate, in this order, None where the file says it itself."""
 
-    replicate: Trajectories | None = option("Another run of the truth: the floor.", None)
+    replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
-        "Topology of files without one: once for all, or for REF, each TRAJ, the replicate.", None, read=_one_or_none
+        "Topology file: one for all, or one each for REF, every TRAJ and the replicate.", None, read=_one_or_none
     )
     lag_ps: float | Sequence[float | None] | None = option(
         "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
@@ -156,14 +158,14 @@ class CompareOptions(Overwriting):
         read=_parse_lag_ps,
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
-    energies: bool = option("Energies of every k-th frame too, by the reference's force field.", False)
+    energies: bool = option("Also compare potential energies, by the reference's force field.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BurstOptions(Seeded, Quiet):
     """What `bursts` can be told."""
 
-    n_bursts: int = option("Short runs in all, as many from each state.", 300, within=(2, 100_000))
+    n_bursts: int = option("Number of short runs, spread evenly over the states.", 300, within=(2, 100_000))
     burst_ps: float = option("Length of each.", 10.0)
 
 
@@ -182,16 +184,18 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
     """What `train` can be told. What is left open is chosen to suit the references, and said with its reason."""
 
     arch: str | None = option(
-        "lam-slide, painet, egnn, a baseline, or another that is installed.", None, unset="what suits the references"
+        "Model architecture: lam-slide, painet, egnn, a baseline, or an installed plug-in.",
+        None,
+        unset="chosen from the references",
     )
-    level: str | None = option("gfn2-xtb: learn a molecule's forces at this level, instead of frames.", None)
-    budget_s: float | None = option("Wall time to spend, such as 30min.", None)
-    steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
+    level: str | None = option("Train a potential on forces at this level of theory: gfn2-xtb.", None)
+    budget_s: float | None = option("Wall-time budget, such as 30min.", None)
+    steps: int | None = option("Number of optimiser steps, instead of a budget.", None, within=(1, None))
     start_from: str | Path | None = option(
-        "Weights whose second stage is trained further: a name or a file.", None, words=("from",)
+        "Weights to fine-tune (second stage): a name or a file.", None, words=("from",)
     )
-    longest_lag_ps: float | None = option("Learn every frame spacing up to this one, such as 1ns.", None)
-    device: str = option("Where it runs.", "auto", choices=("auto", "cpu", "cuda"))
+    longest_lag_ps: float | None = option("Longest frame spacing to learn, such as 1ns.", None)
+    device: str = option("Compute device.", "auto", choices=("auto", "cpu", "cuda"))
     model: dict[str, Any] | None = option("Settings of the network, as explained.", None, words=None)
     training: dict[str, Any] | None = option("Settings of its training, as explained.", None, words=None)
 
@@ -200,17 +204,17 @@ class TrainOptions(Validated, Seeded, Resuming, Overwriting, Quiet):
 class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting, Quiet):
     """What `run` can be told. `workers` and `scheduler` are those of many molecules."""
 
-    budget_s: float = option("Wall time to spend in all, such as 1h.", 600.0)
-    way: str = option("MD, a surrogate, or what pays best here.", "auto", choices=("auto", "md", "surrogate"))
+    budget_s: float = option("Total wall-time budget, such as 1h.", 600.0)
+    way: str = option(
+        "Method: MD, a surrogate, or the more accurate of the two (auto).", "auto", choices=("auto", "md", "surrogate")
+    )
     weights: str | Path | None = option(
         "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"
     )
-    save_every_ps: float | None = option(
-        "Interval between saved frames.", None, unset="what the judge can read in time"
-    )
-    format: str = option("Of the trajectory.", "h5", choices=("h5", "dcd"))
-    cores: int | None = option("To use at most.", None, within=(1, None), unset="all")
-    dry_run: bool = option("Measure and decide, and print that alone.", False)
+    save_every_ps: float | None = option("Interval between saved frames.", None, unset="what can be compared in time")
+    format: str = option("Trajectory format.", "h5", choices=("h5", "dcd"))
+    cores: int | None = option("Maximum number of CPU cores.", None, within=(1, None), unset="all")
+    dry_run: bool = option("Print the timings and the decision without running.", False)
 
 
 # By the verb's name in Python.

@@ -43,15 +43,13 @@ class CostErrorConfig:
     """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
     `settle_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
 
-    time_ps: float = option("Rolled at each setting, all replicas together.", 20_000.0)
+    time_ps: float = option("Rollout time per setting, all replicas together.", 20_000.0)
     settle_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
-    rounds: int = option("Parts, by turns with OpenMM.", 4, within=(1, None))
+    rounds: int = option("Number of blocks, alternating with OpenMM.", 4, within=(1, None))
     slice_ps: float = option("Of MD before each part.", 40.0, words=None)
-    lag_ps: float | None = option(
-        "Between the frames compared; weights that know lags roll so.", None, unset="as in the references"
-    )
+    lag_ps: float | None = option("Interval between compared frames.", None, unset="as in the references")
     threads: int = option("Of both.", 1, within=(1, None), words=None)
-    seed: int = option("Of every random number.", 0, within=(0, None))
+    seed: int = option("Random seed.", 0, within=(0, None))
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -63,15 +61,17 @@ class CostErrorConfig:
 class Sweep:
     """What is gone through: all combinations of what is given; None leaves the choice to `choose_settings`."""
 
-    solvers: Sequence[str] | None = option("Only this; repeatable.", None, words=("solver",))
-    steps: Sequence[int] | None = option("Repeatable.", None, within=(1, None), unset=", ".join(map(str, STEPS)))
+    solvers: Sequence[str] | None = option("Solver to try; repeatable.", None, words=("solver",))
+    steps: Sequence[int] | None = option(
+        "Value to try; repeatable.", None, within=(1, None), unset=", ".join(map(str, STEPS))
+    )
     precisions: Sequence[str] | None = option(
-        "Repeatable.", None, choices=("auto", "fp32", "bf16"), words=("precision",)
+        "Value to try; repeatable.", None, choices=("auto", "fp32", "bf16"), words=("precision",)
     )
     batches: Sequence[int] | None = option(
-        "Replicas; repeatable.", None, within=(1, None), words=("batch",), unset=str(USUAL_BATCH)
+        "Number of replicas to try; repeatable.", None, within=(1, None), words=("batch",), unset=str(USUAL_BATCH)
     )
-    compiled: bool = option("The usual setting compiled, too.", False, words=("compile",))
+    compiled: bool = option("Also time the compiled network.", False, words=("compile",))
 
 
 @dataclass(frozen=True, kw_only=True)

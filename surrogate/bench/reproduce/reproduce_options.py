@@ -30,7 +30,7 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
     plain: bool = option("Leave out what goes beyond the papers: all that can be left out.", False)
     without: Sequence[str] | None = option(
         "Leave out: extrapolate, any-start, from-velocity, canonical, predicted-only, mirrored, pair-messages. "
-        "Repeatable.",
+        "Value to try; repeatable.",
         None,
     )
     clean_conditioning: bool = option("md17: LaM-SLidE computes given frames once a chunk.", False)
@@ -39,7 +39,7 @@ class ReproduceOptions(Seeded, Resuming, Quiet):
     )
     time_ps: float = option("md17: trajectory of each molecule.", 200.0)
     md17_ethanol: Path | None = option("md17: an .npz of MD17's own ethanol to forecast as well.", None)
-    steps: int | None = option("Optimiser steps instead of a budget.", None, within=(1, None))
+    steps: int | None = option("Number of optimiser steps, instead of a budget.", None, within=(1, None))
     call_s: float | None = option(
         "End this call, with exit code 1, at the first saved state after so long; the same with `resume` goes on.",
         None,

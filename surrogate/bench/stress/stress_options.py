@@ -14,14 +14,16 @@ class StressOptions(Seeded, Quiet):
     """What `stress` can be told."""
 
     frames: Sequence[int] | None = option(
-        "Length of a rollout, all replicas; repeatable.", None, within=(1, None), unset="10000 and 100000"
+        "Rollout length in frames, all replicas together; repeatable.", None, within=(1, None), unset="10000 and 100000"
     )
-    replicas: int | None = option("Of the rollouts.", None, within=(1, None), unset="16")
-    guards: Sequence[str] | None = option("Of the rollouts.", None, words=("guard",), unset="flag and repair")
+    replicas: int | None = option("Number of rollout replicas.", None, within=(1, None), unset="16")
+    guards: Sequence[str] | None = option(
+        "Guard policy of the rollouts; repeatable.", None, words=("guard",), unset="flag and repair"
+    )
     sections: Sequence[str] | None = option(
-        "Only this: length, invariance, inputs, precision, batches, solvers, openmm. Repeatable.",
+        "Test to run: length, invariance, inputs, precision, batches, solvers, openmm; repeatable.",
         None,
         words=("section",),
     )
-    scene: str | None = option("Of weights for many molecules: the one to try, such as smiles:CCO.", None)
-    quick: bool = option("Short runs of everything: a minute or two.", False)
+    scene: str | None = option("Scene to test, for weights that cover many, such as smiles:CCO.", None)
+    quick: bool = option("Short runs: a minute or two.", False)
