@@ -33,7 +33,7 @@ class RolloutConfig:
         unset="the longest that the save interval is a multiple of",
     )
     guard: str = option(
-        "What to do with invalid frames: flag, resample, repair (minimise with OpenMM), or run MD instead.",
+        "What to do with invalid frames: flag, resample, repair (minimise with OpenMM) or fallback (MD instead).",
         "flag",
         choices=GUARDS,
     )
