@@ -43,8 +43,6 @@ def text_of(path: Path) -> str:
     if path.suffix == ".py":
         kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
         return "\n\n".join(ast.get_docstring(n) or "" for n in ast.walk(ast.parse(text)) if isinstance(n, kinds))
-    if path.name == "CHANGELOG.md":
-        return text.split("## [Unreleased]", 1)[-1].split("\n## [", 1)[0]
     return text
 
 
