@@ -83,6 +83,11 @@ def settings_of(config: MDConfig) -> dict[str, Any]:
     return {**flat, **force}
 
 
+def flat_settings(config: MDConfig) -> dict[str, Any]:
+    """Return what `settings_of` does but the seed, which belongs to a run's place among others."""
+    return {key: value for key, value in settings_of(config).items() if key != "seed"}
+
+
 def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
     """Raise InputError unless a record or a checkpoint states the settings of `config`.
 

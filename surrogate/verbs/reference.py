@@ -85,12 +85,11 @@ def settle_run(
 
     Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
     """
-    from md_reference.campaign.run_options import to_config
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level
     from md_reference.run.config import MDConfig
-    from md_reference.run.defaults import settle
+    from md_reference.run.defaults import settle, to_config
     from md_reference.run.integrators import check_ensemble
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
