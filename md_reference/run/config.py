@@ -110,18 +110,25 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
         )
 
 
+def resolved(scene: Scene, config: MDConfig) -> MDConfig:
+    """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
+    is explicit): the one value that every later stage of a run takes. Raises what contradicts in them."""
+    from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
+
+    if config.keep not in ("auto", "solute", "all"):
+        raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
+    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+
+
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
-    """Return the settings with force field and ensemble settled for this scene, before anything is computed.
+    """Return the settings `resolved` for this scene, before anything is computed.
 
     Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
     """
-    from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
-
     _ = config.steps_per_frame
-    if config.keep not in ("auto", "solute", "all"):
-        raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
+    config = resolved(scene, config)
     kept = config.kept_atoms(scene)
     check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
     if config.columns and out.suffix.lower() == ".dcd":
         raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
-    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+    return config

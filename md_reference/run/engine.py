@@ -14,7 +14,7 @@ from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
-from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
+from md_reference.run.integrators import add_barostat, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.chemistry.geometry import signed_volumes
@@ -76,10 +76,10 @@ def refuse_inverted(scene: Scene, minimised_nm: FloatArray) -> None:
 class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
-    `threads`: of the CPU platform, where they are settled. `native_gb`: see `build_system`. `system`: what that
-    returned for this scene and these forces, where it is there already; a barostat is added to it. Virtual sites are
-    placed here and appear nowhere else. Raises what `build_system` and `check_ensemble` raise, and SimulationError when
-    the platform cannot run the scene.
+    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform,
+    where they are settled. `native_gb`: see `build_system`. `system`: what that returned for this scene and these
+    forces, where it is there already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
+    Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Engine:
     ) -> None:
         import openmm
 
-        self.ensemble = check_ensemble(conditions.ensemble, scene)
+        self.ensemble = conditions.ensemble
         self.scene = scene
         self.spec = conditions.force
         choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")

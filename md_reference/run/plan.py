@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.forcefield import build_system, resolve
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import SIMD, MDConfig
+from md_reference.run.config import SIMD, MDConfig, resolved
 from md_reference.run.engine import Engine
-from md_reference.run.integrators import check_ensemble, integrator_name
+from md_reference.run.integrators import integrator_name
 from md_reference.run.machine import available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform, simd_choice
 from md_reference.run.timing import as_records
@@ -81,8 +81,8 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     planned and as OpenMM would do it unasked; 0 times nothing, and the size of the scene decides.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    spec = resolve(scene, config.force)
-    config = replace(config, ensemble=check_ensemble(config.ensemble, scene), force=spec)
+    config = resolved(scene, config)
+    spec = config.force
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
@@ -251,8 +251,7 @@ def plan_line(
 
 
 def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:
-    """Return the line of a run whose platform has been chosen, by the timing that chose it."""
-    config = replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+    """Return the line of a run with `resolved` settings whose platform has been chosen, by the timing that chose it."""
     timed = next(
         (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads)), None
     )

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from md_reference.forces.forcefield import resolve
 from md_reference.run.batch import simulate_batch
-from md_reference.run.config import SIMD, MDConfig, check_run
+from md_reference.run.config import SIMD, MDConfig, check_run, resolved
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import line_of_run
 from md_reference.run.platforms import measured_platform, simd_choice
@@ -57,6 +56,7 @@ def simulate_replicas(
     """
     for out in outs:
         check_run(scene, config, out)
+    config = resolved(scene, config)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     jobs = [[k] for k in range(len(outs))]
     if config.platform == SIMD:
@@ -70,8 +70,7 @@ def simulate_replicas(
         if announce is not None:
             announce(line_of_run(scene, config, simd_choice(), replicas=len(outs)))
     elif fresh:
-        settled = replace(config, force=resolve(scene, config.force))
-        choice = measured_platform(scene, settled, max_threads=max(1, available_cores() // width), side_by_side=width)
+        choice = measured_platform(scene, config, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
             announce(line_of_run(scene, config, choice, replicas=len(outs)))
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}

@@ -130,7 +130,7 @@ def prepared_kind(folder: Path, scene: Scene) -> Kind:
 
     def read() -> None:
         found = load_prepared(path)
-        found.account()
+        found.summary()
         build_system(found.scene, found.force)
 
     return Kind(record, lambda altered: path.write_text(json.dumps(altered)), read)
