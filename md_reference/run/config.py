@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.integrators import check_ensemble
-from systems.errors import InputError, UnknownNameError
+from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
 from systems.units import format_time_ps, whole_steps
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
 # What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
 SIMD = "simd"
+ENSEMBLES = ("nvt", "nve", "npt")
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,26 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
 
 def resolved(scene: Scene, config: MDConfig) -> MDConfig:
     """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
-    is explicit): the one value that every later stage of a run takes. Raises what contradicts in them."""
+    is explicit): the one value that every later stage of a run takes.
+
+    Raises UnknownNameError (with the nearest name), InputError for a constant pressure without a periodic cell, and
+    what `forcefield.resolve` raises.
+    """
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
     if config.keep not in ("auto", "solute", "all"):
         raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
-    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+    ensemble = config.ensemble.lower()
+    if ensemble not in ENSEMBLES:
+        raise UnknownNameError(
+            f"unknown ensemble {config.ensemble!r}; known: {', '.join(ENSEMBLES)}." + nearest(ensemble, list(ENSEMBLES))
+        )
+    if ensemble == "npt" and scene.cell_nm is None:
+        raise InputError(
+            f"ensemble npt needs a volume, and scene {scene.name!r} has no periodic cell; use nvt, or give an explicit "
+            "`solvent`."
+        )
+    return replace(config, force=resolve(scene, config.force), ensemble=ensemble)
 
 
 def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:

@@ -14,7 +14,6 @@ from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
-from md_reference.run.integrators import add_barostat, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.chemistry.geometry import signed_volumes
@@ -26,6 +25,7 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8
 _FLAT_NM3 = 2e-4
+_STEPS_BETWEEN_VOLUME_MOVES = 25
 
 
 @dataclass(frozen=True)
@@ -309,3 +309,60 @@ class Engine:
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""
         self._context = None
+
+
+def integrator_name(ensemble: str, scene: Scene) -> str:
+    """Return the name that records have for the integrator of an ensemble."""
+    if ensemble != "nve":
+        return "LangevinMiddle"
+    if scene.interactions is None:
+        return "VelocityVerlet"
+    from md_reference.forces.model_forces import nve_scheme
+
+    return {"kick-drift": "SymplecticEuler", "kick-drift-kick": "VelocityVerlet"}[nve_scheme(scene)]
+
+
+def make_integrator(
+    scene: Scene, system: Any, ensemble: str, *, temperature_k: float, friction_per_ps: float, timestep_ps: float
+) -> Any:
+    """Return the `openmm.Integrator` of an ensemble; model systems without a bath have their own."""
+    import openmm
+
+    if ensemble != "nve":
+        return openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
+    if scene.interactions is not None:
+        from md_reference.forces.model_forces import build_nve_integrator
+
+        return build_nve_integrator(scene, timestep_ps)
+    return velocity_verlet(timestep_ps, constrained=system.getNumConstraints() > 0)
+
+
+def velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
+    """Return velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with RATTLE where bonds are constrained.
+
+    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions.
+    """
+    import openmm
+
+    integrator = openmm.CustomIntegrator(timestep_ps)
+    integrator.addUpdateContextState()
+    integrator.addComputePerDof("v", "v+0.5*dt*f/m")
+    integrator.addComputePerDof("x", "x+dt*v")
+    if constrained:
+        integrator.addPerDofVariable("unconstrained", 0.0)
+        integrator.addComputePerDof("unconstrained", "x")
+        integrator.addConstrainPositions()
+        integrator.addComputePerDof("v", "v+0.5*dt*f/m+(x-unconstrained)/dt")
+        integrator.addConstrainVelocities()
+    else:
+        integrator.addComputePerDof("v", "v+0.5*dt*f/m")
+    return integrator
+
+
+def add_barostat(system: Any, *, pressure_bar: float, temperature_k: float, seed: int) -> None:
+    """Add a Monte Carlo barostat (Åqvist et al., Chem. Phys. Lett. 384, 288 (2004)) to a periodic System."""
+    import openmm
+
+    barostat = openmm.MonteCarloBarostat(pressure_bar, temperature_k, _STEPS_BETWEEN_VOLUME_MOVES)
+    barostat.setRandomNumberSeed(seed)
+    system.addForce(barostat)

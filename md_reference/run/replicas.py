@@ -14,7 +14,7 @@ from typing import Any
 from md_reference.run.batch import simulate_batch
 from md_reference.run.config import SIMD, MDConfig, check_run, resolved
 from md_reference.run.machine import available_cores
-from md_reference.run.plan import line_of_run
+from md_reference.run.plan import plan_line
 from md_reference.run.platforms import measured_platform, simd_choice
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.simd.force_field import n_replicas
@@ -68,11 +68,11 @@ def simulate_replicas(
     choice = None
     if fresh and config.platform == SIMD:
         if announce is not None:
-            announce(line_of_run(scene, config, simd_choice(), replicas=len(outs)))
+            announce(plan_line(scene, config, simd_choice(), replicas=len(outs)))
     elif fresh:
         choice = measured_platform(scene, config, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
-            announce(line_of_run(scene, config, choice, replicas=len(outs)))
+            announce(plan_line(scene, config, choice, replicas=len(outs)))
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
     if len(jobs) == 1:
         _run(scene, [configs[k] for k in jobs[0]], list(outs), how, progress)
