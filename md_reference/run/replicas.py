@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from md_reference.run.batch import simulate_batch
-from md_reference.run.config import SIMD, MDConfig, check_run, resolved
+from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import plan_line
 from md_reference.run.platforms import measured_platform, simd_choice
@@ -55,8 +55,7 @@ def simulate_replicas(
     stay on disk.
     """
     for out in outs:
-        check_run(scene, config, out)
-    config = resolved(scene, config)
+        config = check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     jobs = [[k] for k in range(len(outs))]
     if config.platform == SIMD:
