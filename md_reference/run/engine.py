@@ -110,7 +110,6 @@ class Engine:
                 seed=self._seed,
             )
         self._integrator = make_integrator(
-            scene,
             self._system,
             self.ensemble,
             temperature_k=self._temperature_k,
