@@ -46,10 +46,6 @@ class SimulationError(SurromdError):
     """A simulation failed while running (non-finite coordinates, a platform that cannot run the scene)."""
 
 
-class UnfinishedError(SurromdError):
-    """Work that was asked to end before it was done; what it did is saved, and the message says how to go on."""
-
-
 class StorageError(SurromdError):
     """The disk is full or not writable; what was complete before stays readable."""
 

@@ -32,8 +32,7 @@ class Scene:
     `residue_of_atom` indexes `residue_names`, `residue_ids` and `chain_of_residue`.
 
     `cell_nm`: reduced box vectors `(3, 3)` of a periodic system, else None. `interactions`: the law of a model system
-    (charges, springs, a potential) as JSON-able values with a key `kind`; None where a force field says what the forces
-    are. `velocities_nm_ps`: starting velocities `(n_atoms, 3)` where they are part of the system, else None.
+    as JSON-able values with a key `kind`; None where a force field says what the forces are.
     """
 
     name: str
@@ -51,7 +50,6 @@ class Scene:
     provenance: dict[str, Any] = field(default_factory=dict)
     cell_nm: FloatArray | None = None
     interactions: dict[str, Any] | None = None
-    velocities_nm_ps: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.elements)
@@ -76,10 +74,6 @@ class Scene:
             if self.cell_nm.shape != (3, 3):
                 raise InputError(f"Scene {self.name!r}: cell_nm has shape {self.cell_nm.shape}, not (3, 3).")
             self.cell_nm.setflags(write=False)
-        if self.velocities_nm_ps is not None:
-            if self.velocities_nm_ps.shape != (n, 3):
-                raise InputError(f"Scene {self.name!r}: velocities {self.velocities_nm_ps.shape}, not ({n}, 3).")
-            self.velocities_nm_ps.setflags(write=False)
 
     @property
     def n_atoms(self) -> int:
@@ -102,7 +96,7 @@ class Scene:
     def topology_hash(self) -> str:
         """Hash of the ordered topology, names included, positions left out."""
         record = self.to_dict()
-        for key in ("positions_nm", "provenance", "name", "masses_da", "cell_nm", "velocities_nm_ps"):
+        for key in ("positions_nm", "provenance", "name", "masses_da", "cell_nm"):
             record.pop(key, None)
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -35,7 +35,6 @@ def part_of(scene: Scene, atoms: IntArray) -> Scene:
     rows = [k for k, (i, j) in enumerate(scene.bonds.tolist()) if i in where and j in where]
     residues = list(dict.fromkeys(int(scene.residue_of_atom[i]) for i in atoms))
     rank = {r: k for k, r in enumerate(residues)}
-    velocities = scene.velocities_nm_ps
     return replace(
         scene,
         atom_names=tuple(scene.atom_names[i] for i in atoms),
@@ -49,14 +48,12 @@ def part_of(scene: Scene, atoms: IntArray) -> Scene:
         formal_charges=scene.formal_charges[atoms],
         masses_da=scene.masses_da[atoms],
         positions_nm=scene.positions_nm[atoms],
-        velocities_nm_ps=None if velocities is None else velocities[atoms],
     )
 
 
 def reordered(scene: Scene, order: IntArray) -> Scene:
     """Return the scene whose atom k is this one's atom order[k]; bonds and residues keep their places."""
     where = np.argsort(order)
-    velocities = scene.velocities_nm_ps
     return replace(
         scene,
         atom_names=tuple(scene.atom_names[i] for i in order),
@@ -66,5 +63,4 @@ def reordered(scene: Scene, order: IntArray) -> Scene:
         formal_charges=scene.formal_charges[order],
         masses_da=scene.masses_da[order],
         positions_nm=scene.positions_nm[order],
-        velocities_nm_ps=None if velocities is None else velocities[order],
     )

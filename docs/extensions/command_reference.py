@@ -13,7 +13,7 @@ from sphinx.util.docutils import SphinxDirective
 
 _HEAD = ("| | |", "|---|---|")
 # Verbs that measure the others come last.
-_MEASURING = ("bench", "stress", "reproduce")
+_MEASURING = ("bench", "stress")
 
 
 def find_command(words: list[str]) -> Any:
@@ -29,7 +29,7 @@ def find_command(words: list[str]) -> Any:
 
 
 def all_commands() -> list[list[str]]:
-    """Return the words of every verb, those of groups included: [['demo'], ..., ['bench', 'reference'], ...]."""
+    """Return the words of every verb, those of groups included: [['demo'], ..., ["bench", "cost-error"], ...]."""
     found = []
     for name, command in find_command([]).commands.items():
         inner = getattr(command, "commands", None)

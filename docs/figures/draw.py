@@ -23,7 +23,7 @@ TABLE = HERE.parent / "results" / "tables" / "effective_samples.json"
 CAUSES = TABLE.with_name("n_body_causes.json")
 KT_KJ_PER_MOL = 2.494
 COLOURS = {"peptides": "#d62728", "alanine-dipeptide": "#1f77b4"}
-# of the best polynomial on the 200 held-out trajectories of the study (docs/studies/n_body/n_body_causes.py)
+# of the best polynomial on the 200 held-out trajectories of the study (docs/studies/published/n_body_causes.py)
 POLYNOMIAL_ADE = 0.503
 
 

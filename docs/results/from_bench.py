@@ -1,8 +1,9 @@
 """Make a table of the manual of what a benchmark wrote: `python docs/results/from_bench.py NAME FILE.json`.
 
-NAME is `reference_speed` (FILE of `surromd bench reference -o FILE`), `cost_error` or `effective_samples` (FILE of
-`surromd bench cost-error`) or `peptide_lags` (FILE lag.json of `python -m surrogate.bench.recipes.peptide_gates lag`).
-The table goes to docs/results/tables/NAME.json with the machine that the benchmark names, and replaces the one there.
+NAME is `reference_speed` (FILE of `python docs/studies/reference/md_speed.py -o FILE`), `cost_error` or
+`effective_samples` (FILE of `surromd bench cost-error`) or `peptide_lags` (FILE lag.json of
+`python docs/studies/training/peptide_gates.py lag`). The table goes to docs/results/tables/NAME.json with the machine
+that the benchmark names, and replaces the one there.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def reference_speed(measured: dict[str, Any]) -> dict[str, Any]:
         rows.append(cells)
     heads = [head for solvent in solvents for head in (f"{solvent}: ours, ns/day", "ratio")]
     return {
-        "command": "surromd bench reference",
+        "command": "python docs/studies/reference/md_speed.py",
         "machine": f"{measured['machine']['name']}, {measured['machine']['cores_used']} cores used",
         "note": f"Medians of {measured['rounds']} rounds, least and greatest in brackets; time step 2 fs.",
         "columns": ["atoms", *heads],
@@ -124,7 +125,7 @@ def peptide_lags(measured: dict[str, Any]) -> dict[str, Any]:
     ]
     steps, halves = measured["ten steps against one"], measured["halves of MD"]
     return {
-        "command": "python -m surrogate.bench.recipes.peptide_gates lag FOLDER --train REF... --test REF...",
+        "command": "python docs/studies/training/peptide_gates.py lag FOLDER --train REF... --test REF...",
         "machine": "none is timed here",
         "note": f"Ten steps of 10 ps lie {steps:.3f} from one of 100 ps in the joint φ/ψ map, two halves of MD from "
         f"the same starts {halves:.3f} (Chapman and Kolmogorov's test).",

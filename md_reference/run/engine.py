@@ -110,7 +110,6 @@ class Engine:
                 seed=self._seed,
             )
         self._integrator = make_integrator(
-            scene,
             self._system,
             self.ensemble,
             temperature_k=self._temperature_k,
@@ -311,29 +310,19 @@ class Engine:
         self._context = None
 
 
-def integrator_name(ensemble: str, scene: Scene) -> str:
+def integrator_name(ensemble: str) -> str:
     """Return the name that records have for the integrator of an ensemble."""
-    if ensemble != "nve":
-        return "LangevinMiddle"
-    if scene.interactions is None:
-        return "VelocityVerlet"
-    from md_reference.forces.model_forces import nve_scheme
-
-    return {"kick-drift": "SymplecticEuler", "kick-drift-kick": "VelocityVerlet"}[nve_scheme(scene)]
+    return "VelocityVerlet" if ensemble == "nve" else "LangevinMiddle"
 
 
 def make_integrator(
-    scene: Scene, system: Any, ensemble: str, *, temperature_k: float, friction_per_ps: float, timestep_ps: float
+    system: Any, ensemble: str, *, temperature_k: float, friction_per_ps: float, timestep_ps: float
 ) -> Any:
-    """Return the `openmm.Integrator` of an ensemble; model systems without a bath have their own."""
+    """Return the `openmm.Integrator` of an ensemble."""
     import openmm
 
     if ensemble != "nve":
         return openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
-    if scene.interactions is not None:
-        from md_reference.forces.model_forces import build_nve_integrator
-
-        return build_nve_integrator(scene, timestep_ps)
     return velocity_verlet(timestep_ps, constrained=system.getNumConstraints() > 0)
 
 

@@ -14,7 +14,7 @@ from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import SIMD, MDConfig, resolved
-from md_reference.run.engine import Engine, integrator_name
+from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform, simd_choice
 from md_reference.run.timing import as_records
@@ -115,7 +115,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
         n_atoms=scene.n_atoms,
         force_field=spec.force_field,
         solvent=spec.solvent,
-        integrator=_integrator(scene, config),
+        integrator=_integrator(config),
         platform=choice.name,
         platform_reason=choice.reason,
         timings=tuple(as_records(list(choice.timings))),
@@ -205,14 +205,10 @@ def _wall_s(config: MDConfig, replicas: int, step_s: float | None) -> float | No
     return rounds * (config.time_ps + config.equilibrate_ps) / config.timestep_ps * step_s
 
 
-def _integrator(scene: Scene, config: MDConfig) -> str:
+def _integrator(config: MDConfig) -> str:
     step = f"{config.timestep_ps * 1000:g} fs"
     if config.ensemble == "nve":
-        name = {"VelocityVerlet": "velocity Verlet", "SymplecticEuler": "symplectic Euler"}[
-            integrator_name("nve", scene)
-        ]
-        started = "as the scene says" if scene.velocities_nm_ps is not None else f"at {config.temperature_k:g} K"
-        return f"{name}, {step}, no bath (started {started})"
+        return f"velocity Verlet, {step}, no bath (started at {config.temperature_k:g} K)"
     text = f"Langevin middle, {step}, {config.temperature_k:g} K, {config.friction_per_ps:g}/ps"
     return text + (f"; Monte Carlo barostat at {config.pressure_bar:g} bar" if config.ensemble == "npt" else "")
 
@@ -244,7 +240,7 @@ def plan_line(
     parts = [
         f"{scene.n_atoms} atoms, {law} in {spec.solvent}{born}",
         f"{choice.name} on {threads} ({choice.reason})",
-        _integrator(scene, config),
+        _integrator(config),
         "bonds to hydrogen rigid" if rigid else "no constraints",
         "PME in a cell" if periodic else "all pairs; no cut-off, cell, PME or barostat without a cell",
     ]

@@ -188,15 +188,8 @@ class _Run:
         return writer_at(self.out, scene, record, self.header, resumed=self.resumed, columns=columns)
 
     def _equilibrated(self) -> Engine:
-        """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath.
-
-        A model system that brings its own velocities starts from them as it stands, if nothing is to heat it.
-        """
+        """Return the engine at time 0: minimised, and run for `equilibrate_ps` in the bath."""
         config = self.config
-        if config.ensemble == "nve" and self.scene.velocities_nm_ps is not None:
-            engine = self.engine("nve")
-            engine.set_velocities(self.scene.velocities_nm_ps)
-            return engine
         bath = self.engine("nvt" if config.ensemble == "nve" else config.ensemble)
         try:
             self._equilibrate(bath)
@@ -352,7 +345,7 @@ def record_of(scene: Scene, config: MDConfig, choice: PlatformChoice) -> dict[st
 
     return {
         "kind": "reference",
-        "integrator": integrator_name(config.ensemble, scene),
+        "integrator": integrator_name(config.ensemble),
         "program": {"openmm": openmm.__version__},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "completed": False,

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from systems.errors import InputError
 
 if TYPE_CHECKING:
-    from surrogate.data.frames import TrainingFrames
     from surrogate.data.weights import Weights
 
 
@@ -55,15 +51,3 @@ def _sources(provenance: dict[str, Any]) -> Iterator[dict[str, Any]]:
     yield from provenance.get("sources", ())
     if isinstance(provenance.get("from"), dict):
         yield from _sources(provenance["from"])
-
-
-def cut(frames: TrainingFrames, share: float) -> tuple[TrainingFrames, TrainingFrames]:
-    """Split frames of one trajectory by time: all but the last `share`, and that."""
-    at = round(frames.n_frames * (1.0 - share))
-    if frames.velocities is None:
-        raise InputError("these frames carry no velocities.")
-    parts = []
-    for part in (slice(0, at), slice(at, frames.n_frames)):
-        x, v = frames.coordinates[part], frames.velocities[part]
-        parts.append(replace(frames, coordinates=x, velocities=v, starts=np.array([0, len(x)])))
-    return parts[0], parts[1]

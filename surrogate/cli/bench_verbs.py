@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from surrogate.bench.cost_error.sweep_settings import CostErrorOptions
-from surrogate.bench.speed_options import SpeedOptions
 from surrogate.bench.stress.stress_options import StressOptions
 from surrogate.cli.parameters import JsonOpt, with_options
 from surrogate.cli.render import print_json
-
-if TYPE_CHECKING:
-    from surrogate.bench.md_speed import Row
 
 bench = typer.Typer(
     no_args_is_help=True,
@@ -26,44 +22,6 @@ bench = typer.Typer(
 @bench.callback()
 def _benchmarks() -> None:
     """Keep `bench` a group, however many benchmarks it has."""
-
-
-@bench.command()
-@with_options
-def reference(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output file (.json).")] = None,
-    *,
-    options: SpeedOptions,
-    as_json: JsonOpt = False,
-) -> None:
-    """Our OpenMM set-up against OpenMM's plain defaults: same model, time step and cores. Wants an idle machine."""
-    from surrogate.bench.md_speed import run_benchmark, select_cases, table_head, table_line, write_json
-
-    cases = select_cases(options.cases, quick=options.quick)
-    shown = not (options.quiet or as_json)
-
-    def report(row: Row) -> None:
-        if shown:
-            typer.echo(table_line(row))
-
-    if shown:
-        typer.echo("ns/day of all cores together; ratio: ours over the faster of OpenMM's two ways, [least, greatest]")
-        typer.echo(table_head())
-    result = run_benchmark(
-        cases,
-        rounds=options.rounds or (3 if options.quick else 7),
-        seconds=options.timing_s or (0.3 if options.quick else 3.0),
-        cores=options.cores,
-        report=report,
-        skipped=lambda line: typer.echo(f"left out: {line}", err=True),
-    )
-    if out is not None:
-        write_json(result, out)
-    if as_json:
-        print_json(result)
-    if not result["rows"] or not all(row["equal_energies"] for row in result["rows"]):
-        typer.echo("error: no case ran, or energies differ: see above.", err=True)
-        raise typer.Exit(1)
 
 
 @bench.command(name="cost-error")

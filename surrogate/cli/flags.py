@@ -6,8 +6,6 @@ import re
 from functools import cache
 
 from surrogate.bench.cost_error.sweep_settings import CostErrorOptions
-from surrogate.bench.reproduce.reproduce_options import ReproduceOptions
-from surrogate.bench.speed_options import SpeedOptions
 from surrogate.bench.stress.stress_options import StressOptions
 from surrogate.verbs.options import VERB_OPTIONS
 from systems.options import Option, options_of
@@ -21,7 +19,7 @@ _ARGUMENTS = {"out": "--out", "weights": "--weights", "config": "--config"}
 @cache
 def _known() -> dict[str, Option]:
     # Of a name that several have the last one counts.
-    kinds = [SpeedOptions, CostErrorOptions, StressOptions, ReproduceOptions, *VERB_OPTIONS.values()]
+    kinds = [CostErrorOptions, StressOptions, *VERB_OPTIONS.values()]
     return {name: found for kind in kinds for name, found in options_of(kind).items()}
 
 

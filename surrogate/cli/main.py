@@ -27,7 +27,6 @@ from surrogate.cli.parameters import (
     with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_run, print_written
-from surrogate.cli.reproduce_verb import reproduce
 from surrogate.verbs.options import (
     CampaignOptions,
     CompareOptions,
@@ -123,7 +122,6 @@ app = typer.Typer(
 )
 app.add_typer(bench, name="bench")
 app.command()(stress)
-app.command()(reproduce)
 
 
 @app.callback()

@@ -22,12 +22,6 @@ def literal(text: str) -> str:
     return text.replace("[", "\\[")
 
 
-class Precision(StrEnum):
-    auto = "auto"
-    fp32 = "fp32"
-    bf16 = "bf16"
-
-
 def _scenes(incomplete: str) -> list[str]:
     """Return the library's names that begin so, for a shell that completes the word."""
     from systems.library.named_scenes import names
@@ -56,9 +50,6 @@ WeightsOpt = Annotated[
     ),
 ]
 OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Output trajectory (.h5 or .dcd).")]
-SeedOpt = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
-ResumeOpt = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run of the same settings.")]
-OverwriteOpt = Annotated[bool, typer.Option("--overwrite", help="Overwrite existing output.")]
 
 
 def usage_error(message: str, context: Any = None) -> Exception:
@@ -75,7 +66,6 @@ def _hush(quiet: bool) -> bool:
     return quiet
 
 
-QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.", callback=_hush)]
 JsonOpt = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
 
 

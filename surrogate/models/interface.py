@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -68,12 +68,6 @@ class Chunk:
     frames_nm: Tensor
     velocities_nm_ps: Tensor | None = None
     evaluations: float | None = None
-
-
-class Config(Protocol):
-    """A model's settings: a frozen dataclass that a weights file keeps as JSON."""
-
-    def to_dict(self) -> dict[str, Any]: ...
 
 
 class Surrogate(nn.Module, ABC):

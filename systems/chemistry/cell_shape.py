@@ -43,9 +43,3 @@ def read_cells(lengths_nm: npt.ArrayLike, angles_deg: npt.ArrayLike) -> Float64A
     as files without a cell have it."""
     lengths = np.asarray(lengths_nm, dtype=np.float64)
     return None if (lengths == 0.0).any() else box_vectors(lengths, angles_deg)
-
-
-def volumes_nm3(cell_nm: npt.ArrayLike) -> Float64Array:
-    """Return the volumes `(n,)` nm³ of box vectors `(n, 3, 3)` nm."""
-    volume: Float64Array = np.abs(np.linalg.det(np.asarray(cell_nm, dtype=np.float64)))
-    return volume

@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from systems.library.particles import N_BODY
-
 
 @dataclass(frozen=True)
 class Entry:
@@ -36,7 +34,6 @@ class Entry:
 PEPTIDES = "peptides"
 AMINO_ACIDS = "capped amino acids"
 MOLECULES = "MD17 molecules"
-PARTICLES = "n-body systems"
 ANALYTIC = "analytic systems"
 
 _BATH_SETTINGS: dict[str, Any] = {
@@ -45,7 +42,6 @@ _BATH_SETTINGS: dict[str, Any] = {
     "timestep_ps": 0.01,
     "save_every_ps": 0.1,
 }
-_N_BODY_SOURCE = "LaM-SLidE, section 4.3, with the generator of GeoTDM (Han et al., NeurIPS 2024): 30 frames"
 
 _AMINO_ACIDS = {
     "ALA": "alanine", "ARG": "arginine, +1", "ASN": "asparagine", "ASP": "aspartate, -1", "CYS": "cysteine",
@@ -85,12 +81,6 @@ def _entries() -> list[Entry]:
         found.append(Entry(name, AMINO_ACIDS, title, sequence=name, file=file))
     for name, (smiles, title) in _SMILES.items():
         found.append(Entry(name, MOLECULES, title, protocols=("md17",), smiles=smiles))
-    laws = {"coulomb": "charges of ±1", "springs": "springs between half of the pairs", "gravity": "softened gravity"}
-    for name, n_body in N_BODY.items():
-        settings = {"ensemble": "nve", "timestep_ps": n_body.timestep_ps, "save_every_ps": n_body.save_every_ps,
-                    "equilibrate_ps": 0.0}  # fmt: skip
-        title = f"{n_body.n_particles} particles, {laws[n_body.kind]}; {name}:SEED draws other starting conditions"
-        found.append(Entry(name, PARTICLES, title, settings, _N_BODY_SOURCE))
     single = (("harmonic-oscillator", "one particle, one force constant an axis: variance kT/k, frequency sqrt(k/m)"),
               ("double-well", "one particle, two wells of unequal depth: populations by quadrature"))  # fmt: skip
     found += [Entry(name, ANALYTIC, title, _BATH_SETTINGS, "this program's own") for name, title in single]

@@ -12,13 +12,10 @@ from systems.chemistry.residues import ONE_LETTER
 from systems.errors import UnknownNameError, nearest
 from systems.library import catalogue
 from systems.library.catalogue import ENTRIES, Entry
-from systems.library.particles import N_BODY, double_well, harmonic_oscillator, n_body
+from systems.library.model_systems import double_well, harmonic_oscillator
 from systems.scene import Scene
 
-_ON_DEMAND = (
-    "Made from their name besides: capped peptides (ACE-ALA-GLY-NME), tetrapeptides in one-letter code (SDFS), "
-    "n-body systems with another seed (n-body-spring:7)."
-)
+_ON_DEMAND = "Made from their name besides: capped peptides (ACE-ALA-GLY-NME), tetrapeptides in one-letter code (SDFS)."
 
 
 def names() -> list[str]:
@@ -89,9 +86,6 @@ def _shipped(file: str) -> Scene:
 
 def _load(entry: Entry) -> Scene:
     provenance = {"source": "library", "library_name": entry.name, "repairs": []}
-    base, _, seed = entry.name.partition(":")
-    if base in N_BODY:
-        return n_body(base, int(seed or 0))
     if entry.group == catalogue.ANALYTIC:
         return {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[entry.name]()
     if entry.name in ENTRIES:
@@ -126,9 +120,6 @@ def _find(name: str) -> Entry | None:
     """Return the entry of a name, made for names on demand; None when there is no such scene."""
     if name in ENTRIES:
         return ENTRIES[name]
-    base, colon, seed = name.partition(":")
-    if base in N_BODY and colon and seed.isdecimal():
-        return replace(ENTRIES[base], name=f"{base}:{int(seed)}")
     if len(name) == 4 and set(name) <= set(ONE_LETTER):
         return _tetrapeptide(name, "-".join(ONE_LETTER[c] for c in name))
     if "-" not in name:

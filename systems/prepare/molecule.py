@@ -136,14 +136,6 @@ def to_rdkit(scene: Scene) -> Any:
     return molecule.GetMol()
 
 
-def n_unpaired_electrons(scene: Scene) -> int:
-    """Return the number of unpaired electrons that the scene's bonds and charges leave (0 for closed shells).
-
-    Raises PreparationError where the bond orders are not known.
-    """
-    return sum(atom.GetNumRadicalElectrons() for atom in to_rdkit(scene).GetAtoms())
-
-
 def _unique_names(elements: tuple[str, ...]) -> tuple[str, ...]:
     count: dict[str, int] = {}
     names = []

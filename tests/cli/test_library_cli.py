@@ -27,7 +27,7 @@ def test_systems_lists_every_scene_in_its_group() -> None:
     ("name", "words"),
     [
         ("uracil", ["md17", "gaff2", "500", "0.0005", "natural"]),
-        ("n-body-gravity:3", ["nve", "gravitational_constant", "softening_nm", "GeoTDM"]),
+        ("double-well", ["barrier_kj_mol", "minimum_nm", "this program's own"]),
         ("SDFS", ["SER-ASP-PHE-SER", "mdgen", "gbn2", "350"]),
     ],
 )
@@ -53,21 +53,20 @@ def test_plan_takes_the_protocol_and_says_so() -> None:
     assert "temperature" not in other["protocol"]
     assert other["constraints"] == "6 bonds to hydrogen"
     assert "protocol" not in json.loads(run("plan", "alanine-dipeptide", "--json").stdout)
-    for name, scheme in (("n-body-spring", "symplectic Euler"), ("n-body-gravity", "velocity Verlet")):
-        moved = json.loads(run("plan", name, "--json").stdout)
-        assert moved["integrator"] == f"{scheme}, 1 fs, no bath (started as the scene says)"
+    moved = json.loads(run("plan", "double-well", "--ensemble", "nve", "--json").stdout)
+    assert moved["integrator"] == "velocity Verlet, 10 fs, no bath (started at 300 K)"
 
 
 def test_reference_takes_a_model_system_s_own_settings_and_says_so(tmp_path: Path) -> None:
     out = tmp_path / "a.h5"
-    result = run("reference", "n-body-spring:5", "--time", "1ps", "-o", str(out))
+    result = run("reference", "double-well", "--ensemble", "nve", "--time", "1ps", "-o", str(out))
     assert result.exit_code == 0, result.output
-    assert "ensemble nve" in result.stderr
+    assert "time step 10 fs" in result.stderr or "10 fs" in result.stderr
     with open_trajectory(out) as reader:
         record = reader.record
         assert reader.n_frames == 10
-    assert (record["ensemble"], record["timestep_ps"], record["save_every_ps"]) == ("nve", 0.001, 0.1)
-    assert record["integrator"] == "SymplecticEuler"
+    assert (record["ensemble"], record["timestep_ps"], record["save_every_ps"]) == ("nve", 0.01, 0.1)
+    assert record["integrator"] == "VelocityVerlet"
     quiet = run("reference", "harmonic-oscillator", "--time", "1ps", "--temperature", "400K", "-o",
                 str(tmp_path / "b.h5"), "--quiet")  # fmt: skip
     assert quiet.exit_code == 0, quiet.output

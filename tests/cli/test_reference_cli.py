@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -59,34 +58,3 @@ def test_what_cannot_be_is_one_line_before_anything_runs(here: Path, arguments: 
     assert said in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
     assert not list(here.iterdir())
-
-
-def test_the_benchmark_compares_equal_models(here: Path) -> None:
-    arguments = ("--case", "ethanol", "--rounds", "1", "--seconds", "0.05s", "--cores", "1")
-    result = run("bench", "reference", *arguments, "-o", "bench.json")
-    assert result.exit_code == 0, result.output
-    rows = json.loads((here / "bench.json").read_text())["rows"]
-    assert [(row["case"], row["solvent"], row["n_atoms"]) for row in rows] == [
-        ("ethanol", "vacuum", 9),
-        ("ethanol", "obc2", 9),
-    ]
-    for row in rows:
-        assert row["equal_energies"] and row["energy_gap"] < 0.02 and row["force_gap"] < 1e-4
-        assert row["ns_per_day"]["ours"] > row["ns_per_day"]["plain, all cores"]
-    assert "ethanol" in result.stdout and "ratio" in result.stdout
-    wrong = run("bench", "reference", "--case", "methanol")
-    assert wrong.exit_code == 1 and "Did you mean 'ethanol'" in wrong.stderr
-
-
-def test_unequal_models_are_seen() -> None:
-    """Negative control of the comparison: another force field, and another solvent."""
-    from surrogate.bench import md_setups as setups
-    from surrogate.bench.md_speed import _compare
-
-    ala = next(c for c in setups.CASES if c.scene == "alanine-dipeptide" and c.solvent == "obc2")
-    scene = ala.prepared()
-    mine = setups.ours(ala, scene, cores=1)
-    mine.context.setPositions(scene.positions_nm)
-    for other in (ala, setups.Case("x", ala.scene, "vacuum"), setups.Case("x", ala.scene, "obc2", "ff99SB-ILDN")):
-        found = _compare({"ours": mine, "plain, one a core": setups.plain(other, scene, threads=1)})
-        assert found["equal_energies"] == (other is ala), found

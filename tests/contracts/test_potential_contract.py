@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from known_answers import pair_energy
 from surrogate.models.conformance import SurrogateContract, branched_chain, orthogonal
 from surrogate.models.interface import Molecule, Surrogate
-from surrogate.models.painet.attention import pair_energy
 from surrogate.models.painet.potential import energy as room
 from surrogate.models.painet.potential import simd
 from surrogate.models.painet.potential.config import PotentialConfig

@@ -80,3 +80,13 @@ def stretched(scene: Scene, by_nm: float) -> np.ndarray:
     step = positions[j] - positions[i]
     positions[j] += by_nm * step / np.linalg.norm(step)
     return positions
+
+
+def n_unpaired_electrons(scene: Scene) -> int:
+    """Return the number of unpaired electrons that the scene's bonds and charges leave (0 for closed shells).
+
+    Raises PreparationError where the bond orders are not known.
+    """
+    from systems.prepare.molecule import to_rdkit
+
+    return sum(atom.GetNumRadicalElectrons() for atom in to_rdkit(scene).GetAtoms())

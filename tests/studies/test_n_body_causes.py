@@ -10,11 +10,11 @@ import n_body_causes as study
 import numpy as np
 import pytest
 import torch
+from forecast_methods import N_GIVEN, polynomial_weights
 from n_body_cause_views import InnovationsView, VelocitiesView
+from n_body_data import make_systems
+from n_body_views import ParticleView
 
-from surrogate.bench.reproduce.forecast_methods import N_GIVEN, polynomial_weights
-from surrogate.bench.reproduce.n_body_data import make_systems
-from surrogate.bench.reproduce.n_body_views import ParticleView
 from surrogate.models.lam_slide.losses import random_rotations
 
 NAMES = (

@@ -21,7 +21,7 @@ from systems.errors import SurromdError
 from systems.units import parse_time_ps
 
 # One of each kind that is made on demand, beside all that ship.
-ON_DEMAND = ("ACE-SER-GLY-NME", "SDFS", "n-body-charged:7")
+ON_DEMAND = ("ACE-SER-GLY-NME", "SDFS")
 
 
 @dataclass(frozen=True)

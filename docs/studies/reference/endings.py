@@ -71,9 +71,7 @@ VERBS: dict[str, list[str]] = {
     "rollout": ["rollout", "alanine-dipeptide", "--weights", "alanine-dipeptide", "--time", "20ns", "--replicas", "4",
                 "-o", "r.h5"],
     "compare": ["compare", "{data}/ref.h5", "{data}/ref.h5", "-o", "report.html"],
-    "bench reference": ["bench", "reference", "--quick", "--cores", "2"],
     "stress": ["stress", "alanine-dipeptide", "--quick"],
-    "reproduce": ["reproduce", "n-body-charged", "--workers", "2"],
     "demo": ["demo"],
 }  # fmt: skip
 

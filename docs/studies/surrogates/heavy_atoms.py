@@ -4,7 +4,7 @@ REF... --test REF...`.
 Three LaM-SLidE of alanine dipeptide (or another peptide with phi and psi) are trained for the same time: of all atoms,
 of heavy atoms whose hydrogens are placed (`hydrogens = "placed"`), and of residues (`entities = "residue"`).
 Each draws one chunk from frames of a trajectory that it never saw, beside MD from the same frames (see
-`surrogate.bench.lag_errors`), and is timed. What is finished in FOLDER is not done again.
+`docs/studies/training/lag_errors.py`), and is timed. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from surrogate.bench.lag_errors import Row, evenly_started, hold_against
 from systems.chemistry.validity import Geometry
 from systems.units import parse_wall_s
+
+sys.path.append(str(Path(__file__).parents[1] / "training"))
+from lag_errors import Row, evenly_started, hold_against
 
 KINDS: dict[str, dict[str, str]] = {
     "modelled": {},

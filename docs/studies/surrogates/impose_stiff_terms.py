@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.bench.recipes.alanine_dipeptide import ship
 from surrogate.data.shipped import weights_path
 from systems.chemistry.validity import BOND_20_PERCENT, INVALID, Geometry, check_frames
 from systems.errors import InputError
 from systems.trajectory.codec import open_trajectory
+
+sys.path.append(str(Path(__file__).parents[1] / "training"))
+from alanine_dipeptide import ship
 
 if TYPE_CHECKING:
     from surrogate.models.stiff import StiffTerms

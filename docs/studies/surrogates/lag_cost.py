@@ -23,7 +23,6 @@ from surrogate.bench.cost_error.effective_samples import samples_per_second
 from surrogate.bench.cost_error.paired_timing import roll_in_turns
 from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
 from surrogate.bench.held_out import refuse_trained_on
-from surrogate.bench.lag_errors import torsions
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.data.shipped import weights_path
@@ -33,6 +32,9 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.trajectory.codec import open_trajectory
+
+sys.path.append(str(Path(__file__).parents[1] / "training"))
+from lag_errors import torsions
 
 Angles = npt.NDArray[np.float64]
 LAGS_PS = (10.0, 20.0, 50.0)

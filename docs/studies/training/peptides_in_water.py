@@ -12,17 +12,16 @@ and of the training set by turns, the test set first. What is there is left alon
 from __future__ import annotations
 
 import argparse
-import fcntl
-import multiprocessing
 import os
 import sys
-import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from peptide_list import Peptide, training_peptides
+from processes import in_order, only_here
 
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate
@@ -32,11 +31,8 @@ from md_reference.run.config import SIMD, Conditions, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
 from md_reference.simd.force_field import SimdReplicas, n_replicas
-from surrogate.bench.recipes.peptide_list import Peptide, training_peptides
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
-from systems.errors import SimulationError
-from systems.parent_watch import end_with_parent
 from systems.prepare.peptide import build_peptide
 from systems.scene import FloatArray, IntArray, Scene
 from systems.trajectory.topology_file import topology_path
@@ -101,11 +97,8 @@ def batch(folder: Path, peptide: Peptide, number: int) -> None:
     names = [f"run_{k:03d}.h5" for k in range(number * n_replicas(), (number + 1) * n_replicas())]
     if all((folder / name).exists() for name in names):
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "lock", "a") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with only_here(folder) as free:
+        if not free:
             return
         dry = build_peptide(peptide.sequence)
         wet = solvate(dry, WATER, WaterBox())
@@ -124,28 +117,20 @@ def batch(folder: Path, peptide: Peptide, number: int) -> None:
             os.replace(part, folder / name)
 
 
-def order() -> Iterator[tuple[str, Peptide, int]]:
-    """Yield every batch: where its files go, the molecule and the number."""
+def order() -> list[tuple[str, Peptide, int]]:
+    """Return every batch: where its files go, the molecule and the number."""
     training = [Peptide(p.residues, p.capped, p.n_starts, TRAINING_PS) for p in training_peptides()]
-    for number in range(ROUNDS):
-        yield from (("test", peptide, number) for peptide in TEST)
-        yield from (("train", peptide, number) for peptide in training)
+    return [
+        (kind, peptide, number)
+        for number in range(ROUNDS)
+        for kind, peptides in (("test", TEST), ("train", training))
+        for peptide in peptides
+    ]
 
 
-def work(folder: str, budget_s: float, taken: Any) -> None:
-    end_with_parent()
-    deadline = time.monotonic() + budget_s
-    for place, (kind, peptide, number) in enumerate(order()):
-        if time.monotonic() > deadline:
-            return
-        with taken.get_lock():
-            if place < taken.value:
-                continue
-            taken.value = place + 1
-        try:
-            batch(Path(folder) / kind / peptide.name, peptide, number)
-        except SimulationError as error:
-            sys.stderr.write(f"{peptide.name}: {error}\n")
+def make(task: tuple[str, Peptide, int], deadline: float, folder: str) -> None:
+    kind, peptide, number = task
+    batch(Path(folder) / kind / peptide.name, peptide, number)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -161,18 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if done > 0:
                 sys.stdout.write(f"{kind} {peptide.name} {min(done, n_replicas())} x {peptide.time_ps:g} ps\n")
         return
-    os.nice(15)
-    context = multiprocessing.get_context("spawn")
-    how = (str(chosen.folder), parse_wall_s(chosen.budget, "--budget"), context.Value("i", 0))
-    workers = [context.Process(target=work, args=how) for _ in range(chosen.workers)]
-    for worker in workers:
-        worker.start()
-    try:
-        for worker in workers:
-            worker.join()
-    finally:
-        for worker in workers:
-            worker.terminate()
+    in_order(order, make, parse_wall_s(chosen.budget, "--budget"), chosen.workers, str(chosen.folder))
 
 
 if __name__ == "__main__":

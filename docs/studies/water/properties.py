@@ -27,13 +27,13 @@ from md_reference.run.machine import machine_name
 from md_reference.simd.force_field import SimdReplicas
 from systems.scene import FloatArray
 from systems.source import prepare
-from systems.units import parse_time_ps
+from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 STEP_PS, SAVE_PS, WARM_PS = 0.004, 0.4, 20.0
 BINS = np.linspace(0.2, 0.9, 141)
 # e^2 / (eps0 nm kT) at 300 K, over 3.
-PERMITTIVITY = 4 * np.pi * 138.93545764438198 / (8.31446261815324e-3 * 300.0) / 3
+PERMITTIVITY = 4 * np.pi * 138.93545764438198 / (GAS_CONSTANT_KJ_MOL_K * 300.0) / 3
 
 
 def first_shell(oxygens: FloatArray, edge: float) -> list[float]:

@@ -57,7 +57,7 @@ def roll_in_turns(weights: Weights, roller: Roller, sampler: ChunkSampler, setti
 
 def md_costs(weights: Weights, config: CostErrorConfig) -> list[dict[str, Any]]:
     """Return processor and wall seconds of MD for a ns, by turns: OpenMM as it is set up here at each time step, MD in
-    SIMD at the longest where it runs, and what OpenMM's manual makes of the model on one thread (`md_setups.plain`),
+    SIMD at the longest where it runs, and what OpenMM's manual makes of the model on one thread (`plain_openmm.plain`),
     where it knows the force field.
 
     A plain step is timed once: it takes the same at any time step, of which 4 fs wants heavier hydrogens.
@@ -120,12 +120,13 @@ def _by_simd(weights: Weights, config: CostErrorConfig) -> SimdReplicas | None:
 
 def _plain_steps(weights: Weights, config: CostErrorConfig) -> Callable[[], object] | None:
     """Return what runs plain OpenMM for as many steps as a slice has at 4 fs; None where it cannot be set up."""
-    from surrogate.bench.md_setups import Case, plain
+    from md_reference.forces.spec import ForceFieldSpec
+    from surrogate.bench.plain_openmm import plain
 
     domain = weights.domain
-    case = Case(domain.scene.name, "", str(domain.conditions["solvent"]), str(domain.conditions["force_field"]))
+    spec = ForceFieldSpec(str(domain.conditions["force_field"]), str(domain.conditions["solvent"]))
     try:
-        context = plain(case, domain.scene, threads=config.threads).context
+        context = plain(domain.scene, spec, threads=config.threads).context
     except (KeyError, ValueError, SurromdError):
         return None
     context.setPositions(domain.scene.positions_nm)

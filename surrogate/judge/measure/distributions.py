@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.statistics import Blocks
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 FloatArray = npt.NDArray[np.float64]
 AnyFloat = npt.NDArray[np.floating]
@@ -18,8 +19,6 @@ IntArray = npt.NDArray[np.int64]
 N_BINS_1D = 100
 N_BINS_2D = 50
 PI = math.pi
-GAS_CONSTANT_KJ = 8.31446261815324e-3
-SQRT_LN2 = math.sqrt(math.log(2.0))
 
 # The cuts lie at the two minima of the psi density of ff99SB and ff14SB alanine dipeptide (about 80 and -120 degrees).
 ALPHA_PSI_RAD = (-2.0 * PI / 3.0, 80.0 * PI / 180.0)
@@ -170,5 +169,5 @@ def block_occupancy(member: Sequence[npt.NDArray[np.bool_]], blocks: Blocks) -> 
 def free_energy_kj(counts: FloatArray, temperature_k: float) -> FloatArray:
     """Return -RT ln(p) in kJ/mol above the most populated bin; NaN where nothing was counted."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        energy = -GAS_CONSTANT_KJ * temperature_k * np.log(counts / counts.max())
+        energy = -GAS_CONSTANT_KJ_MOL_K * temperature_k * np.log(counts / counts.max())
     return np.where(counts > 0, energy, np.nan)

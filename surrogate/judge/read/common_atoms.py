@@ -172,5 +172,4 @@ def _with_pseudo_hydrogens(scene: Scene) -> Scene:
         formal_charges=np.zeros(n + k, dtype=np.int64),
         masses_da=np.concatenate([scene.masses_da, np.ones(k)]),
         positions_nm=np.concatenate([x, np.array(places).reshape(-1, 3)]),
-        velocities_nm_ps=None,
     )

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from surrogate.judge.measure.distributions import free_energy_kj
 from surrogate.judge.rows.charts import Histogram
 from surrogate.judge.rows.curves import CorrelationCurve, RamachandranMap, Timeline
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def difference(title: str, data: RamachandranMap, temperature_k: float) -> str:
 
 def difference_kj(reference: FloatArray, candidate: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
     """Return candidate minus reference in kJ/mol, cut off at the second number; NaN where there are too few counts."""
-    rt_kj = 8.31446261815324e-3 * temperature_k
+    rt_kj = GAS_CONSTANT_KJ_MOL_K * temperature_k
     p_reference, p_candidate = (counts / max(counts.sum(), 1.0) for counts in (reference, candidate))
     with np.errstate(divide="ignore", invalid="ignore"):
         change = -rt_kj * np.log(p_candidate / p_reference)

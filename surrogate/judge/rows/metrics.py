@@ -20,12 +20,12 @@ from surrogate.judge.rows.rare_states import free_energy_row, rare_residues, wit
 from surrogate.judge.rows.rows import Group, Metric, Row, Sample, Trio, distance_row, observable_row
 from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 FloatArray = npt.NDArray[np.float64]
-Membership = Callable[[npt.NDArray[np.floating]], npt.NDArray[np.bool_]]
 
 # A population within this factor is 1 kJ/mol away at 300 K.
-ONE_KJ_FACTOR = math.exp(1.0 / (8.31446261815324e-3 * 300.0))
+ONE_KJ_FACTOR = math.exp(1.0 / (GAS_CONSTANT_KJ_MOL_K * 300.0))
 TORN_NM = 0.25
 WHOLE_KEY = "valid:whole"
 # More residues than this, and they share rows: means over all, and the one that is furthest off.

@@ -43,27 +43,6 @@ def linear_mean(q: Tensor, k: Tensor, v: Tensor, phi: Tensor, psi: Tensor, group
     return out[..., :-1] / out[..., -1:]
 
 
-def pair_energy(h: Tensor, before: Tensor, a: Tensor, b: Tensor, smoothness: float) -> Tensor:
-    """Return E(H) = sum_i |h_i - h_i(t)|^2 + lambda sum_ij (a_ij s - b_ij s^2), s = |h_i - h_j|^2.
-
-    `h` and `before` (H(t)) are `(..., n, d)`, `a` and `b` `(n, n)`; the result `(...)`.
-    """
-    squared = (h.unsqueeze(-2) - h.unsqueeze(-3)).square().sum(-1)
-    rho = a * squared - b * squared.square()
-    return (h - before).square().sum((-1, -2)) + smoothness * rho.sum((-1, -2))
-
-
-def largest_step(weights: Tensor, smoothness: float) -> float:
-    """Return the largest eta for which h + eta (mean - h) is proved not to raise `pair_energy`.
-
-    For concave rho the tangent at H(t) majorises the energy. With symmetric weights W, row sums D and L = D - W, the
-    step -eta D^-1 L H changes the majorant by at most eta u^T u (eta / d_min - 4 lambda (1 - eta)), u = D^-1/2 L H,
-    because D^-1/2 L D^-1/2 has no eigenvalue above 2. It vanishes at eta = c / (1 + c), c = 4 lambda d_min.
-    """
-    bound = 4.0 * smoothness * float(weights.sum(-1).min())
-    return bound / (1.0 + bound)
-
-
 class AttentionSettings(Protocol):
     """What a model's configuration says of its attention. `step`: eta of the descent; `psi_limit`: largest Psi / Phi;
     `attention`: 'dense', or in the factored form."""

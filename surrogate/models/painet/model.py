@@ -20,13 +20,13 @@ from surrogate.models.painet.pairs import Pairs, molecular_pairs
 from surrogate.models.painet.rotation import angular_velocity, spun, turns
 from surrogate.models.painet.surroundings import Surroundings
 from systems.errors import InputError
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 # Atomic numbers up to xenon; 0 is a particle of a model system.
 N_TYPES = 55
 # Numbers in one layer's messages, of all rows decoded at once. Larger arrays come anew from the system each time: then
 # 10,000 atoms cost five times what 3,000 do.
 MESSAGE_NUMBERS = 2_000_000
-BOLTZMANN_KJ_MOL_K = 0.00831446261815324
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ class Painet(Surrogate):
         """The bath acts on velocities `(b, n, 3)` for the time of one chunk (exact Ornstein-Uhlenbeck step); None are
         drawn from the Maxwell-Boltzmann distribution, all from `noise` (b, n, 3)."""
         c = self.config
-        thermal = (BOLTZMANN_KJ_MOL_K * c.temperature_k / molecule.masses_da).sqrt()[:, None] * noise
+        thermal = (GAS_CONSTANT_KJ_MOL_K * c.temperature_k / molecule.masses_da).sqrt()[:, None] * noise
         if velocities is None:
             return thermal
         kept = math.exp(-c.friction_per_ps * c.chunk_ps)

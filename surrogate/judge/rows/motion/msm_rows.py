@@ -16,7 +16,7 @@ from surrogate.judge.measure.statistics import estimate
 from surrogate.judge.rows.charts import BarChart, Chart, Landscape, Line, LineChart, Role
 from surrogate.judge.rows.motion.relaxation_rows import speed_words
 from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, too_short
-from systems.units import format_time_ps
+from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -210,7 +210,7 @@ def _landscape(trio: Trio, states: Sequence[_States]) -> list[Chart]:
 
 def _free_energies(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:
     """Free energies of the states above the most populated one, -RT ln(p / p_0), with error bars; not judged twice."""
-    thermal_kj = distributions.GAS_CONSTANT_KJ * trio.temperature_k
+    thermal_kj = GAS_CONSTANT_KJ_MOL_K * trio.temperature_k
     found = []
     for s in states:
         total, drawn = s.occupancy.sum(0), s.sample.weights @ s.occupancy

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.distributions import GAS_CONSTANT_KJ
 from surrogate.judge.measure.movie import pick_frames
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.block_means import block_means, bounds, mean_row
 from surrogate.judge.rows.charts import Chart, Histogram
 from surrogate.judge.rows.rows import Metric, Row, Trio
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 FloatArray = npt.NDArray[np.float64]
 # Positions `(n_atoms, 3)` nm of one frame to kJ/mol; not finite where the frame has none.
@@ -61,7 +61,7 @@ def energy_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str
     limit = float(np.quantile(finite, _HIGH_QUANTILE))
     above = [[np.where(np.isnan(c), np.nan, 100.0 * (c > limit)) for c in m] for m in columns]
     shares = [block_means(s, a) for s, a in zip(trio.samples, above, strict=True)]
-    thermal_kj = GAS_CONSTANT_KJ * trio.temperature_k
+    thermal_kj = GAS_CONSTANT_KJ_MOL_K * trio.temperature_k
     rows = [
         mean_row(
             trio,

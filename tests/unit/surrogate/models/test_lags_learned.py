@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lag_errors import _correlation
 
-from surrogate.bench.lag_errors import _correlation
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
 from surrogate.data.weights import load_weights
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from many_molecules import TRAINED, UNSEEN, change_per_frame
 
 from surrogate import api
-from surrogate.bench.recipes.many_molecules import TRAINED, UNSEEN, change_per_frame
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.sampling.domain import find_deviations

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from small_scenes import n_unpaired_electrons
 from systems.chemistry import symmetry
 from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.geometry import signed_volumes, superpose, torsion
@@ -32,7 +33,7 @@ from systems.chemistry.graph import (
 )
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load
-from systems.prepare.molecule import n_unpaired_electrons, scene_from_smiles
+from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
 from systems.selection import part_of
 

@@ -34,8 +34,7 @@ def test_the_groups_hold_every_name_once() -> None:
     listed = [name for members in named_scenes.groups().values() for name in members]
     assert sorted(listed) == named_scenes.names()
     sizes = {group: len(members) for group, members in named_scenes.groups().items()}
-    assert sizes == {"peptides": 4, "capped amino acids": 22, "MD17 molecules": 8, "n-body systems": 3,
-                     "analytic systems": 2}  # fmt: skip
+    assert sizes == {"peptides": 4, "capped amino acids": 22, "MD17 molecules": 8, "analytic systems": 2}
 
 
 @pytest.mark.parametrize("name", MD17)
@@ -144,13 +143,7 @@ def test_tetrapeptides_are_made_from_one_letter_code() -> None:
     assert named_scenes.protocols("SDFS") == named_scenes.protocols("SER-ASP-PHE-SER") == ("mdgen",)
 
 
-def test_a_seed_may_follow_the_name_of_an_n_body_system() -> None:
-    assert named_scenes.load("n-body-charged").name == "n-body-charged:0"
-    assert prepare("n-body-charged:12").provenance["seed"] == 12
-    assert named_scenes.own_settings("n-body-charged:12")["ensemble"] == "nve"
-
-
-@pytest.mark.parametrize("name", ["n-body-charged:", "n-body-charged:x", "n-body-charged:-1", "harmonic-oscillator:1",
+@pytest.mark.parametrize("name", ["n-body-charged", "harmonic-oscillator:1",
                                   "SDF", "SDFX", "ACE-XXX-NME", "aspirine", "alanine dipeptide"])  # fmt: skip
 def test_other_names_are_refused_in_one_line(name: str) -> None:
     assert not named_scenes.knows(name)
@@ -183,7 +176,7 @@ def test_protocols_name_settings_that_runs_have() -> None:
     for protocol in PROTOCOLS.values():
         assert set(protocol.settings) <= known, protocol.name
         assert protocol.source
-    assert named_scenes.own_settings("n-body-spring")
+    assert named_scenes.own_settings("double-well")
 
 
 def test_the_md17_protocol_is_the_published_one() -> None:

@@ -1,4 +1,4 @@
-"""Model systems as scenes: starting conditions by the protocol, seeds, files, and everything that asks for elements."""
+"""Model systems as scenes: files, and everything that asks for elements."""
 
 from __future__ import annotations
 
@@ -11,73 +11,17 @@ import pytest
 from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key, rotatable_torsions, stereocentres
 from systems.chemistry.validity import NOT_FINITE, check_frames, geometry_from_frames, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
-from systems.library.particles import N_BODY, double_well, harmonic_oscillator, n_body, particles
+from systems.library.model_systems import double_well, harmonic_oscillator, particles
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.topology_file import pdb_text
 
-SCENES = {"harmonic": harmonic_oscillator, "double-well": double_well} | {
-    name: (lambda name=name: n_body(name, 7)) for name in N_BODY
-}
-SEEDS = range(400)
+SCENES = {"harmonic": harmonic_oscillator, "double-well": double_well}
 
 
 @pytest.fixture(params=SCENES, ids=SCENES)
 def scene(request: pytest.FixtureRequest) -> Scene:
     return SCENES[request.param]()
-
-
-def mean_is(values: np.ndarray, expected: float) -> bool:
-    return abs(values.mean() - expected) < 4.0 * values.std() / np.sqrt(values.size)
-
-
-# ---- starting conditions -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", N_BODY)
-def test_a_seed_is_a_scene(name: str) -> None:
-    first, again, other = n_body(name, 3), n_body(name, 3), n_body(name, 4)
-    np.testing.assert_array_equal(first.positions_nm, again.positions_nm)
-    np.testing.assert_array_equal(first.velocities_nm_ps, again.velocities_nm_ps)
-    assert first.interactions == again.interactions
-    assert np.abs(first.positions_nm - other.positions_nm).min() > 0.0
-    assert first.name == f"{name}:3"
-
-
-@pytest.mark.parametrize(("name", "std", "n"), [("n-body-charged", 1.0, 5), ("n-body-spring", 0.5, 5),
-                                                ("n-body-gravity", 1.0, 10)])  # fmt: skip
-def test_starting_positions_have_the_published_spread(name: str, std: float, n: int) -> None:
-    x = np.array([n_body(name, seed).positions_nm for seed in SEEDS])
-    assert x.shape[1:] == (n, 3)
-    assert mean_is(x, 0.0)
-    assert mean_is(x**2, std**2)
-    assert not mean_is(x**2, 1.1 * std**2)
-    assert mean_is(x**4, 3.0 * std**4), "not normal"
-
-
-@pytest.mark.parametrize("name", ["n-body-charged", "n-body-spring"])
-def test_every_particle_starts_at_the_published_speed_in_a_random_direction(name: str) -> None:
-    v = np.array([n_body(name, seed).velocities_nm_ps for seed in SEEDS])
-    np.testing.assert_allclose(np.linalg.norm(v, axis=-1), 0.5, rtol=1e-12)
-    for axis in range(3):
-        assert mean_is(v[..., axis], 0.0)
-        assert mean_is(v[..., axis] ** 2, 0.25 / 3.0)
-
-
-def test_gravity_starts_with_its_centre_of_mass_at_rest() -> None:
-    v = np.array([n_body("n-body-gravity", seed).velocities_nm_ps for seed in SEEDS])
-    np.testing.assert_allclose(v.mean(axis=1), 0.0, atol=1e-12)
-    assert mean_is(v**2, 1.0 - 1.0 / 10.0)  # the mean of ten was taken away
-    assert not mean_is(v**2, 1.0)
-
-
-def test_charges_and_springs_come_with_even_odds() -> None:
-    charges = np.array([n_body("n-body-charged", seed).interactions["charges_e"] for seed in SEEDS])
-    assert set(np.unique(charges)) == {-1.0, 1.0}
-    assert mean_is(charges, 0.0)
-    n_springs = np.array([len(n_body("n-body-spring", seed).interactions["pairs"]) for seed in SEEDS])
-    assert mean_is(n_springs, 5.0)  # of ten pairs
-    assert n_springs.var() == pytest.approx(2.5, abs=0.8)
 
 
 # ---- everything that asks for elements -----------------------------------------------------------------------------
@@ -87,11 +31,6 @@ def test_a_scene_survives_its_record(scene: Scene) -> None:
     again = Scene.from_dict(scene.to_dict())
     assert again.topology_hash == scene.topology_hash
     assert again.interactions == scene.interactions
-    if scene.velocities_nm_ps is None:
-        assert again.velocities_nm_ps is None
-    else:
-        np.testing.assert_array_equal(again.velocities_nm_ps, scene.velocities_nm_ps)
-        assert replace(scene, velocities_nm_ps=None).topology_hash == scene.topology_hash
     assert replace(scene, interactions=None).topology_hash != scene.topology_hash
 
 
@@ -132,19 +71,13 @@ def test_particles_may_meet_but_not_vanish(scene: Scene) -> None:
 
 
 def test_another_law_is_another_system() -> None:
-    gravity, other = n_body("n-body-gravity", 1), n_body("n-body-gravity", 2)
-    np.testing.assert_array_equal(match_atoms(other, gravity), np.arange(10))
-    assert molecule_key(gravity) == molecule_key(other)
-    first, second = n_body("n-body-charged", 0), n_body("n-body-charged", 1)
-    assert first.interactions != second.interactions
-    assert molecule_key(first) != molecule_key(second)
-    for scene, template in (
-        (first, second),
-        (first, n_body("n-body-spring", 0)),
-        (harmonic_oscillator(), double_well()),
-    ):
+    well = double_well()
+    deeper = replace(well, interactions={**(well.interactions or {}), "barrier_kj_mol": 7.0})
+    np.testing.assert_array_equal(match_atoms(double_well(), well), [0])
+    assert molecule_key(double_well()) == molecule_key(well) != molecule_key(deeper)
+    for template in (deeper, harmonic_oscillator()):
         with pytest.raises(OutOfDomainError, match="different laws"):
-            match_atoms(scene, template)
+            match_atoms(well, template)
 
 
 # ---- refusals ------------------------------------------------------------------------------------------------------
@@ -154,11 +87,9 @@ def test_another_law_is_another_system() -> None:
     ("law", "said"),
     [
         ({"kind": "magnetism"}, "unknown"),
-        ({"kind": "coulomb", "coulomb_constant": 1.0}, "charges_e"),
-        ({"kind": "coulomb", "coulomb_constant": 1.0, "charges_e": [1.0]}, "1 charges for 2"),
-        ({"kind": "springs", "force_constant_kj_mol_nm2": 1.0, "pairs": [[0, 2]]}, "two of the 2"),
         ({"kind": "harmonic", "force_constants_kj_mol_nm2": [1.0]}, "three"),
-        ({"kind": "gravity", "gravitational_constant": 1.0, "softening_nm": 0.1, "mass": 1.0}, "mass"),
+        ({"kind": "harmonic"}, "force_constants_kj_mol_nm2"),
+        ({"kind": "harmonic", "force_constants_kj_mol_nm2": [1.0, 1.0, 1.0], "mass": 1.0}, "mass"),
     ],
 )
 def test_a_law_that_does_not_fit_is_refused_in_one_line(law: dict, said: str) -> None:

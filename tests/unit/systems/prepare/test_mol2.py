@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from small_scenes import n_unpaired_electrons
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.prepare.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles
+from systems.prepare.molecule import scene_from_mol_file, scene_from_smiles
 from systems.prepare.read.mol2_file import element_of
 from systems.scene import Scene
 from systems.source import prepare

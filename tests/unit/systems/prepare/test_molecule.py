@@ -13,10 +13,11 @@ from drug_like_smiles import Case, cases, what_is_wrong
 from rdkit import Chem, rdBase
 from rdkit.Chem import rdDepictor
 
+from small_scenes import n_unpaired_electrons
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.prepare.molecule import n_unpaired_electrons, scene_from_mol_file, scene_from_smiles, to_rdkit
+from systems.prepare.molecule import scene_from_mol_file, scene_from_smiles, to_rdkit
 from systems.prepare.read.smiles import refuse_changed_stereo, stereo_labels
 from systems.scene import Scene
 from systems.source import prepare

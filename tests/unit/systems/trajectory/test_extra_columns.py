@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.chemistry.cell_shape import box_vectors, lengths_and_angles, volumes_nm3
+from systems.chemistry.cell_shape import box_vectors, lengths_and_angles
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
@@ -47,7 +47,7 @@ def test_box_vectors_are_reduced_and_come_back() -> None:
     assert cell[0, 0, 1] == cell[0, 0, 2] == cell[0, 1, 2] == 0.0
     ca, cb, cg = np.cos(np.radians(ANGLES))
     volume = LENGTHS.prod() * np.sqrt(1 - ca**2 - cb**2 - cg**2 + 2 * ca * cb * cg)
-    assert volumes_nm3(cell)[0] == pytest.approx(volume, rel=1e-12)
+    assert np.linalg.det(cell[0]) == pytest.approx(volume, rel=1e-12)
     # Angles in another order are another cell of the same volume.
     assert np.abs(box_vectors(LENGTHS[None], ANGLES[None, ::-1]) - cell).max() > 0.1
 

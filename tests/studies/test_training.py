@@ -1,0 +1,129 @@
+"""Trainings of shipped weights: which peptides, from which starts; umbrella sampling; lags."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import lag_errors
+import numpy as np
+import peptide_runs
+import peptide_seeds
+import pytest
+from peptide_energies import wham
+from peptide_list import (
+    FURTHER_PAIRS,
+    RESIDUES,
+    TEST_CHAINS,
+    TEST_FREE_CHAINS,
+    TEST_PAIRS,
+    held_out_peptides,
+    training_peptides,
+)
+
+from systems.prepare.peptide import build_peptide
+from systems.trajectory.codec import open_trajectory
+
+
+def test_every_residue_stands_three_times_at_either_place_of_the_capped_pairs() -> None:
+    pairs = [p.residues for p in training_peptides() if p.capped and len(p.residues) == 2]
+    assert len(pairs) == len(set(pairs)) == 66 + len(FURTHER_PAIRS)
+    assert tuple(pairs[66:]) == FURTHER_PAIRS
+    pairs = pairs[:66]
+    for place in (0, 1):
+        assert Counter(p[place] for p in pairs) == dict.fromkeys(RESIDUES, 3)
+        assert Counter(p[place] for p in pairs[: len(RESIDUES)]) == dict.fromkeys(RESIDUES, 1)
+
+
+def test_no_test_molecule_is_trained_on() -> None:
+    trained = {(p.residues, p.capped) for p in training_peptides()}
+    tested = {(p, True) for p in (*TEST_PAIRS, *TEST_CHAINS)} | {(p, False) for p in TEST_FREE_CHAINS}
+    assert not trained & tested
+    # A pair with free termini would teach the capped one, and a free chain the capped one of the same residues.
+    assert not {r for r, _ in trained} & {r for r, _ in tested}
+
+
+def test_metadynamics_fills_the_basins_and_not_the_clash() -> None:
+    scene = build_peptide("ACE-ALA-NME")
+    frames, (free,) = peptide_seeds.metadynamics(
+        scene, time_ps=80, temperature_k=500, bias_factor=8, seed=4, platform="Reference"
+    )
+    assert frames.shape == (80, 22, 3)
+    # Minus the bias: no deeper than what was deposited, deepest in alpha and beta, and none at phi = psi = 0.
+    n = len(free) - 1
+    at = np.rint((np.radians([[-70, -30], [-70, 150], [0, 0]]) + np.pi) / (2 * np.pi) * n).astype(int)
+    alpha, beta, clash = (free[psi, phi] for phi, psi in at)
+    assert max(alpha, beta) < clash - 3.0
+
+
+def test_runs_start_at_their_seeds_and_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alanine = replace(training_peptides()[0], n_starts=18, time_ps=3.0)
+    scene = build_peptide(alanine.sequence)
+    seeds = peptide_seeds.Seeds(np.stack([scene.positions_nm] * 18), ("basin",) * 17 + ("phi>0",))
+    monkeypatch.setattr(peptide_runs, "_seeds", lambda *_: seeds)
+    kept = peptide_runs.run_path(tmp_path, 4)
+    kept.write_bytes(b"there")
+    peptide_runs.simulate_peptide(tmp_path, alanine, math.inf)
+    assert sorted(p.name for p in tmp_path.glob("*.h5")) == [f"run_{k:03d}.h5" for k in range(18)]
+    assert kept.read_bytes() == b"there"
+    with (
+        open_trajectory(peptide_runs.run_path(tmp_path, 17)) as last,
+        open_trajectory(tmp_path / "run_000.h5") as first,
+    ):
+        assert last.n_frames == first.n_frames == 3
+        assert last.record["start"] == {"group": "phi>0", "index": 17, "discarded_ps": 20.0}
+        assert last.record["force_field"] == "ff14SB"
+        assert not np.allclose(last.read(), first.read())
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_what_is_tested_is_never_made_for_training(tmp_path: Path) -> None:
+    order = peptide_runs._order()
+    assert len(order) == len(training_peptides()) + len(held_out_peptides())
+    assert not {p.residues for p, training in order if training and len(p.residues) > 1} & {
+        p.residues for p, training in order if not training
+    }
+
+
+CENTRES = np.linspace(np.radians(82.0), np.radians(-185.0), 16)
+STIFF = 40.0
+EDGES = np.linspace(-np.pi, np.pi, 73)
+
+
+def _energy(phi: np.ndarray) -> np.ndarray:
+    """Two basins, the one at 60 degrees 4 kT higher, behind barriers of 12 and 20 kT."""
+    return np.asarray(6.0 * (1 - np.cos(phi + 1.2)) + 4.0 * (1 - np.cos(2 * phi - 0.3)))
+
+
+def _biased_draws(rng: np.random.Generator, n: int) -> np.ndarray:
+    fine = np.linspace(-np.pi, np.pi, 20_001)
+    rows = []
+    for centre in CENTRES:
+        p = np.exp(-_energy(fine) + STIFF * (np.cos(fine - centre) - 1))
+        rows.append(rng.choice(fine, size=n, p=p / p.sum()))
+    return np.stack(rows)
+
+
+def test_wham_recovers_what_was_biased() -> None:
+    draws = _biased_draws(np.random.default_rng(0), 4000)
+    found = wham(draws, CENTRES, STIFF)
+    fine = np.linspace(-np.pi, np.pi, 20_001)
+    true = np.exp(-_energy(fine))
+    ratio = np.log(true[fine < 0].sum() / true[fine > 0].sum())
+    positive = np.arange(72) >= 36
+    assert np.log(found[~positive].sum() / found[positive].sum()) == pytest.approx(ratio, abs=0.1)
+    # What the copies show by themselves is another.
+    wrong = wham(draws, CENTRES, 0.0)
+    assert abs(np.log(wrong[~positive].sum() / wrong[positive].sum()) - ratio) > 0.5
+
+
+def test_correlation_and_distance_of_known_processes() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=20_000)
+    assert lag_errors._correlation(x, 0.6 * x + 0.8 * rng.normal(size=20_000)) == pytest.approx(0.6, abs=0.02)
+    assert lag_errors._correlation(x, rng.normal(size=20_000)) == pytest.approx(0.0, abs=0.02)
+    angles = rng.uniform(-np.pi, np.pi, (20_000, 2))
+    assert lag_errors.joint_distance(angles, angles) == 0.0
+    assert lag_errors.joint_distance(angles, 0.1 * angles) > 0.7
