@@ -35,6 +35,15 @@ _LEAST_FRAMES = 10
 _SAMPLED_VALUES = 20_000_000
 
 
+def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
+    """Return how long trajectories are, as what they are: '32 replicas of 3.8 ns', never their sum."""
+    if not segment_lengths:
+        return "no frames"
+    short, long = (format_time_ps(n * lag_ps, 3) for n in (min(segment_lengths), max(segment_lengths)))
+    each = long if short == long else f"{short} to {long}"
+    return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
+
+
 class InSegments(ABC):
     """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
 
@@ -54,6 +63,11 @@ class InSegments(ABC):
     def total_ps(self) -> float:
         """Simulated time of all segments together (frames times lag)."""
         return self.n_frames * self.lag_ps
+
+    @property
+    def length_words(self) -> str:
+        """Such as '32 replicas of 3.8 ns'."""
+        return length_words(self.segment_lengths, self.lag_ps)
 
 
 @dataclass(frozen=True, eq=False)
