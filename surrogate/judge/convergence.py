@@ -34,13 +34,13 @@ LEAST_RELAXATIONS = 5.0
 # Entries and exits of a state that is neither rare nor everything; share below which a state is rare.
 LEAST_PASSAGES = 6
 RARE_BELOW = 0.05
-# What a start may leave in a share.
+# What a start may leave in a share, and by how much quarters must differ to be a drift that matters.
 _LEAST_BIAS = 0.05
 # Of each test that can give a false alarm: drift, the φ/ψ map, a replica that is stuck.
 _SIGNIFICANCE = 0.01
 _FLIPS = 2000
 _LEAST_REPLICAS = 8
-_MOST_TORSIONS, _MOST_MAPS = 128, 16
+_MOST_TORSIONS, _MOST_MAPS = 64, 16
 _BINS, _MAP_BINS, _LEAST_FRAMES = 72, 18, 16
 # Peaks of an angle are two states where the density between them falls below this share of the lower one.
 _SADDLE = 0.5
@@ -436,7 +436,8 @@ def _judged(column: Column, drift_p: float, lag_ps: float, n_tests: int) -> Stat
             low, high = 0.0, 1.0
     else:
         common = True
-    if not fault and drift_p < _SIGNIFICANCE:
+    moves = not column.is_state or float(np.ptp(by_quarter)) > _LEAST_BIAS
+    if not fault and moves and drift_p < _SIGNIFICANCE:
         fault = f"{label} drifts: {words} by quarters" if column.is_state else f"{label} drifts along the replicas"
         low, high = (low, 1.0) if upward else (0.0, high)
     elif not fault and common and replica < LEAST_RELAXATIONS * tau:

@@ -69,6 +69,14 @@ class Explained:
     why: tuple[str, ...] = ()
     excess: tuple[Excess, ...] = ()
 
+    def in_words(self, found: Convergence) -> str:
+        """Return why a verdict must wait; empty where it need not."""
+        if not self.why:
+            return ""
+        if not found.converged:
+            return f"the reference is {found.verdict.removesuffix('.')}; {found.remedy}"
+        return f"the reference, {found.length}, is too short to tell: {'; '.join(self.why[:3])}"
+
 
 def explain(
     reference: Sequence[Features], candidate: Features, torsions: Backbone, found: Convergence, *, seed: int = 0

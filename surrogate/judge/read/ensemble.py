@@ -39,7 +39,7 @@ def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
     """Return how long trajectories are, as what they are: '32 replicas of 3.8 ns', never their sum."""
     if not segment_lengths:
         return "no frames"
-    short, long = (format_time_ps(n * lag_ps, 3) for n in (min(segment_lengths), max(segment_lengths)))
+    short, long = (format_time_ps(n * lag_ps) for n in (min(segment_lengths), max(segment_lengths)))
     each = long if short == long else f"{short} to {long}"
     return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
 
