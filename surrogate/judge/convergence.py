@@ -460,16 +460,20 @@ def _judged(column: Column, drift_p: float, lag_ps: float, n_tests: int) -> Stat
 
 
 def _stuck_p(column: Column) -> float:
-    """Return the least probability of a replica that stays in the state all along, if exits were as frequent in it as
-    in the others (binomial: of n exits none falls on it)."""
-    inside = np.array([x.sum() for x in column.series])
-    exits = np.array([(np.diff(x) < 0).sum() for x in column.series])
-    whole = inside == [len(x) for x in column.series]
-    if not whole.any() or not exits.sum():
+    """Return the least probability of a replica that stays in the state all along, if it were as the others.
+
+    Of n exits none falls on it (binomial). Where exits come in bursts (crossing back and forth at once) fewer count:
+    those of a two-state process that relaxes as slowly as the others do.
+    """
+    whole = np.array([bool(x.all()) for x in column.series])
+    if not whole.any() or whole.all():
         return 1.0
-    longest = inside[whole].max()
-    moving = float(inside[~whole].sum())
-    return float((moving / (moving + longest)) ** exits.sum())
+    others = Column(column.torsion, column.name, [x for x, w in zip(column.series, whole, strict=True) if not w])
+    inside, exits = float(sum(x.sum() for x in others.series)), float(others.passages()[1])
+    if math.isfinite(others.relaxation):
+        exits = min(exits, inside * (1.0 - others.share) / others.relaxation)
+    longest = max(len(x) for x, w in zip(column.series, whole, strict=True) if w)
+    return float((inside / (inside + longest)) ** exits)
 
 
 def _chance(p: float) -> str:
