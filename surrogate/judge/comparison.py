@@ -11,7 +11,7 @@ import numpy as np
 
 from surrogate.judge import remarks, verdict
 from surrogate.judge.convergence import Convergence, convergence_of
-from surrogate.judge.explained import Explained, explain
+from surrogate.judge.explained import NOTHING_OPEN, Explained, explain
 from surrogate.judge.in_short import in_short
 from surrogate.judge.measure.movie import Movie, make_movie
 from surrogate.judge.measure.slow_motion import longest_correlation
@@ -47,7 +47,6 @@ from surrogate.judge.worth_measures import worths
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.units import format_time_ps
 
 # Frames whose bonds tell whether a topology fits.
 _FRAMES_FOR_BONDS = 20
@@ -110,7 +109,7 @@ class Judgement:
     curves: Curves
     worth: tuple[Worth, ...] = ()
     worth_words: str = ""
-    left_open: Explained = Explained()
+    left_open: Explained = NOTHING_OPEN
     in_short: tuple[str, str, str] = ("", "", "")
 
     def row(self, key: str) -> Row:
@@ -244,8 +243,17 @@ def compare(
     accounts = [account_of(e) for e in everyone]
     beside = None if floor is None else find_pairs(thinned[0], floor)
     setting = _Setting(
-        stage, yardstick.torsions, yardstick.geometry, truth, other, chosen, float(temperature), accounts[0], {},
-        known, convergence,
+        stage,
+        yardstick.torsions,
+        yardstick.geometry,
+        truth,
+        other,
+        chosen,
+        float(temperature),
+        accounts[0],
+        {},
+        known,
+        convergence,
     )
     judgements = tuple(
         _with_forecast(
@@ -325,9 +333,7 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
     return Judgement(
         account=account,
         status=kind,
-        verdict=" ".join(
-            [verdict.sentence(judged, found, shortest.length_words, doubts), *([words] if words else [])]
-        ),
+        verdict=" ".join([verdict.sentence(judged, found, shortest.length_words, doubts), *([words] if words else [])]),
         findings=found,
         rows=judged,
         compared_ps=trio.compared_ps,
@@ -351,6 +357,7 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
         ),
         notes=tuple(
             remarks.trimming(trio, reference, candidate, replicate)
+            + (["Equivalent MD time is withheld: it takes a converged reference."] * bool(left_open.why))
             + remarks.unlike(judged, options)
             + copied_from(trio)[1]
             + imposed_notes(account.label, judged, account.imposed)

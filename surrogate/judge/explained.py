@@ -78,6 +78,9 @@ class Explained:
         return f"the reference, {found.length}, is too short to tell: {'; '.join(self.why[:3])}"
 
 
+NOTHING_OPEN = Explained()
+
+
 def explain(
     reference: Sequence[Features], candidate: Features, torsions: Backbone, found: Convergence, *, seed: int = 0
 ) -> Explained:
@@ -101,7 +104,7 @@ def explain(
             unseen.append(line)
             outside = [o | (x > 0) for o, x in zip(outside, column.series, strict=True)]
     if found.converged and not unseen:
-        return Explained()
+        return NOTHING_OPEN
     allowed = convergence_of(theirs, torsions, wells=wells, seed=seed).states
     open_ones = [(s, c) for s, c in zip(allowed, truths, strict=False) if s.fault]
     excess = []

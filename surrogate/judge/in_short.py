@@ -34,7 +34,8 @@ def in_short(
         reason = next(filter(None, reversed(doubts)), "the error bars are wider than what would matter")
         return "Not known yet whether it can be used.", for_what, f"Why: {reason}.{ends}"
     if status == "different":
-        return "Do not use it for what is wrong in it.", for_what, f"Why: {why}.{ends}"
+        waits = f" What is not known waits: {doubts.start}." if doubts.start else ""
+        return "Do not use it for what is wrong in it.", for_what, f"Why: {why}.{waits}{ends}"
     if status == "close":
         return "Use it within its tolerances.", for_what, f"Why: {why}, each within its tolerance.{ends}"
     return "Use it.", for_what, f"Why: nothing measured differs from reference MD by more than chance.{ends}"

@@ -23,7 +23,7 @@ def _one_or_none(text: str, what: str) -> str | None:
     return None if text == "-" else text
 
 
-def _parse_lag_ps(text: str, what: str) -> float | None:
+def _parse_dt_ps(text: str, what: str) -> float | None:
     return None if text == "-" else parse_time_ps(text, what)
 
 
@@ -145,17 +145,17 @@ class WindowsOptions(Validated, Overwriting, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(Overwriting):
-    """What `compare` can be told. Of `top` and `lag_ps` one stands for all, or there is one for the reference, each
+    """What `compare` can be told. Of `top` and `dt_ps` one stands for all, or there is one for the reference, each
     candidate and the replicate, in this order, None where the file says it itself."""
 
     replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
         "Topology file: one for all, or one each for REF, every TRAJ and the replicate.", None, read=_one_or_none
     )
-    lag_ps: float | Sequence[float | None] | None = option(
+    dt_ps: float | Sequence[float | None] | None = option(
         "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
         None,
-        read=_parse_lag_ps,
+        read=_parse_dt_ps,
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
     energies: bool = option("Also compare potential energies, by the reference's force field.", False)

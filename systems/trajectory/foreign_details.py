@@ -31,7 +31,7 @@ def counted_note(time_ps: npt.NDArray[np.float64]) -> tuple[str, ...]:
     """Return the line on times `(n_frames,)` that are what MDTraj writes where nobody stated any."""
     if len(time_ps) < 3 or not np.array_equal(time_ps, np.arange(len(time_ps))):
         return ()
-    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where it was told none; if so, state `lag_ps`.",)
+    return ("its times are 0, 1, 2, ... ps, which MDTraj also writes where it was told none; if so, state `dt_ps`.",)
 
 
 def netcdf_units(handle: Any, path: Path) -> tuple[float, float, float]:

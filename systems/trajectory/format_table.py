@@ -1,7 +1,7 @@
 """The formats that are read: what a file states, and what its reader would make up where the file says nothing.
 
 The readers go by this table, and the manual prints it (`markdown`). What would be made up is not used: times are then
-unknown (`lag_ps`), atoms need `top`, and units that a file does not state are said in a line.
+unknown (`dt_ps`), atoms need `top`, and units that a file does not state are said in a line.
 """
 
 from __future__ import annotations

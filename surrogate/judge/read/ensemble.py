@@ -98,9 +98,7 @@ class Ensemble(InSegments):
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
-            raise InputError(
-                f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `lag_ps='1ps'`."
-            )
+            raise InputError(f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `dt_ps='1ps'`.")
         for i, segment in enumerate(self.segments):
             if segment.ndim != 3 or segment.shape[1:] != (self.scene.n_atoms, 3):
                 raise InputError(
@@ -248,7 +246,7 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
         intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in out)
         raise InputError(
             f"Save intervals have no common multiple short enough to compare at ({intervals}); "
-            "save again at a multiple of one another, or state the interval with `lag_ps`."
+            "save again at a multiple of one another, or state the interval with `dt_ps`."
         )
     return [e.strided(stride) for e, stride in zip(out, strides, strict=True)], common
 

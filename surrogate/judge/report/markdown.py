@@ -8,7 +8,17 @@ from surrogate.judge.comparison import Comparison, Judgement
 from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.report.cards import cards, side_by_side
 from surrogate.judge.report.definitions import DEFINITIONS
-from surrogate.judge.report.wording import GROUP_TITLES, MARKS, STATE_HEADS, STATUS_MARKS, interval, number, per_day, plain, state_lines
+from surrogate.judge.report.wording import (
+    GROUP_TITLES,
+    MARKS,
+    STATE_HEADS,
+    STATUS_MARKS,
+    interval,
+    number,
+    per_day,
+    plain,
+    state_lines,
+)
 from surrogate.judge.rows.rows import GROUPS, Row
 from systems.files.outside import printable
 from systems.units import format_time_ps
@@ -25,7 +35,11 @@ def to_markdown(comparison: Comparison, *, command: str, headline: str = "") -> 
         parts.append(f"**{mark} {_text(judgement.account.label)}**: {use}\n- {for_what}\n- {why}")
         parts.append(_text(judgement.verdict))
     if comparison.convergence is not None:
-        parts += ["## Has the reference forgotten its start?", _text(comparison.convergence.verdict), _drifts(comparison)]
+        parts += [
+            "## Has the reference forgotten its start?",
+            _text(comparison.convergence.verdict),
+            _drifts(comparison),
+        ]
     if len(comparison.judgements) > 1:
         parts += ["## Side by side", _side_by_side(comparison)]
     for judgement in comparison.judgements:

@@ -156,7 +156,7 @@ def _command(comparison: Comparison, target: Path) -> str:
     if comparison.reference.top is not None:
         words += [flag_of("top"), comparison.reference.top]
     if comparison.reference.stated_lag_ps is not None:
-        words += [flag_of("lag_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+        words += [flag_of("dt_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
     return shlex.join([*words, "-o", target.name])
 
 

@@ -109,7 +109,7 @@ _MOST_STATES = 40
 def state_lines(found: Convergence) -> list[tuple[str, ...]]:
     """Return the states of a convergence as lines of `STATE_HEADS`, what is not converged first; no more than forty."""
     order = sorted(found.states, key=lambda s: (not s.fault, min(s.share, 1.0 - s.share) < 1e-3))
-    out = []
+    out: list[tuple[str, ...]] = []
     for s in order[:_MOST_STATES]:
         is_state = s.entries is not None
         quarters = "; ".join(f"{100 * q:.3g} ± {100 * e:.2g}" if is_state else f"{q:.2g} ± {e:.2g}"

@@ -21,8 +21,8 @@ class Account:
     """What one trajectory is: where from, how long, how it was made, what it cost.
 
     `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
-    `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds no cost; `imposed` are terms that no model made
-    (systems.imposed).
+    `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds
+    no cost; `imposed` are terms that no model made (systems.imposed).
     """
 
     label: str

@@ -184,7 +184,7 @@ def test_shapes_are_checked(alanine_dipeptide: Scene) -> None:
         Ensemble("bad", [np.zeros((5, 21, 3), dtype=np.float32)], 1.0, alanine_dipeptide)
     with pytest.raises(InputError, match="no frames"):
         Ensemble("empty", [], 1.0, alanine_dipeptide)
-    with pytest.raises(InputError, match="state it with `lag_ps"):
+    with pytest.raises(InputError, match="state it with `dt_ps"):
         Ensemble("still", [np.zeros((5, 22, 3), dtype=np.float32)], 0.0, alanine_dipeptide)
     with pytest.raises(InputError, match="do not match the segments"):
         Ensemble("flags", [np.zeros((5, 22, 3), dtype=np.float32)], 1.0, alanine_dipeptide,
