@@ -14,8 +14,8 @@ from systems.errors import UnitError
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
 # Minus the logarithm of how often chance may be taken for a blow-up.
 _UNLIKELINESS = 50.0
-# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`. A quantity
-# of `openmm.unit` is taken, too, which is not named here, for this package imports no simulator.
+# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`; also a
+# quantity of `openmm.unit`, which is not named here, for this package imports no simulator.
 Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.

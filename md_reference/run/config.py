@@ -12,6 +12,7 @@ from md_reference.run.integrators import check_ensemble
 from systems.errors import InputError, UnknownNameError
 from systems.files.outside import check_disk
 from systems.options import option
+from systems.trajectory.codec import refuse_columns
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
@@ -117,6 +118,5 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
         raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
     kept = config.kept_atoms(scene)
     check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
-    if config.columns and out.suffix.lower() == ".dcd":
-        raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
+    refuse_columns(out, config.columns)
     return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))

@@ -70,7 +70,7 @@ def simulate(
     checkpoint_every_s: float = 20.0,
     choice: PlatformChoice | None = None,
 ) -> Path:
-    """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
+    """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
     A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
     time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure

@@ -212,7 +212,7 @@ class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting,
         "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"
     )
     save_every_ps: float | None = option("Interval between saved frames.", None, unset="what can be compared in time")
-    format: str = option("Trajectory format.", "h5", choices=("h5", "dcd"))
+    format: str = option("Trajectory format.", "h5", choices=("h5", "dcd", "xtc"))
     cores: int | None = option("Maximum number of CPU cores.", None, within=(1, None), unset="all")
     dry_run: bool = option("Print the timings and the decision without running.", False)
 

@@ -11,9 +11,10 @@ from md_reference.campaign.manifest import campaign_folder, campaign_trajectorie
 from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
+from systems.trajectory.codec import WRITTEN
 from systems.trajectory.topology_file import refuse_foreign_topology
 
-TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
+TRAJECTORY_SUFFIXES = WRITTEN
 
 
 def check_outputs(

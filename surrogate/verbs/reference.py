@@ -44,8 +44,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     field. Explicit solvents ('tip3p', 'opc') put a scene that has no periodic cell into one: water to `padding_nm` (1
     nm) on each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
 
-    `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
-    `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name:
+    `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
+    `seed`, `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name:
     `systems.library.protocols`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
     4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
     for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
