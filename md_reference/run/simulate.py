@@ -14,7 +14,7 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, State, refuse_inverted
+from md_reference.run.engine import Engine, State, refuse_damaged
 from md_reference.run.integrators import integrator_name
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.run_summary import summarise
@@ -213,7 +213,7 @@ class _Run:
             engine.restore(self.blob)
         else:
             engine.minimise()
-            refuse_inverted(self.scene, engine.positions())
+            refuse_damaged(self.scene, engine.positions())
             engine.thermalise()
         while done < n_steps:
             done += self._advance(engine, n_steps - done)
