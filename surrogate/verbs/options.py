@@ -42,6 +42,13 @@ class Replicated:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Joining(Replicated):
+    """Options of verbs that write the trajectories of replicas."""
+
+    join: bool = option("Also write all replicas into one file, NAME.h5.", False)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Quiet:
     """Options of verbs that show their progress."""
 
@@ -105,7 +112,7 @@ class PlanOptions(MDSettings, Replicated, Preparation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
+class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """What `reference` can be told."""
 
     time_ps: float = from_field(MDConfig, "time_ps")
@@ -116,7 +123,7 @@ class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Ov
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriting, Quiet):
+class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
     """What `rollout` can be told."""
 
 

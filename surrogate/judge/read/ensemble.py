@@ -21,6 +21,7 @@ from surrogate.judge.read.truth_asked import reweighting_notes
 from systems.errors import InputError, listed
 from systems.scene import Scene
 from systems.selection import part_of
+from systems.trajectory.joined_file import replicas_of
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -180,6 +181,8 @@ def load_ensemble(
         reader, template = opened.reader, opened.template
         kept.append(opened.kept)
         lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        replicas = replicas_of(reader.record, reader.n_frames)
+        cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
         notes += note
         lags.append(lag)
         frames = opened.frames
@@ -196,9 +199,11 @@ def load_ensemble(
             chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
         if COLUMN in reader.scalars:
             changed += np.split(reader.scalars[COLUMN] > 0, cuts)
-        records.append(dict(reader.record))
-        scalars.append(reader.scalars)
-        if records[-1].get("completed") is False:
+        if len(replicas) > 1:
+            notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
+        records += [record for _, record in replicas]
+        scalars += [{key: values[part] for key, values in reader.scalars.items()} for part, _ in replicas]
+        if reader.record.get("completed") is False:
             stopped.append(f"{path} ({reader.n_frames} frames)")
     assert template is not None
     if stopped:
