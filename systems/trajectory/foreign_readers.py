@@ -17,7 +17,14 @@ import numpy as np
 from systems.chemistry.cell_shape import read_cells
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.foreign_details import AsciiPath, counted_note, netcdf_units, trr_positions, unit_note
+from systems.trajectory.foreign_details import (
+    AsciiPath,
+    counted_note,
+    netcdf_units,
+    trr_positions,
+    unit_note,
+    xtc_grid_nm,
+)
 from systems.trajectory.foreign_scenes import (
     bonds_completed,
     scene_from_mdtraj_topology,
@@ -117,6 +124,8 @@ class MdtrajReader(TrajectoryReader):
         self._nm, ps, self._cell_nm = (0.1, 1.0, 0.1) if self._file.distance_unit == "angstroms" else (1.0, 1.0, 1.0)
         if self._format.name.startswith("NetCDF"):
             self._nm, ps, self._cell_nm = netcdf_units(self._file._handle, self.path)
+        if self._format.name == "XTC":
+            self.grid_nm = xtc_grid_nm(self.path)
         positions, *_ = self._file.read(n_frames=1)
         self.n_atoms = int(positions.shape[1])
         self._file.seek(0)
