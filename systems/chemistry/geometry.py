@@ -69,8 +69,13 @@ def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatAr
 
 
 def extend(
-    a: FloatArray, b: FloatArray, c: FloatArray, length: float, angle_deg: float, torsion_deg: float
-) -> FloatArray:
+    a: npt.NDArray[np.float64],
+    b: npt.NDArray[np.float64],
+    c: npt.NDArray[np.float64],
+    length: float,
+    angle_deg: float,
+    torsion_deg: float,
+) -> npt.NDArray[np.float64]:
     """Return the point `(3,)` at `length` from c, at `angle_deg` to b and `torsion_deg` about b-c to a, in the unit of
     the positions `(3,)`."""
     angle, twist = np.radians(angle_deg), np.radians(torsion_deg)
@@ -78,7 +83,7 @@ def extend(
     normal = np.cross(b - a, axis)
     normal = normal / np.linalg.norm(normal)
     inward = np.cross(normal, axis)
-    out: FloatArray = c + length * (
+    out: npt.NDArray[np.float64] = c + length * (
         -np.cos(angle) * axis + np.sin(angle) * (np.cos(twist) * inward + np.sin(twist) * normal)
     )
     return out

@@ -27,7 +27,7 @@ Vector = npt.NDArray[np.float64]
 Sites = dict[str, int]
 
 _STAGGERED = (-60.0, 180.0, 60.0)
-_PLANAR = tuple(range(-180, 180, 30))
+_PLANAR = tuple(float(k) for k in range(-180, 180, 30))
 # The atom at the end of the last torsion that turns a planar group.
 _PLANAR_AT = {"ASP": "CG", "ASN": "CG", "PHE": "CG", "TYR": "CG", "TRP": "CG", "HIS": "CG", "GLU": "CD", "GLN": "CD"}
 _RIGID = frozenset({frozenset(("NE", "CZ"))})
@@ -97,8 +97,8 @@ def settle_side_chains(
             continue  # its bonds are refused with their lengths
         if 10.0 * least < _OVERLAP_ANGSTROM:
             raise PreparationError(
-                f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom in "
-                "every rotamer; give the residue with all its heavy atoms, or make place for it."
+                f"{label}: {' '.join(moved)}, which were missing, come out {10 * least:.2f} Å from another heavy atom "
+                "in every rotamer; give the residue with all its heavy atoms, or make place for it."
             )
         if not np.array_equal(best, positions_nm):
             positions_nm[:] = best
@@ -119,13 +119,11 @@ def _conformers(name: str, there: Mapping[str, Vector], moved: Sequence[str]) ->
         if any(axis[1:3] == (g, p) for axis in axes) or frozenset((g, p)) in _RIGID:
             continue
         if _turns(name, g, p):
-            values = _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
+            values: tuple[float, ...] = _PLANAR if _PLANAR_AT.get(name) == p else _STAGGERED
             fixed = next((b for b, (pb, _, _) in tree.items() if pb == p and b in there), None)
             if fixed is not None:
-                values = (
-                    float(np.degrees(torsion(np.array([there[k] for k in (q, g, p, fixed)]), [[0, 1, 2, 3]])[0])),
-                )
-            axes.append((q, g, p, fixed or atom, tuple(map(float, values))))
+                values = (_torsion_deg(there, q, g, p, fixed),)
+            axes.append((q, g, p, fixed or atom, values))
     out = []
     for chosen in product(*(values for *_, values in axes)):
         turn = {(g, p): value - _torsion_deg(shape, q, g, p, d)
@@ -137,7 +135,7 @@ def _conformers(name: str, there: Mapping[str, Vector], moved: Sequence[str]) ->
             u, v = shape[g] - shape[p], shape[atom] - shape[p]
             bend = float(np.degrees(np.arccos(np.dot(u, v) / np.linalg.norm(u) / np.linalg.norm(v))))
             value = _torsion_deg(shape, q, g, p, atom) + turn.get((g, p), 0.0)
-            placed[atom] = np.asarray(extend(placed[q], placed[g], placed[p], length, bend, value), dtype=np.float64)
+            placed[atom] = extend(placed[q], placed[g], placed[p], length, bend, value)
         out.append({a: placed[a] for a in moved})
     return out
 

@@ -85,8 +85,19 @@ class MdtrajReader(TrajectoryReader):
     def _load(self, path: Path, topology: Any) -> Any:
         import mdtraj
 
+        is_mol2 = path.name.lower().endswith(".mol2")
+        n_molecules = path.read_bytes().count(b"@<TRIPOS>MOLECULE") if is_mol2 else 1
+        if n_molecules > 1:
+            raise InputError(
+                f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write a PDB file."
+            )
         try:
+            if is_mol2:
+                import pandas  # noqa: F401
             frames = mdtraj.load(str(self._ascii.path), **({} if topology is None else {"top": topology}))
+        except ImportError as error:
+            lacking = error.name or "a package"
+            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
         except Exception as error:
             needs = topology is None and not self._format.names_atoms
             hint = " (a format without topology: give one with `top`)" if needs else ""
