@@ -6,6 +6,7 @@ block.
 
 from __future__ import annotations
 
+import importlib
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -85,15 +86,13 @@ class MdtrajReader(TrajectoryReader):
     def _load(self, path: Path, topology: Any) -> Any:
         import mdtraj
 
-        is_mol2 = path.name.lower().endswith(".mol2")
+        is_mol2 = path.name.lower().endswith(".mol2") and path.is_file()
         n_molecules = path.read_bytes().count(b"@<TRIPOS>MOLECULE") if is_mol2 else 1
         if n_molecules > 1:
-            raise InputError(
-                f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write a PDB file."
-            )
+            raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
         try:
             if is_mol2:
-                import pandas  # noqa: F401
+                importlib.import_module("pandas")
             frames = mdtraj.load(str(self._ascii.path), **({} if topology is None else {"top": topology}))
         except ImportError as error:
             lacking = error.name or "a package"
