@@ -75,6 +75,14 @@ def trr_positions(path: Path) -> npt.NDArray[np.bool_]:
     return np.array(found, dtype=bool)
 
 
+def trr_has_cell(path: Path) -> bool:
+    """Return whether the first frame of a TRR file states a cell: MDTraj gives memory that nobody set where not."""
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(12)[8:], "big")
+        file.seek(-(-length // 4) * 4 + 8, 1)
+        return int.from_bytes(file.read(4), "big") > 0
+
+
 def xtc_grid_nm(path: Path) -> float | None:
     """Return what an XTC file rounds coordinates to, nm, by the precision in its first frame's header (1000: 0.001 nm);
     None where it states none, as of nine atoms or fewer, which are not rounded."""

@@ -22,6 +22,7 @@ from systems.trajectory.foreign_details import (
     AsciiPath,
     counted_note,
     netcdf_units,
+    trr_has_cell,
     trr_positions,
     unit_note,
     xtc_grid_nm,
@@ -193,6 +194,8 @@ class MdtrajReader(TrajectoryReader):
             if stored[2] is None:
                 return None
             return read_cells(np.asarray(stored[2])[::stride] * self._cell_nm, np.asarray(stored[3])[::stride])
+        if self._format.name == "TRR" and not trr_has_cell(self.path):
+            return None
         cells = None if stored[3] is None else np.asarray(stored[3], dtype=np.float64)
         return cells[::stride] if cells is not None and cells.ndim == 3 and cells.any() else None
 
