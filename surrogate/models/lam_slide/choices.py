@@ -9,7 +9,7 @@ from surrogate.data.rarity import rare_kinds
 from surrogate.data.references import References
 from surrogate.data.weights import load_weights, read_header
 from surrogate.models.architecture import Survey
-from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig, of_weights
 from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
@@ -38,7 +38,8 @@ class LamSlideTrainer(Trainer):
         if request.start_from is not None:
             found = _rare_states(references, survey, self.settings(request).model)
         else:
-            pool = AutoencoderConfig(**request.model.get("autoencoder", {})).identifier_pool
+            default = AutoencoderConfig.identifier_pool
+            pool = request.model.get("autoencoder", {}).get("identifier_pool", default)
             if (n := survey.scenes[0].n_atoms) > pool:
                 found.append(Choice("model.autoencoder.identifier_pool", n, f"{n} atoms, more than {pool} identifiers"))
             if (request.longest_lag_ps or request.training.get("longest_lag_ps")) and survey.equilibrium:
@@ -48,7 +49,7 @@ class LamSlideTrainer(Trainer):
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""
         if request.start_from is not None:
-            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
+            model = of_weights(read_header(request.start_from).config)
         else:
             model = LamSlideConfig.from_dict(request.model)
         steps, first = request.steps, None
