@@ -183,7 +183,7 @@ def _of_a_set(
     )
     view, model = WindowView.of(train, weights), LamSlide(config)
     if change.exact:
-        model.autoencoder = ExactCode(config.autoencoder.n_latents)
+        model.autoencoder = ExactCode()
 
     def seen(data: ParticleSet) -> tuple[Tensor, Tensor]:
         x = view.to_model(data.positions_nm)
