@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from systems.errors import InputError, UnknownNameError, nearest
-from systems.units import format_quantity, parser_of, quantity, stem_of, unit_of
+from systems.units import format_quantity, is_openmm_quantity, openmm_number, parser_of, quantity, stem_of, unit_of
 
 T = TypeVar("T")
 _KEY = "option"
@@ -152,6 +152,9 @@ class Option:
     def value(self, given: Any, what: str) -> Any:
         """Return what is given for it, checked and in our unit. Raises UnitError, UnknownNameError or InputError, which
         call it `what`."""
+        if is_openmm_quantity(given):
+            given = openmm_number(self.name if self.unit else "", given, what)
+            given = given.tolist() if self.many and hasattr(given, "tolist") else given
         if hasattr(given, "item") and not getattr(given, "ndim", 1):
             given = given.item()
         if self.read is not None and (given is not None or type(None) not in get_args(self.hint)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Callable
 from numbers import Real
 from typing import Any, overload
@@ -13,7 +14,8 @@ from systems.errors import UnitError
 GAS_CONSTANT_KJ_MOL_K = 8.31446261815324e-3
 # Minus the logarithm of how often chance may be taken for a blow-up.
 _UNLIKELINESS = 50.0
-# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`.
+# What a verb takes for a quantity: a number in the unit that the name ends in, or a text with its own: `10ns`; also a
+# quantity of `openmm.unit`, which is not named here, for this package imports no simulator.
 Quantity = float | str
 
 # Both signs for micro: U+00B5, which keyboards type, and U+03BC, which other programs print.
@@ -138,6 +140,43 @@ def stem_of(name: str) -> str:
     return name.removesuffix(_ending(name))
 
 
+# The units of the endings as `openmm.unit` calls them, with their powers.
+_OPENMM = {
+    "_per_ps": ("picosecond", -1),
+    "_ps": ("picosecond", 1),
+    "_k": ("kelvin", 1),
+    "_da": ("dalton", 1),
+    "_nm": ("nanometer", 1),
+    "_molar": ("molar", 1),
+    "_bar": ("bar", 1),
+    "_s": ("second", 1),
+}
+
+
+def is_openmm_quantity(value: Any) -> bool:
+    """Whether this is a quantity of `openmm.unit`, told without importing OpenMM."""
+    return hasattr(value, "value_in_unit") and hasattr(value, "unit")
+
+
+def openmm_number(name: str, value: Any, what: str = "") -> Any:
+    """Return what a quantity of `openmm.unit` is in the unit that the name ends in.
+
+    Raises UnitError for another dimension, and for a setting whose name ends in no unit.
+    """
+    what, ending = what or name, _ending(name)
+    if not ending:
+        raise UnitError(f"{what} = {value} has a unit, and takes none.")
+    # Whoever holds a quantity has imported its module.
+    units = sys.modules[type(value).__module__.rpartition(".")[0]]
+    unit, power = _OPENMM[ending]
+    try:
+        return value.value_in_unit(getattr(units, unit) ** power)
+    except TypeError:
+        raise UnitError(
+            f"{what} = {value} cannot be turned into {_UNITS[ending]}; give a quantity of that dimension."
+        ) from None
+
+
 @overload
 def quantity(name: str, value: Quantity, what: str = ...) -> float: ...
 @overload
@@ -145,7 +184,8 @@ def quantity(name: str, value: None, what: str = ...) -> None: ...
 def quantity(name: str, value: Any, what: str = "") -> float | None:
     """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
 
-    `value` is a number in that unit or a text with its own, such as '10ns'; None stays None. `what`: how messages call
+    `value` is a number in that unit, a text with its own, such as '10ns', or a quantity of `openmm.unit`; None stays
+    None. `what`: how messages call
     it, by default as it is called. Raises UnitError for another kind of value, and for a number that is negative or not
     finite.
     """
@@ -154,6 +194,8 @@ def quantity(name: str, value: Any, what: str = "") -> float | None:
     what = what or name
     if isinstance(value, str):
         return parser_of(name)(value, what)
+    if is_openmm_quantity(value):
+        value = openmm_number(name, value, what)
     if isinstance(value, bool) or not isinstance(value, Real):
         raise UnitError(f"{what} = {value!r} must be a number in {unit_of(name)}, or a text with its unit.")
     number = float(value)

@@ -110,7 +110,7 @@ class _Head:
     scenes: tuple[str | dict[str, Any], ...]
     name: str = ""
     out: str = ""
-    format: Literal["h5", "dcd"] = "h5"
+    format: Literal["h5", "dcd", "xtc"] = "h5"
     seed: Annotated[int, range(2**63)] = 0
     retries: Annotated[int, range(1000)] = 2
     checkpoint_every: str = "20s"

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import SIMD, MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, refuse_inverted
+from md_reference.run.engine import Engine, refuse_damaged
 from md_reference.run.platforms import simd_choice
 from md_reference.run.run_summary import summarise
 from md_reference.run.simulate import ProgressFn, already_complete, record_of, stand_of, tell_preparing
@@ -139,7 +139,7 @@ class _Batch:
             with Engine(self.scene, replace(self.config, platform=platform), system=self.system) as engine:
                 engine.minimise()
                 starts_nm = engine.positions()[None]
-                refuse_inverted(self.scene, starts_nm[0])
+                refuse_damaged(self.scene, starts_nm[0])
         self.simd.check(self.system, starts_nm[0])
         # SimdReplicas left over repeat the last start; they cost nothing and are not kept.
         self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])

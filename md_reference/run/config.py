@@ -11,6 +11,7 @@ from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
+from systems.trajectory.codec import refuse_columns
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
@@ -143,6 +144,5 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
     config = resolved(scene, config)
     kept = config.kept_atoms(scene)
     check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
-    if config.columns and out.suffix.lower() == ".dcd":
-        raise InputError(f"{out}: a DCD holds positions only; write an .h5 to keep {' and '.join(config.columns)}.")
+    refuse_columns(out, config.columns)
     return config

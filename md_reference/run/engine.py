@@ -16,6 +16,7 @@ from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
+from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.geometry import signed_volumes
 from systems.chemistry.graph import stereocentres
 from systems.errors import PreparationError, SimulationError, first_line, listed
@@ -26,6 +27,8 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 _VELOCITY_TOLERANCE = 1e-8
 _FLAT_NM3 = 2e-4
 _STEPS_BETWEEN_VOLUME_MOVES = 25
+# A bond is broken that is longer than so many sums of covalent radii; the longest of a minimised molecule are 1.1.
+_BROKEN = 1.25
 
 
 @dataclass(frozen=True)
@@ -51,26 +54,42 @@ def one_line(error: Exception) -> str:
     return first_line(error).split("  For more information")[0].rstrip(".")
 
 
-def refuse_inverted(scene: Scene, minimised_nm: FloatArray) -> None:
-    """Raise PreparationError where a stereocentre of the solute turned over in the minimisation, which left positions
-    `(n_atoms, 3)` nm; one that the scene has flat may go either way."""
+def refuse_damaged(scene: Scene, minimised_nm: FloatArray) -> None:
+    """Raise PreparationError where a bond of the solute broke in the minimisation, which left positions `(n_atoms, 3)`
+    nm, or a stereocentre turned over; one that the scene has flat may go either way.
+
+    Minimising parts atoms that clash; from a geometry that is broken it can leave a bond stretched, one that runs
+    through a ring say.
+    """
     if scene.interactions is not None:
         return
     atoms = solute_of(scene)
+    inside = np.isin(scene.bonds, atoms).all(axis=1) if len(atoms) else slice(None)
+    bonds = scene.bonds[inside]
+    radii_nm = np.array([sum(covalent_radius_nm(scene.elements[i]) for i in bond) for bond in bonds.tolist()])
+    was, now = (np.linalg.norm(x[bonds[:, 0]] - x[bonds[:, 1]], axis=1) for x in (scene.positions_nm, minimised_nm))
+    broken = np.flatnonzero((now > _BROKEN * radii_nm) & (was <= _BROKEN * radii_nm))
+    if len(broken):
+        names = [" - ".join(_atom_name(scene, int(i)) for i in bonds[k]) for k in broken]
+        raise PreparationError(
+            f"{scene.name}: minimising its energy breaks the bond {listed(names, 3)} ({10 * now[broken[0]]:.2f} Å), as "
+            "atoms stand in each other there; correct the coordinates, or build the molecule anew."
+        )
     centres = stereocentres(part_of(scene, atoms))
     rows = atoms[centres] if len(atoms) else centres
     before, after = (signed_volumes(x, rows) for x in (scene.positions_nm, minimised_nm))
     turned = rows[(np.abs(before) > _FLAT_NM3) & (np.sign(before) != np.sign(after)), 0].tolist()
     if turned:
-        residues = [int(scene.residue_of_atom[i]) for i in turned]
-        names = [
-            f"{scene.residue_names[r]} {scene.residue_ids[r]} {scene.atom_names[i]}"
-            for i, r in zip(turned, residues, strict=True)
-        ]
+        names = [_atom_name(scene, i) for i in turned]
         raise PreparationError(
             f"{scene.name}: minimising its energy turns the stereocentre {listed(names)} over, as the geometry is "
             "broken there; correct the coordinates, or build the molecule anew."
         )
+
+
+def _atom_name(scene: Scene, i: int) -> str:
+    residue = scene.residue_of_atom[i]
+    return f"{scene.residue_names[residue]} {scene.residue_ids[residue]} {scene.atom_names[i]}"
 
 
 class Engine:

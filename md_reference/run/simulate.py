@@ -14,7 +14,7 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, State, integrator_name, refuse_inverted
+from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
@@ -69,7 +69,7 @@ def simulate(
     checkpoint_every_s: float = 20.0,
     choice: PlatformChoice | None = None,
 ) -> Path:
-    """Run reference MD and stream it to `out` (.h5 or .dcd): frames at save_every_ps, 2 save_every_ps, ..., time_ps.
+    """Run reference MD and stream it to `out` (.h5, .dcd, .xtc): frames at save_every_ps, 2 save_every_ps ... time_ps.
 
     A checkpoint stands behind every block of frames and, in frames that take longer, every `checkpoint_every_s` of wall
     time; frames and checkpoint are on the medium before the run goes on. So a `kill -9`, a full disk or a power failure
@@ -212,7 +212,7 @@ class _Run:
             engine.restore(self.blob)
         else:
             engine.minimise()
-            refuse_inverted(self.scene, engine.positions())
+            refuse_damaged(self.scene, engine.positions())
             engine.thermalise()
         while done < n_steps:
             done += self._advance(engine, n_steps - done)

@@ -49,7 +49,7 @@ WeightsOpt = Annotated[
         autocompletion=_weights,
     ),
 ]
-OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Output trajectory (.h5 or .dcd).")]
+OutOpt = Annotated[Path, typer.Option("--out", "-o", help="Output trajectory (.h5, .dcd or .xtc).")]
 
 
 def usage_error(message: str, context: Any = None) -> Exception:

@@ -290,6 +290,7 @@ class _Survey:
 def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> _Survey:
     """Return what the files say of themselves. Raises InputError when they do not go together."""
     from systems.trajectory.codec import open_trajectory
+    from systems.trajectory.joined_file import refuse_joined
 
     if not paths:
         raise InputError("no trajectory given to train on.")
@@ -301,6 +302,7 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
         with open_trajectory(path) as reader:
             if reader.scene is None:
                 raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
+            refuse_joined(reader)
             steps = np.diff(reader.time_ps)
             if len(steps) == 0 or not np.allclose(steps, steps[0], rtol=1e-4):
                 raise InputError(f"{path}: frames are not evenly spaced in time; training needs one save interval.")
@@ -311,8 +313,8 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
                 scene, lag_ps, conditions = reader.scene, float(steps[0]), found
             if reader.scene.topology_hash != scene.topology_hash:
                 raise InputError(
-                    f"{path} holds another topology than {paths[0]}; one model learns one "
-                    "scene, or, with graph = true in [model], many."
+                    f"{path} holds another topology than {paths[0]}; one model learns one scene, or several peptides "
+                    "(`arch='lam-slide-peptides'`)."
                 )
             if not np.isclose(steps[0], lag_ps, rtol=1e-4):
                 raise InputError(f"{path} is saved every {steps[0]:g} ps, {paths[0]} every {lag_ps:g} ps.")

@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from surrogate.judge import remarks, verdict
+from surrogate.judge.convergence import Convergence, convergence_of
+from surrogate.judge.explained import NOTHING_OPEN, Explained, explain
+from surrogate.judge.in_short import in_short
 from surrogate.judge.measure.movie import Movie, make_movie
 from surrogate.judge.measure.slow_motion import longest_correlation
 from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
@@ -44,7 +47,6 @@ from surrogate.judge.worth_measures import worths
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.units import format_time_ps
 
 # Frames whose bonds tell whether a topology fits.
 _FRAMES_FOR_BONDS = 20
@@ -85,7 +87,8 @@ class Judgement:
     and replicate; `effective_samples` are the independent ones that the equal length holds of the slowest motion of any
     of the three; `speed_ratio` is simulated time per wall second over the reference's.
     `worth` says by each measure how much MD the whole candidate is worth, and `worth_words` says it in a sentence
-    (empty where it cannot be told, or frames are broken).
+    (empty where it cannot be told, or frames are broken, or the reference still depends on where it started).
+    `left_open`: what the reference's start or length leaves open; `in_short`: use it or not, for what, why.
     """
 
     account: Account
@@ -106,6 +109,8 @@ class Judgement:
     curves: Curves
     worth: tuple[Worth, ...] = ()
     worth_words: str = ""
+    left_open: Explained = NOTHING_OPEN
+    in_short: tuple[str, str, str] = ("", "", "")
 
     def row(self, key: str) -> Row:
         """Return the row whose key is, or starts with, `key`. Raises InputError when there is none."""
@@ -117,7 +122,8 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything a report says, and nothing that needs computing. `movies`: one per judgement, for the viewer."""
+    """Everything a report says, and nothing that needs computing. `movies`: one per judgement, for the viewer;
+    `convergence`: whether reference and replicate together have forgotten where they started."""
 
     scene_name: str
     formula: str
@@ -131,21 +137,39 @@ class Comparison:
     options: Options
     versions: dict[str, str]
     movies: tuple[Movie, ...] = ()
+    convergence: Convergence | None = None
+
+    @property
+    def headline(self) -> str:
+        """Of every candidate a line: use it or not, for what, and why."""
+        return "\n".join(f"{j.account.label}: {' '.join(j.in_short)}" for j in self.judgements)
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook."""
+        from html import escape
+
+        return "".join(
+            f"<p><b>{escape(j.account.label)}: {escape(j.in_short[0])}</b><br>"
+            f"{'<br>'.join(map(escape, j.in_short[1:]))}</p>"
+            for j in self.judgements
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""
-        apart = ("judgements", "reference", "replicate", "options", "movies")
+        apart = ("judgements", "reference", "replicate", "options", "movies", "convergence")
         plain: dict[str, Any] = _jsonable({k: v for k, v in vars(self).items() if k not in apart})
         plain["reference"] = _jsonable(asdict(self.reference))
         plain["replicate"] = None if self.replicate is None else _jsonable(asdict(self.replicate))
         plain["options"] = _jsonable(asdict(self.options))
+        plain["convergence"] = None if self.convergence is None else _jsonable(asdict(self.convergence))
         plain["judgements"] = []
         for judgement in self.judgements:
-            nested = ("rows", "curves", "account", "faults", "worth")
+            nested = ("rows", "curves", "account", "faults", "worth", "left_open")
             out = _jsonable({k: v for k, v in vars(judgement).items() if k not in nested})
             out["account"] = _jsonable(asdict(judgement.account))
             out["faults"] = [_jsonable(asdict(f)) for f in judgement.faults]
             out["worth"] = [_jsonable(asdict(w)) for w in judgement.worth]
+            out["left_open"] = _jsonable(asdict(judgement.left_open))
             out["rows"] = [r.to_dict() for r in judgement.rows]
             out["curves"] = judgement.curves.to_dict()
             plain["judgements"].append(out)
@@ -197,12 +221,17 @@ def compare(
         notes += [f"{rolled.label}: {said}; does its topology fit its coordinates?"] if long else []
     notes += jumps(measured)
     truth = measured[0]
+    known = (truth,) if replicate is None else (truth, measured[-1])
+    convergence = convergence_of(known, yardstick.torsions, seed=chosen.seed)
+    if not convergence.converged:
+        remedy = convergence.remedy
+        notes.append(f"The reference is {convergence.verdict} {remedy[:1].upper()}{remedy[1:]}.")
     if replicate is None:
         half = truth.n_frames // 2
         other = replace(truth.frames(half, 2 * half), label=f"{truth.label} (second half)")
         truth = replace(truth.frames(0, half), label=f"{truth.label} (first half)")
         notes.append(
-            f"No replicate was given: the reference is cut in two halves of {format_time_ps(truth.total_ps)}; the "
+            f"No replicate was given: the reference is cut in two halves of {truth.length_words}; the "
             "candidates are compared with the first, and the second is the replicate."
         )
     else:
@@ -214,7 +243,17 @@ def compare(
     accounts = [account_of(e) for e in everyone]
     beside = None if floor is None else find_pairs(thinned[0], floor)
     setting = _Setting(
-        stage, yardstick.torsions, yardstick.geometry, truth, other, chosen, float(temperature), accounts[0], {}
+        stage,
+        yardstick.torsions,
+        yardstick.geometry,
+        truth,
+        other,
+        chosen,
+        float(temperature),
+        accounts[0],
+        {},
+        known,
+        convergence,
     )
     judgements = tuple(
         _with_forecast(
@@ -236,6 +275,7 @@ def compare(
         notes=tuple(dict.fromkeys(notes)),
         options=chosen,
         versions=_versions(),
+        convergence=convergence,
         movies=tuple(
             make_movie(thinned[0], rolled, measured[0], features, judgement.n_frames)
             for rolled, features, judgement in zip(thinned[1:], measured[1:], judgements, strict=False)
@@ -255,6 +295,8 @@ class _Setting(NamedTuple):
     temperature_k: float
     account: Account
     recipes: dict[int, Any]
+    known: tuple[Features, ...]
+    convergence: Convergence
 
 
 def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgement:
@@ -272,24 +314,26 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
     n_compared = round(trio.compared_ps / trio.reference.features.lag_ps)
     samples = effective_samples(n_compared, correlation)
     every = by_group([*rows, *kinetic, *slowest, *seams, *more])
-    if samples < remarks.LEAST_FOR_TESTS:
-        every = verdict.untested(every)
+    left_open = explain(setting.known, candidate, setting.torsions, setting.convergence, seed=options.seed)
+    if samples < remarks.LEAST_FOR_TESTS or left_open.why:
+        every = verdict.untested(every, start=bool(left_open.why))
+    every = by_group([*every, *(x.row() for x in left_open.excess)])
     judged = verdict.judge_rows(every, options, account.imposed)
     found = verdict.findings(judged)
     truth = trio.reference
-    doubts = remarks.doubts(trio, max(correlation, own))
+    doubts = remarks.doubts(trio, max(correlation, own), left_open.in_words(setting.convergence))
     kind = verdict.status(judged, doubts)
-    worth = worths(reference, candidate, replicate, setting.torsions, options)
+    # By a reference that may be elsewhere than MD ends, nothing is worth a length of MD.
+    worth = () if left_open.why else worths(reference, candidate, replicate, setting.torsions, options)
     words = ""
+    shortest = min((s.features for s in trio.samples), key=lambda f: f.total_ps)
     known = effective_samples(min(reference.n_frames, replicate.n_frames), correlation)
-    if kind != "broken" and not (doubts.apart or doubts.copied) and known >= remarks.LEAST_FOR_WORTH:
+    if worth and kind != "broken" and not (doubts.apart or doubts.copied) and known >= remarks.LEAST_FOR_WORTH:
         words = _worth_words(worth, account, setting.account)
     return Judgement(
         account=account,
         status=kind,
-        verdict=" ".join(
-            [verdict.sentence(judged, found, format_time_ps(trio.compared_ps), doubts), *([words] if words else [])]
-        ),
+        verdict=" ".join([verdict.sentence(judged, found, shortest.length_words, doubts), *([words] if words else [])]),
         findings=found,
         rows=judged,
         compared_ps=trio.compared_ps,
@@ -313,6 +357,7 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
         ),
         notes=tuple(
             remarks.trimming(trio, reference, candidate, replicate)
+            + (["Equivalent MD time is withheld: it takes a converged reference."] * bool(left_open.why))
             + remarks.unlike(judged, options)
             + copied_from(trio)[1]
             + imposed_notes(account.label, judged, account.imposed)
@@ -327,6 +372,8 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
         ),
         worth=worth,
         worth_words=words,
+        left_open=left_open,
+        in_short=in_short(judged, kind, found, doubts, words),
     )
 
 

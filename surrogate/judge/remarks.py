@@ -26,14 +26,15 @@ def trimming(trio: Trio, reference: Features, candidate: Features, replicate: Fe
     """Return which trajectories are longer than the equal length at which distances are taken."""
     longer = [f for f in (reference, candidate, replicate) if f.total_ps > trio.compared_ps]
     return [
-        f"{f.label}: the first {format_time_ps(trio.compared_ps)} of {format_time_ps(f.total_ps)} are used for the "
-        "distances, at equal length; all of it for the tests."
+        f"{f.label}: the first {f.frames(0, round(trio.compared_ps / f.lag_ps)).length_words} of {f.length_words} are "
+        "used for the distances, at equal length; all of it for the tests."
         for f in longer
     ]
 
 
-def doubts(trio: Trio, correlation: float) -> verdict.Doubts:
-    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any trajectory, frames."""
+def doubts(trio: Trio, correlation: float, start: str = "") -> verdict.Doubts:
+    """Return which slow motions are not sampled, in words. `correlation`: the slowest of any trajectory, frames;
+    `start`: what of the reference still depends on where it started."""
     short = lost = ""
     lag_ps = trio.reference.features.lag_ps
     samples = effective_samples(round(trio.compared_ps / lag_ps), correlation)
@@ -49,7 +50,7 @@ def doubts(trio: Trio, correlation: float) -> verdict.Doubts:
             f"it lies in another state of {named} than the reference, and hardly any run passes from one to the other"
         )
     copied, _ = copied_from(trio)
-    return verdict.Doubts(short, lost, copied)
+    return verdict.Doubts(short, lost, copied, start)
 
 
 def unlike(rows: Sequence[Row], options: Options) -> list[str]:

@@ -19,6 +19,7 @@ _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0, "imposed": 0}
 _MENTIONED = 3
 _WITHIN_KEYS = ("phi_given", "torsions_given", "torsion_step", "hydrogen_bond_lifetime")
+_STATE_KEYS = ("phi_given", "torsions_given", "hydrogen_bond_lifetime")
 _FAST_KEYS = ("valid:", "copies", "bond_", "angle_", "temperature", "energy_", "chunk_step", *_WITHIN_KEYS)
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
@@ -27,11 +28,12 @@ ALL_KEY = "valid:all"
 class Doubts(NamedTuple):
     """Why a verdict must wait, in words, empty where it need not: `short` for slow motion sampled too little for
     anything to agree, `apart` for states between which hardly any run passes, so that a difference says nothing,
-    `copied` for frames that are the truth's own."""
+    `copied` for frames that are the truth's own, `start` for a reference that depends on where it started."""
 
     short: str = ""
     apart: str = ""
     copied: str = ""
+    start: str = ""
 
 
 SURE = Doubts()
@@ -114,16 +116,19 @@ def _share_word(row: Row) -> Word:
     return "differs" if excess <= _FAILS_AT * row.tolerance else "fails"
 
 
-def untested(rows: Sequence[Row]) -> list[Row]:
+def untested(rows: Sequence[Row], *, start: bool = False) -> list[Row]:
     """Return the rows of a comparison too short to test what follows the slow motion: those rows without a p-value.
 
     What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state). What moves
     within a state is not, where the reference and its replicate differ by it: there a state they do not share, such as
-    another rotamer beside it, is as good a reason as a wrong.
+    another rotamer beside it, is as good a reason as a wrong. Of a reference that depends on its `start` both share
+    that, and what moves within a state is left out, but for steps from frame to frame.
     """
 
     def tested(row: Row) -> bool:
         if not row.key.startswith(_FAST_KEYS):
+            return False
+        if start and row.key.startswith(_STATE_KEYS):
             return False
         return not (row.key.startswith(_WITHIN_KEYS) and row.p_replicate < UNLIKE_BELOW)
 
@@ -144,7 +149,7 @@ def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
     if "differs" in words:
         return "different"
     statistical = [r.verdict for r in rows if r.kind != "share" and r.verdict != "imposed"]
-    if doubts.short:
+    if doubts.short or doubts.start:
         return "undecided"
     if statistical and statistical.count("undecided") > 0.5 * len(statistical):
         return "undecided"

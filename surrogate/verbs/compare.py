@@ -33,7 +33,7 @@ def compare(
     The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
     `candidates` is one candidate, and a sequence holds one each. `top`: topology for
-    files that carry none. `lag_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
+    files that carry none. `dt_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
     stands for all, or there is one for the reference, each candidate and the replicate in this order, None where the
     file says it itself. `energies`: judge the potential energy of every k-th frame too, by the force field that the
     reference's file names. A report that is there stays unless `overwrite`.
@@ -55,7 +55,7 @@ def compare(
         beside = [page.with_suffix(".json"), page.with_suffix(".md")]
         check_outputs(beside, [".json", ".md"], overwrite=options.overwrite)
     n = 1 + len(candidates) + (options.replicate is not None)
-    tops, lags = _one_each("top", options.top, n), _one_each("lag_ps", options.lag_ps, n)
+    tops, lags = _one_each("top", options.top, n), _one_each("dt_ps", options.dt_ps, n)
     truth = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
     others = [
         load_ensemble(

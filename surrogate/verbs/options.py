@@ -23,7 +23,7 @@ def _one_or_none(text: str, what: str) -> str | None:
     return None if text == "-" else text
 
 
-def _parse_lag_ps(text: str, what: str) -> float | None:
+def _parse_dt_ps(text: str, what: str) -> float | None:
     return None if text == "-" else parse_time_ps(text, what)
 
 
@@ -39,6 +39,13 @@ class Replicated:
     """Options of verbs that run a scene several times."""
 
     replicas: int = option("Independent runs; NAME.h5 becomes NAME_r0.h5, ...", 1, within=(1, None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joining(Replicated):
+    """Options of verbs that write the trajectories of replicas."""
+
+    join: bool = option("Also write all replicas into one file, NAME.h5.", False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +112,7 @@ class PlanOptions(MDSettings, Replicated, Preparation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Overwriting, Quiet):
+class ReferenceOptions(MDSettings, Joining, Preparation, Seeded, Resuming, Overwriting, Quiet):
     """What `reference` can be told."""
 
     time_ps: float = from_field(MDConfig, "time_ps")
@@ -116,7 +123,7 @@ class ReferenceOptions(MDSettings, Replicated, Preparation, Seeded, Resuming, Ov
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions(RolloutConfig, Replicated, Preparation, Resuming, Overwriting, Quiet):
+class RolloutOptions(RolloutConfig, Joining, Preparation, Resuming, Overwriting, Quiet):
     """What `rollout` can be told."""
 
 
@@ -145,17 +152,17 @@ class WindowsOptions(Validated, Overwriting, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(Overwriting):
-    """What `compare` can be told. Of `top` and `lag_ps` one stands for all, or there is one for the reference, each
+    """What `compare` can be told. Of `top` and `dt_ps` one stands for all, or there is one for the reference, each
     candidate and the replicate, in this order, None where the file says it itself."""
 
     replicate: Trajectories | None = option("Independent reference run, for the replicate baseline.", None)
     top: PathLike | Sequence[PathLike | None] | None = option(
         "Topology file: one for all, or one each for REF, every TRAJ and the replicate.", None, read=_one_or_none
     )
-    lag_ps: float | Sequence[float | None] | None = option(
+    dt_ps: float | Sequence[float | None] | None = option(
         "Time between frames, where a file does not say; as the topology. '-' leaves one out.",
         None,
-        read=_parse_lag_ps,
+        read=_parse_dt_ps,
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
     energies: bool = option("Also compare potential energies, by the reference's force field.", False)
@@ -212,7 +219,7 @@ class RunOptions(MDSettings, Preparation, OnDask, Seeded, Resuming, Overwriting,
         "Name of shipped weights, or a .safetensors file.", None, unset="those that cover SCENE"
     )
     save_every_ps: float | None = option("Interval between saved frames.", None, unset="what can be compared in time")
-    format: str = option("Trajectory format.", "h5", choices=("h5", "dcd"))
+    format: str = option("Trajectory format.", "h5", choices=("h5", "dcd", "xtc"))
     cores: int | None = option("Maximum number of CPU cores.", None, within=(1, None), unset="all")
     dry_run: bool = option("Print the timings and the decision without running.", False)
 

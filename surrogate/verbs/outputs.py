@@ -11,9 +11,10 @@ from md_reference.campaign.manifest import campaign_folder, campaign_trajectorie
 from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
+from systems.trajectory.codec import WRITTEN
 from systems.trajectory.topology_file import refuse_foreign_topology
 
-TRAJECTORY_SUFFIXES = (".h5", ".hdf5", ".dcd")
+TRAJECTORY_SUFFIXES = WRITTEN
 
 
 def check_outputs(
@@ -39,6 +40,13 @@ def check_outputs(
             raise InputError(f"{path} exists; add `overwrite=True` to replace it, or choose another name.")
         if path.suffix.lower() in TRAJECTORY_SUFFIXES and suffixes == TRAJECTORY_SUFFIXES and not resume:
             refuse_foreign_topology(path)
+
+
+def join_replicas(written: Sequence[Path], joined: Sequence[Path], *, overwrite: bool) -> list[Path]:
+    """Return what a verb wrote, with the file `joined` of all replicas at the end, where there is to be one."""
+    from systems.trajectory.joined_file import join
+
+    return [*written, *(join(written, out, overwrite=overwrite) for out in joined)]
 
 
 @contextmanager
@@ -81,7 +89,7 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
     if path.is_dir():
         files = [p for p in sorted(path.iterdir()) if not p.name.endswith(".meta.h5")]
         for suffixes in ((".h5", ".hdf5"), (".dcd",), (".xtc",)):
-            found = [p for p in files if p.suffix.lower() in suffixes]
+            found = _counted_once([p for p in files if p.suffix.lower() in suffixes])
             if found:
                 return found
         raise InputError(f"{path}: no trajectory (.h5, .dcd, .xtc) in this folder.")
@@ -94,8 +102,24 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
     if any(c in text for c in "*?["):
         import glob
 
-        found = [Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")]
+        found = _counted_once([Path(p) for p in sorted(glob.glob(text)) if not p.endswith(".meta.h5")])
         if found:
             return found
         raise InputError(f"{text}: no file matches.")
     raise InputError(f"{text}: no such file.")
+
+
+def _counted_once(found: list[Path]) -> list[Path]:
+    """Return files without those that join others of them, which would be counted twice."""
+    from systems.trajectory.codec import open_trajectory
+    from systems.trajectory.joined_file import KEY
+
+    kept = []
+    for path in found:
+        if path.with_name(f"{path.stem}_r0{path.suffix}") in found:
+            with open_trajectory(path) as reader:
+                if KEY in reader.record:
+                    sys.stderr.write(f"{path} joins replicas that are taken one by one, and is left out\n")
+                    continue
+        kept.append(path)
+    return kept

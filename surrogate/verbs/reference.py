@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import PlanOptions, ReferenceOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.takes import takes
@@ -44,8 +44,9 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     field. Explicit solvents ('tip3p', 'opc') put a scene that has no periodic cell into one: water to `padding_nm` (1
     nm) on each side, counter-ions, and NaCl at `ionic_strength_molar` (0), drawn with `seed`.
 
-    `out` ends in .h5 or .dcd; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds `seed`,
-    `seed + 1`, ... Settings that are not given are those of `protocol` (a paper's, by name:
+    `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
+    `seed`, `seed + 1`, ..., and `join` writes them into NAME.h5, too, one after another, whose record says where each
+    begins. Settings that are not given are those of `protocol` (a paper's, by name:
     `systems.library.protocols`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
     4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
     for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
@@ -56,7 +57,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     from systems.trajectory.claim import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
-    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
+    joined = [Path(out)] if options.join and len(outs) > 1 else []
+    check_outputs([*outs, *joined], TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
     molecule, config, protocol = settle_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
@@ -67,7 +69,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
         accounted_outputs(outs, resumable="the same again with `resume=True` goes on"),
         progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
-        return simulate_replicas(
+        written = simulate_replicas(
             molecule,
             config,
             outs,
@@ -76,6 +78,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
             progress=progress,
             announce=None if options.quiet else lambda said: tell(molecule.name, str(said)),
         )
+    return join_replicas(written, joined, overwrite=options.resume or options.overwrite)
 
 
 def settle_run(

@@ -9,7 +9,7 @@ from surrogate.data.shipped import weights_path
 from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
 from surrogate.verbs.options import RolloutOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.options import part_of
@@ -29,13 +29,13 @@ def rollout(
     says which and why. Atoms are written in the scene's own order, frames at
     the interval of the weights or a multiple of it (`save_every_ps`), each marked with its chunk and validity. Weights
     that were trained for several lags step at `lag_ps`, by default at the longest that `save_every_ps` is a multiple
-    of; weights that know atoms by their bonds take molecules that look like those they were trained on. Replicas
-    run in one batch and are named as by `reference`. `solver`: 'multistep', 'fitted' (for few `solver_steps`, 2 to
-    10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`: 'fp32', 'bf16' or
-    'auto'. `compile`: the networks, by torch; it takes a C++ compiler and about a minute, and pays in long rollouts.
-    `stiff`: bonds and angles 'modelled' by the network, or 'imposed': rigid bonds as long as the reference's, the width
-    of the others drawn given the torsions, as far as the weights hold that; None imposes what they hold. The record
-    names imposed terms (`imposed`), and `compare` leaves them out of its verdict.
+    of; weights of several peptides take others of the same residues. Replicas
+    run in one batch, are named as by `reference` and joined as there. `solver`: 'multistep', 'fitted' (for few
+    `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`:
+    'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a C++ compiler and about a minute, and pays in
+    long rollouts. `stiff`: bonds and angles 'modelled' by the network, or 'imposed': rigid bonds as long as the
+    reference's, the width of the others drawn given the torsions, as far as the weights hold that; None imposes what
+    they hold. The record names imposed terms (`imposed`), and `compare` leaves them out of its verdict.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real
@@ -51,7 +51,8 @@ def rollout(
     from systems.trajectory.claim import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
-    check_outputs(outs, TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
+    joined = [Path(out)] if options.join and len(outs) > 1 else []
+    check_outputs([*outs, *joined], TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
@@ -77,7 +78,7 @@ def rollout(
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=options.quiet, ps_per_frame=saved_ps * len(outs)) as progress,
     ):
-        return roll(
+        written = roll(
             molecule,
             loaded,
             outs,
@@ -87,3 +88,4 @@ def rollout(
             progress=progress,
             announce=None if options.quiet else lambda line: tell(molecule.name, line),
         )
+    return join_replicas(written, joined, overwrite=options.resume or options.overwrite)

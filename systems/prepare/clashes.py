@@ -1,4 +1,4 @@
-"""Atoms that are close and not bonded: noted, or refused where no energy would mean anything."""
+"""Atoms that are close and not bonded: noted, for minimising parts them, or refused where they coincide."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from systems.errors import PreparationError
 from systems.prepare.read.records import AtomRecord
 from systems.prepare.structure import atom_label
 
-# Heavy atoms, a heavy atom and a hydrogen, hydrogens. No minimisation can be trusted to part atoms nearer than the
-# first; it does part those up to the second, which models have before any refinement.
-_IMPOSSIBLE_ANGSTROM = (1.0, 0.9, 0.7)
+# Nearer than this two atoms have one place, and nothing says which way they part.
+_COINCIDE_ANGSTROM = 0.1
+# Heavy atoms, a heavy atom and a hydrogen, hydrogens: models have them before any refinement. Whether bonds and
+# stereocentres survive the minimisation is seen then (`md_reference.run.engine.refuse_damaged`).
 _CLOSE_ANGSTROM = (1.5, 1.1, 0.9)
 
 
 def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[str]:
     """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart.
 
-    Raises PreparationError for atoms that stand in each other.
+    Raises PreparationError for atoms that have the same place.
     """
     neighbours: dict[int, set[int]] = {}
     for i, j in bonds.tolist():
@@ -33,17 +34,14 @@ def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) ->
         gap = float(np.linalg.norm(x[i] - x[j]))
         kind = sum(atoms[k].element == "H" for k in (i, j))
         if gap < _CLOSE_ANGSTROM[kind] and not _is_near(neighbours, i, j):
-            found.append((gap - _IMPOSSIBLE_ANGSTROM[kind], gap, i, j))
+            found.append((gap, i, j))
     if not found:
         return []
-    margin, gap, i, j = min(found)
+    gap, i, j = min(found)
     more = f", and {len(found) - 1} pairs more are close" if len(found) > 1 else ""
     what = f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart and not bonded{more}"
-    if margin < 0:
-        raise PreparationError(
-            f"{what}: atoms stand in each other; model them again, or minimise the structure with the program that "
-            "made it."
-        )
+    if gap < _COINCIDE_ANGSTROM:
+        raise PreparationError(f"{what}: atoms have the same place; take one of them out, or model them again.")
     return [f"{what}; minimising has to part them"]
 
 

@@ -5,18 +5,18 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.errors import InputError, SurromdError, TrajectoryError
-from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
+from systems.errors import InputError, TrajectoryError
+from systems.files.whole_file import write_whole
 from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology, unused_top_note
+from systems.trajectory.base import TrajectoryReader, unused_top_note
+from systems.trajectory.companion_writer import CompanionWriter, companions
 from systems.trajectory.dcd_layout import (
     DcdLayout,
     cell_blocks,
@@ -25,14 +25,13 @@ from systems.trajectory.dcd_layout import (
     step_fields,
     title_bytes,
 )
-from systems.trajectory.frame_block import Float32Array, FrameBlock
+from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
 from systems.trajectory.frame_store import (
     CELLS,
+    ENDS,
     FRAMES,
-    FrameStore,
     add_column,
     consistent_length,
-    create_store,
     damage_reported,
     get_json,
     open_hdf5,
@@ -40,85 +39,34 @@ from systems.trajectory.frame_store import (
     read_run_id,
 )
 from systems.trajectory.hdf5_file import check_read, read_checksums, read_columns
-from systems.trajectory.topology_file import (
-    is_our_topology,
-    refuse_other_topology,
-    topology_bytes,
-    topology_path,
-    write_topology,
-)
+from systems.trajectory.topology_file import is_our_topology
 
 
-def companions(path: Path) -> tuple[Path, Path]:
-    """Return the paths of `NAME.pdb` and `NAME.meta.h5` that stand beside `NAME.dcd`."""
-    return topology_path(path), path.with_suffix(".meta.h5")
-
-
-class DcdWriter(TrajectoryWriter):
+class DcdWriter(CompanionWriter):
     """Writes a DCD and its companions; see `systems.trajectory.codec.open_writer` for the arguments and errors."""
 
-    def __init__(
-        self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool, run_id: str = ""
-    ) -> None:
-        self.path, self.scene, self._fd = path, scene, -1
-        self._pdb, self._meta = companions(path)
-        if not append:
-            self._create(record, overwrite, run_id)
-        if not self._meta.exists():
-            raise TrajectoryError(f"{path} has no {self._meta.name} beside it and cannot be continued.")
-        self._store = FrameStore(self._meta)
-        try:
-            check_same_topology(path, self._store.scene, scene)
-            layout = DcdLayout.read(path)
-            if layout != DcdLayout.ours(scene.n_atoms, layout.first_frame_at, has_cell=scene.cell_nm is not None):
-                raise TrajectoryError(f"{path} was not written by surromd and cannot be continued; take another name.")
-            _check_against_meta(path, layout, self._store.n_frames, completed=False)
-            self._layout, self.n_frames = layout, self._store.n_frames
-            self.last_time_ps, self._first_times = self._store.last_time_ps, self._store.first_times_ps()
-            new = {key: value for key, value in record.items() if key not in self._store.record}
-            if append and new:
-                self._store.update_record(new)
-            try:
-                self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-                self._set_length(self.n_frames)
-            except OSError as error:
-                raise storage_error(path, error, "nothing was changed") from error
-        except BaseException:
-            self.close()
-            raise
+    _layout: DcdLayout
+    _first_times: Float64Array
 
-    def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
-        for file in (self.path, self._meta):
-            refuse_existing(file, overwrite)
-        topology = topology_bytes(self.scene)
-        refuse_other_topology(self.path, topology, overwrite=overwrite)
-        made = [file for file in (self._meta, self._pdb, self.path) if not file.exists()]
-        try:
-            create_store(
-                self._meta,
-                self.scene,
-                record,
-                lambda file: add_column(file, "time", 0, "<f8"),
-                overwrite=overwrite,
-                run_id=run_id,
-                checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
-            )
-            write_topology(self.path, topology)
-            header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
-            create_whole(self.path, header + title_bytes(self.scene.n_atoms))
-        except SurromdError:
-            for file in made:
-                with suppress(OSError):
-                    file.unlink(missing_ok=True)
-            raise
+    def _lay_out(self, file: h5py.File) -> None:
+        add_column(file, "time", 0, "<f8")
 
-    def _append(self, block: FrameBlock) -> None:
-        self._refuse_closed()
-        self._store.check_flags(block)
-        if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
-            raise InputError(f"{self.path}: a DCD holds positions only; write an .h5 to keep velocities or forces.")
-        if block.cell_nm is not None and not self._layout.has_cell:
-            raise InputError(f"{self.path}: {self.scene.name!r} has no periodic cell, but frames came with one.")
+    def _head(self) -> bytes:
+        header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
+        return header + title_bytes(self.scene.n_atoms)
+
+    def _adopt(self) -> None:
+        layout = DcdLayout.read(self.path)
+        ours = DcdLayout.ours(self.scene.n_atoms, layout.first_frame_at, has_cell=self.scene.cell_nm is not None)
+        if layout != ours or ENDS in self._store.file:
+            raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
+        _check_against_meta(self.path, layout, self._store.n_frames, completed=False)
+        self._layout, self._first_times = layout, self._store.first_times_ps()
+
+    def _offset(self, n_frames: int) -> int:
+        return self._layout.offset(n_frames)
+
+    def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
         frames = np.empty(len(block), dtype=self._layout.frame_dtype)
         angstrom = block.positions_nm * np.float32(10.0)
         stored: dict[str, npt.NDArray[Any]] = {FRAMES: angstrom}
@@ -128,45 +76,19 @@ class DcdWriter(TrajectoryWriter):
         if self._layout.has_cell:
             own = np.broadcast_to(np.asarray(self.scene.cell_nm, dtype=np.float64), (len(block), 3, 3))
             stored[CELLS] = frames["cell"] = cell_blocks(own if block.cell_nm is None else block.cell_nm)
-        first_times = self._first_times
-        try:
-            write_whole(self._fd, frames.tobytes(), self._layout.offset(self.n_frames))
-            self._first_times = np.concatenate([first_times, block.time_ps])[:2]
-            self._set_length(self.n_frames + len(block))
-            os.fsync(self._fd)
-            self._store.append(block, {}, stored)
-        except BaseException as error:
-            # Taking space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
-            self._first_times = first_times
-            with suppress(OSError):
-                self._set_length(self.n_frames)
-            failed = self._store.failed(error) if isinstance(error, OSError) else error
-            self.close()
-            raise failed from error
+        return frames.tobytes(), {}, stored
 
-    def _set_length(self, n_frames: int) -> None:
-        """Make header and file size say `n_frames`. The header is one small write, which is atomic."""
+    def _restate(self, n_frames: int) -> None:
         first, nsavc, timestep_ps = 0, 1, 0.0
         if len(self._first_times):
             first, nsavc, timestep_ps = step_fields(self._first_times, self._store.record)
         write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
-        os.ftruncate(self._fd, self._layout.offset(n_frames))
 
-    def truncate(self, n_frames: int) -> None:
-        self._refuse_closed()
-        self._store.truncate(n_frames)
-        self._first_times = self._store.first_times_ps()
-        try:
-            self._set_length(n_frames)
-        except OSError as error:
-            raise self._store.failed(error) from error
-        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+    def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:
+        self._first_times = np.concatenate([self._first_times, block.time_ps])[:2]
 
-    def close(self) -> None:
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-        super().close()
+    def _forgotten(self, n_frames: int) -> None:
+        self._first_times = self._first_times[:n_frames]
 
 
 class DcdReader(TrajectoryReader):
@@ -181,7 +103,7 @@ class DcdReader(TrajectoryReader):
         self._layout = layout = DcdLayout.read(path)
         self.n_atoms = layout.n_atoms
         pdb, meta = companions(path)
-        if meta.exists():
+        if meta.exists() and not _is_of_xtc(meta):
             with open_hdf5(meta) as file, damage_reported(meta):
                 if "surromd" not in file:
                     raise TrajectoryError(f"{meta} is not the record of {path.name}; move it to read the DCD alone.")
@@ -240,6 +162,11 @@ class DcdReader(TrajectoryReader):
 
     def close(self) -> None:
         self._frames = None
+
+
+def _is_of_xtc(meta: Path) -> bool:
+    with open_hdf5(meta) as file:
+        return ENDS in file
 
 
 def _check_against_meta(path: Path, layout: DcdLayout, n_frames: int, *, completed: bool) -> None:

@@ -37,6 +37,8 @@ _RECORD_BYTES = 4096
 # Box vectors of each frame, where H5MD wants them.
 EDGES = "particles/trajectory/box/edges/value"
 CHECKSUMS = "surromd/checksums"
+# Where each frame ends in an XTC file, bytes.
+ENDS = "surromd/frame_ends"
 # The checksum of a frame's positions, time, chunk, flags and scalars; what else there is has one of its own.
 FRAMES, CELLS = "frames", "cells"
 _EXTRA = ("velocities", "forces", "cell_lengths", "cell_angles", EDGES)
@@ -179,7 +181,8 @@ def open_hdf5(path: Path, source: AtomicFile | None = None) -> h5py.File:
 
 def column_names(file: h5py.File) -> list[str]:
     """Return the names of all per-frame columns present in the file."""
-    fixed = ("coordinates", "time", "particles/trajectory/position/step", "surromd/flags", "surromd/chunk_idx")
+    fixed = ("coordinates", "time", "particles/trajectory/position/step", "surromd/flags", "surromd/chunk_idx",
+             ENDS)  # fmt: skip
     names = [name for name in fixed if name in file]
     if "surromd" in file:
         names += [name for name in _EXTRA if name in file]

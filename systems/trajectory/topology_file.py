@@ -18,7 +18,7 @@ MOST_ATOMS = 99_999
 # Between these a coordinate in Å fits its columns.
 _LEAST_A, _MOST_A = -999.999, 9999.999
 _OURS = b"REMARK   1 surromd scene"
-_TRAJECTORIES = (".h5", ".hdf5", ".dcd")
+_TRAJECTORIES = (".h5", ".hdf5", ".dcd", ".xtc")
 
 
 def pdb_text(scene: Scene) -> str:

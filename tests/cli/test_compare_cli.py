@@ -58,26 +58,26 @@ def test_each_file_has_its_topology_and_time(
     files: list[Path], shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     top = shared_data / "alanine-dipeptide" / "ala2.pdb"
-    found = compare(files[0], [files[1]], replicate=files[2], top=[top, None, top], lag_ps=["2ps", "2ps", 2.0])
+    found = compare(files[0], [files[1]], replicate=files[2], top=[top, None, top], dt_ps=["2ps", "2ps", 2.0])
     assert found.lag_ps == 2.0 and found.judgements[0].n_frames == 300
     assert found.reference.top == str(top) and found.judgements[0].account.top is None
     with pytest.raises(InputError, match="2 values of top for 3 trajectories"):
-        compare(files[0], [files[1]], replicate=files[2], top=[top, top], lag_ps=1.0)
+        compare(files[0], [files[1]], replicate=files[2], top=[top, top], dt_ps=1.0)
     # Through the command: '-' where a file needs none.
     seen: dict[str, object] = {}
     monkeypatch.setattr(
         api, "compare", lambda *args, **kwargs: seen.update(kwargs) or SimpleNamespace(judgements=[], notes=())
     )
-    arguments = ["compare", "a.xtc", "b.h5", "--top", "a.pdb", "--top", "-", "--lag", "1ps", "--lag", "-", "--quiet"]
+    arguments = ["compare", "a.xtc", "b.h5", "--top", "a.pdb", "--top", "-", "--dt", "1ps", "--dt", "-", "--quiet"]
     assert RUNNER.invoke(app, arguments).exit_code == 0
     options = vars(seen["options"])
-    assert (options["top"], options["lag_ps"]) == (["a.pdb", None], [1.0, None])
+    assert (options["top"], options["dt_ps"]) == (["a.pdb", None], [1.0, None])
 
 
 def test_what_cannot_be_read_says_what_is_missing(files: list[Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run1.xtc holds no topology; give one with .top="):
-        compare(files[0], [files[1]], lag_ps=1.0)
+        compare(files[0], [files[1]], dt_ps=1.0)
     ase = tmp_path / "run.traj"
     ase.write_bytes(b"- of Ulm")
     with pytest.raises(SurromdError, match=r"run.traj .* by ase"):
-        compare(ase, [files[1]], lag_ps=1.0)
+        compare(ase, [files[1]], dt_ps=1.0)

@@ -10,7 +10,9 @@ import numpy as np
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 
-SUFFIXES = (".h5", ".dcd")
+SUFFIXES = (".h5", ".dcd", ".xtc")
+# Of positions, nm: what each keeps.
+TOLERANCES = {".h5": (0.0, 0.0), ".dcd": (3e-7, 0.0), ".xtc": (3e-7, 5.1e-4)}
 RECORD = {"kind": "reference", "timestep_ps": 0.004, "save_every_ps": 1.0, "seed": 7, "completed": False}
 
 

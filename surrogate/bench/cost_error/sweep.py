@@ -84,7 +84,7 @@ def run_cost_error(
     StorageError; KeyboardInterrupt says what is kept.
     """
     weights = [one for one, _ in chosen]
-    prints = [refuse_trained_on(w, reference, replicate) for w in weights]
+    prints = [refuse_trained_on(w, reference, replicate, lag_ps=config.lag_ps) for w in weights]
     fitted = [_fitted(w, reference, config.lag_ps) for w in weights]
     header = {"references": prints[0], "config": asdict(config)}
     result = _earlier(folder, header)
@@ -147,7 +147,6 @@ def measure_setting(
         "weights_hash": weights.hash,
         **asdict(setting),
         "label": setting.label,
-        "atoms": "heavy, hydrogens placed" if getattr(model.config, "hydrogens", "") == "placed" else "all",
         "clean_conditioning": bool(getattr(getattr(model.config, "approximator", None), "clean_conditioning", False)),
     }
     try:

@@ -38,7 +38,7 @@ def longest_correlation(*features: Features) -> float:
     as long as they are. 1 where nothing moves.
     """
     chosen = _slowest(_all_series(features))
-    slowest = _tic_0(features)
+    slowest = tic_0(features)
     times = [kinetics.zero_crossing(s)[1] for s in (*chosen, *([] if slowest is None else [slowest]))]
     return max((t for t in times if math.isfinite(t)), default=1.0)
 
@@ -149,7 +149,7 @@ def _share_between(segments: Series, n_blocks: int) -> float:
     return float(values[: len(values) // size * size].reshape(-1, size).mean(axis=1).var()) / total
 
 
-def _tic_0(features: Sequence[Features]) -> Series | None:
+def tic_0(features: Sequence[Features]) -> Series | None:
     """Return TIC 0 of all torsions, fitted on all trajectories together; None where frames are too few."""
     parts = [x for f in features for x in tica_features(f)]
     n_features = parts[0].shape[1]

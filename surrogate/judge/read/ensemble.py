@@ -16,11 +16,13 @@ import numpy.typing as npt
 
 from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, unseen_notes
 from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
+from surrogate.judge.read.rounding import grid_of, rounded, rounding_note
 from surrogate.judge.read.stored_frames import StoredFrames
 from surrogate.judge.read.truth_asked import reweighting_notes
 from systems.errors import InputError, listed
 from systems.scene import Scene
 from systems.selection import part_of
+from systems.trajectory.joined_file import replicas_of
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -33,6 +35,15 @@ STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
+
+
+def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
+    """Return how long trajectories are, as what they are: '32 replicas of 3.8 ns', never their sum."""
+    if not segment_lengths:
+        return "no frames"
+    short, long = (format_time_ps(n * lag_ps) for n in (min(segment_lengths), max(segment_lengths)))
+    each = long if short == long else f"{short} to {long}"
+    return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
 
 
 class InSegments(ABC):
@@ -55,6 +66,11 @@ class InSegments(ABC):
         """Simulated time of all segments together (frames times lag)."""
         return self.n_frames * self.lag_ps
 
+    @property
+    def length_words(self) -> str:
+        """Such as '32 replicas of 3.8 ns'."""
+        return length_words(self.segment_lengths, self.lag_ps)
+
 
 @dataclass(frozen=True, eq=False)
 class Ensemble(InSegments):
@@ -64,7 +80,8 @@ class Ensemble(InSegments):
     by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
     `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
     segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
-    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading.
+    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading;
+    `grids_nm`: what the coordinates of each segment are rounded to, 0 for nothing (none given: nothing).
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -81,12 +98,11 @@ class Ensemble(InSegments):
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
     changed: Sequence[npt.NDArray[np.bool_]] | None = None
+    grids_nm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
-            raise InputError(
-                f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `lag_ps='1ps'`."
-            )
+            raise InputError(f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `dt_ps='1ps'`.")
         for i, segment in enumerate(self.segments):
             if segment.ndim != 3 or segment.shape[1:] != (self.scene.n_atoms, 3):
                 raise InputError(
@@ -101,6 +117,11 @@ class Ensemble(InSegments):
     @property
     def segment_lengths(self) -> list[int]:
         return [len(s) for s in self.segments]
+
+    @property
+    def grid_nm(self) -> float:
+        """The coarsest rounding of any segment's coordinates, nm, 0 for none."""
+        return max(self.grids_nm, default=0.0)
 
     def sample(self, n_frames: int) -> npt.NDArray[np.float32]:
         """Return about `n_frames` finite frames `(n, n_atoms, 3)` nm, spread evenly (fewer of very large scenes)."""
@@ -122,6 +143,17 @@ class Ensemble(InSegments):
             lag_ps=self.lag_ps * stride,
             notes=(*self.notes, f"{self.label}: one frame in {stride} is used, for equal save intervals."),
         )
+
+    def on_grid(self, grid_nm: float) -> Ensemble:
+        """Return the same frames with coordinates rounded to `grid_nm`, where they are not as coarse already."""
+        own = self.grids_nm or (0.0,) * len(self.segments)
+        if min(own) >= grid_nm:
+            return self
+        segments = [
+            s if g >= grid_nm else s.on_grid(grid_nm) if isinstance(s, StoredFrames) else rounded(s, grid_nm)
+            for s, g in zip(self.segments, own, strict=True)
+        ]
+        return replace(self, segments=segments, grids_nm=tuple(max(g, grid_nm) for g in own))
 
     def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
         """Return the same frames with `atoms` `(k,)` only, which are those of `scene`."""
@@ -162,15 +194,19 @@ def load_ensemble(
     lags: list[float] = []
     notes: list[str] = []
     kept: list[IntArray] = []
+    grids: list[float] = []
     stopped: list[str] = []
     for path in paths:
         opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
         reader, template = opened.reader, opened.template
         kept.append(opened.kept)
         lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        replicas = replicas_of(reader.record, reader.n_frames)
+        cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
         notes += note
         lags.append(lag)
         frames = opened.frames
+        grids += [grid_of(reader)] * (len(cuts) + 1)
         size = 12 * len(frames) * reader.n_atoms
         if size <= in_memory_bytes:
             in_memory_bytes -= size
@@ -184,9 +220,11 @@ def load_ensemble(
             chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
         if COLUMN in reader.scalars:
             changed += np.split(reader.scalars[COLUMN] > 0, cuts)
-        records.append(dict(reader.record))
-        scalars.append(reader.scalars)
-        if records[-1].get("completed") is False:
+        if len(replicas) > 1:
+            notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
+        records += [record for _, record in replicas]
+        scalars += [{key: values[part] for key, values in reader.scalars.items()} for part, _ in replicas]
+        if reader.record.get("completed") is False:
             stopped.append(f"{path} ({reader.n_frames} frames)")
     assert template is not None
     if stopped:
@@ -210,12 +248,13 @@ def load_ensemble(
         stated_lag_ps=lag_ps,
         notes=tuple(notes),
         kept=part,
+        grids_nm=tuple(grids),
     )
 
 
 def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
     """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
-    interval; and which of the first's atoms these are (None: all).
+    interval, rounded to the coarsest grid of any; and which of the first's atoms these are (None: all).
 
     The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
     are left, or when no common interval leaves 10 frames of each.
@@ -234,9 +273,15 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
         intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in out)
         raise InputError(
             f"Save intervals have no common multiple short enough to compare at ({intervals}); "
-            "save again at a multiple of one another, or state the interval with `lag_ps`."
+            "save again at a multiple of one another, or state the interval with `dt_ps`."
         )
-    return [e.strided(stride) for e, stride in zip(out, strides, strict=True)], common
+    out = [e.strided(stride) for e, stride in zip(out, strides, strict=True)]
+    grid = max(e.grid_nm for e in out)
+    if grid > 0:
+        note = rounding_note([e.label for e in out if e.grid_nm == grid], grid)
+        out = [e.on_grid(grid) for e in out]
+        out[0] = replace(out[0], notes=(*out[0].notes, note))
+    return out, common
 
 
 def _common_atoms(every: IntArray, kept: Sequence[IntArray | None]) -> IntArray | None:

@@ -110,11 +110,11 @@ def time_axis(
     if n_frames < 2:
         return math.nan, [], []
     if time_ps is None or not (np.isfinite(time_ps).all() and measured > 0):
-        raise InputError(f"{path}: the file holds no usable times; state the time between frames with `lag_ps='1ps'`.")
+        raise InputError(f"{path}: the file holds no usable times; state the time between frames with `dt_ps='1ps'`.")
     if measured < _LEAST_LAG_PS or abs(measured - _AKMA_PS) < 1e-6:
         raise InputError(
             f"{path}: its header says {1e3 * measured:.3g} fs between frames, which is what a writer that was told "
-            "nothing puts there; state the time between frames with `lag_ps='1ps'`."
+            "nothing puts there; state the time between frames with `dt_ps='1ps'`."
         )
     # Times that passed through float32 are exact only to its spacing.
     tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
@@ -124,7 +124,7 @@ def time_axis(
         first = int(np.flatnonzero(odd)[0])
         raise TrajectoryError(
             f"{path}: time is uneven (frame {first} to {first + 1}: {steps[first]:g} ps, most steps {measured:g} ps); "
-            "state the time between frames with `lag_ps` if you know it to be even."
+            "state the time between frames with `dt_ps` if you know it to be even."
         )
     cuts = (np.flatnonzero(jump) + 1).tolist()
     notes = [f"{path}: time jumps {len(cuts)} times; the stretches between are treated as segments."] if cuts else []
@@ -137,12 +137,12 @@ def common_lag(lags: Sequence[float], paths: Sequence[str | Path], stated: float
         return stated
     if not lags:
         raise InputError(
-            f"{paths[0]}: one frame only, so the time between frames is unknown; state it with `lag_ps='1ps'`."
+            f"{paths[0]}: one frame only, so the time between frames is unknown; state it with `dt_ps='1ps'`."
         )
     if max(lags) - min(lags) > 1e-3 * min(lags):
         listed = ", ".join(f"{p}: {x:g} ps" for p, x in zip(paths, lags, strict=False))
         raise InputError(
-            f"Replicas of one candidate must share one save interval ({listed}); thin them or use `lag_ps`."
+            f"Replicas of one candidate must share one save interval ({listed}); thin them or use `dt_ps`."
         )
     return lags[0]
 

@@ -8,7 +8,17 @@ from surrogate.judge.comparison import Comparison, Judgement
 from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.report.cards import cards, side_by_side
 from surrogate.judge.report.definitions import DEFINITIONS
-from surrogate.judge.report.wording import GROUP_TITLES, MARKS, STATUS_MARKS, interval, number, per_day, plain
+from surrogate.judge.report.wording import (
+    GROUP_TITLES,
+    MARKS,
+    STATE_HEADS,
+    STATUS_MARKS,
+    interval,
+    number,
+    per_day,
+    plain,
+    state_lines,
+)
 from surrogate.judge.rows.rows import GROUPS, Row
 from systems.files.outside import printable
 from systems.units import format_time_ps
@@ -21,7 +31,15 @@ def to_markdown(comparison: Comparison, *, command: str, headline: str = "") -> 
     parts += [_text(headline)] if headline else []
     for judgement in comparison.judgements:
         mark = STATUS_MARKS[judgement.status]
-        parts.append(f"**{mark} {_text(judgement.account.label)}**: {_text(judgement.verdict)}")
+        use, for_what, why = map(_text, judgement.in_short)
+        parts.append(f"**{mark} {_text(judgement.account.label)}**: {use}\n- {for_what}\n- {why}")
+        parts.append(_text(judgement.verdict))
+    if comparison.convergence is not None:
+        parts += [
+            "## Has the reference forgotten its start?",
+            _text(comparison.convergence.verdict),
+            _drifts(comparison),
+        ]
     if len(comparison.judgements) > 1:
         parts += ["## Side by side", _side_by_side(comparison)]
     for judgement in comparison.judgements:
@@ -87,7 +105,7 @@ def _costs(comparison: Comparison) -> str:
     rows = [
         (
             f"{role}: {a.label}",
-            f"{format_time_ps(a.total_ps)}, {a.n_segments} segments",
+            a.length,
             f"{a.n_frames}, every {format_time_ps(a.lag_ps)}",
             "not recorded" if a.wall_s is None else f"{a.wall_s:.4g} s",
             per_day(a.ns_per_day),
@@ -95,6 +113,10 @@ def _costs(comparison: Comparison) -> str:
         for role, a in listed
     ]
     return _table(("Trajectory", "Length", "Frames", "Wall time", "Speed"), rows)
+
+
+def _drifts(comparison: Comparison) -> str:
+    return _table(STATE_HEADS, state_lines(comparison.convergence)) if comparison.convergence else ""
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -18,6 +18,7 @@ from surrogate.judge.report.pictures import albums, maps, timelines
 from surrogate.judge.report.wording import (
     GROUP_TITLES,
     MARKS,
+    STATE_HEADS,
     STATUS_MARKS,
     interval,
     number,
@@ -26,6 +27,7 @@ from surrogate.judge.report.wording import (
     setting,
     severity,
     sort_key,
+    state_lines,
 )
 from surrogate.judge.rows.account import Account
 from surrogate.judge.rows.rows import GROUPS
@@ -115,6 +117,8 @@ def render(comparison: Comparison, *, command: str, foreword: Foreword | None = 
         candidates=candidates,
         side_by_side=side_by_side(comparison) if len(candidates) > 1 else [],
         accounts=_accounts(comparison),
+        state_heads=STATE_HEADS,
+        state_lines=[] if comparison.convergence is None else state_lines(comparison.convergence),
         definitions=DEFINITIONS,
         group_titles=GROUP_TITLES,
         marks=MARKS,
@@ -152,7 +156,7 @@ def _command(comparison: Comparison, target: Path) -> str:
     if comparison.reference.top is not None:
         words += [flag_of("top"), comparison.reference.top]
     if comparison.reference.stated_lag_ps is not None:
-        words += [flag_of("lag_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
+        words += [flag_of("dt_ps"), format_time_ps(comparison.reference.stated_lag_ps).replace(" ", "")]
     return shlex.join([*words, "-o", target.name])
 
 

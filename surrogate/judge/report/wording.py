@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from surrogate.judge.convergence import Convergence
 from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.rows.rows import Row
+from systems.units import format_time_ps
 
 MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?", "imposed": "="}
 STATUS_MARKS = {"indistinguishable": "✓", "close": "≈", "different": "✗", "broken": "‼", "undecided": "?"}
@@ -97,3 +99,30 @@ def severity(row: Row) -> int:
 def worst(rows: Sequence[Row]) -> Row | None:
     """Return the row with the worst word, among equals the one with the greatest value; None for no rows."""
     return max(rows, key=lambda r: (severity(r), r.candidate.value), default=None)
+
+
+STATE_HEADS = ("State", "Share", "By quarters of each replica", "Drift, p", "Split R-hat", "Relaxes in", "In, out",
+               "Left their start", "Allowed")  # fmt: skip
+_MOST_STATES = 40
+
+
+def state_lines(found: Convergence) -> list[tuple[str, ...]]:
+    """Return the states of a convergence as lines of `STATE_HEADS`, what is not converged first; no more than forty."""
+    order = sorted(found.states, key=lambda s: (not s.fault, min(s.share, 1.0 - s.share) < 1e-3))
+    out: list[tuple[str, ...]] = []
+    for s in order[:_MOST_STATES]:
+        is_state = s.entries is not None
+        quarters = "; ".join(f"{100 * q:.3g} ± {100 * e:.2g}" if is_state else f"{q:.2g} ± {e:.2g}"
+                             for q, e in zip(s.quarters, s.quarter_errors, strict=True))  # fmt: skip
+        out.append((
+            s.label,
+            f"{100 * s.share:.3g} ± {100 * s.error:.2g} %" if is_state else "",
+            quarters + (" %" if is_state else ""),
+            f"{s.drift_p:.2g}" if math.isfinite(s.drift_p) else "–",
+            f"{s.r_hat:.3g}" if math.isfinite(s.r_hat) else "–",
+            format_time_ps(s.relaxation_ps, 2) if math.isfinite(s.relaxation_ps) else "–",
+            f"{s.entries}, {s.exits}" if is_state else "",
+            f"{s.left} of {s.started}" if is_state else "",
+            f"{100 * s.low:.2g} to {100 * s.high:.2g} %" if is_state else "",
+        ))  # fmt: skip
+    return out

@@ -21,8 +21,8 @@ class Account:
     """What one trajectory is: where from, how long, how it was made, what it cost.
 
     `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
-    `ns_per_day` and `wall_s` are None where its record holds no cost; `imposed` are terms that no model made
-    (systems.imposed).
+    `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds
+    no cost; `imposed` are terms that no model made (systems.imposed).
     """
 
     label: str
@@ -38,6 +38,7 @@ class Account:
     ns_per_day: float | None
     cost: dict[str, Any]
     imposed: tuple[str, ...] = ()
+    length: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ def account_of(ensemble: Ensemble) -> Account:
         ns_per_day=None if wall_s is None else ensemble.total_ps * 1e-3 * 86_400.0 / wall_s,
         cost=dict(cost),
         imposed=imposed_terms(record),
+        length=ensemble.length_words,
     )
 
 

@@ -201,14 +201,22 @@ def _step_row(trio: Trio, states: Sequence[Sequence[IntArray]]) -> Row:
         ),
         values,
         draws,
-        lambda c, r: (
-            f"torsions step by {c:.3g}° from frame to frame instead of {r:.3g}°"
-            + (
-                ": frames are further apart in time, or colder or hotter, than said"
-                if c != r and math.isfinite(c)
-                else ""
-            )
-        ),
+        lambda c, r: f"torsions step by {c:.3g}° from frame to frame instead of {r:.3g}°" + _possible_causes(c, r),
+    )
+
+
+def _possible_causes(c: float, r: float) -> str:
+    """Return what makes torsions step by `c` where the reference has `r`; the row cannot tell these apart."""
+    if not math.isfinite(c) or c == r:
+        return ""
+    if c > r:
+        return (
+            "; possible causes: frames further apart in time than said, a higher temperature, less friction, another "
+            "force field or solvent, or a model that moves too far in a step"
+        )
+    return (
+        "; possible causes: frames closer in time than said, a lower temperature, more friction, another force field "
+        "or solvent, smoothed frames, or a model that moves too little in a step"
     )
 
 

@@ -14,10 +14,13 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from chain_files import SUFFIXES, TOLERANCES
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.engine import Engine, refuse_inverted
+from md_reference.run.engine import Engine, refuse_damaged
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
+from systems.chemistry.validity import BOND_HALF_ANGSTROM, CHIRALITY, CLASH, check_frames, geometry_from_scene
 from systems.errors import (
     InputError,
     PreparationError,
@@ -28,10 +31,11 @@ from systems.errors import (
     UnknownNameError,
 )
 from systems.scene import Scene
+from systems.source import prepare
 from systems.trajectory.checkpoint import read_checkpoints
 from systems.trajectory.codec import open_trajectory, open_writer
+from systems.trajectory.topology_file import topology_bytes
 
-SUFFIXES = [".h5", ".dcd"]
 SHORT = MDConfig(time_ps=4.0, save_every_ps=0.2, equilibrate_ps=0.4, seed=7, platform="Reference")
 # About a second of work on a fast core: long enough to be killed three times on the way.
 LONG = replace(SHORT, time_ps=240.0, save_every_ps=0.4)
@@ -51,6 +55,26 @@ timer = None
 config = MDConfig(time_ps=240.0, save_every_ps=0.4, equilibrate_ps=0.4, seed=7, platform="Reference")
 simulate(load("alanine-dipeptide"), config, {out!r}, resume=True, progress=kill_soon, checkpoint_every_s=0.05)
 """
+
+
+def clashing() -> Scene:
+    """Four alanines whose backbone is turned until the chain's ends stand in each other."""
+    scene = prepare("sequence:ACE-ALA-ALA-ALA-ALA-NME")
+    neighbours: dict[int, set[int]] = {i: set() for i in range(scene.n_atoms)}
+    for i, j in scene.bonds.tolist():
+        neighbours[i].add(j)
+        neighbours[j].add(i)
+    turned = ({"N", "CA"}, {"CA", "C"})
+    backbone = [(i, j) for i, j in scene.bonds.tolist() if {scene.atom_names[i], scene.atom_names[j]} in turned]
+    x = scene.positions_nm.copy()
+    for (i, j), angle in zip(backbone, (1.33, 1.22, 1.84, -2.29, -0.72, -2.1, -0.24, -0.72), strict=True):
+        behind, ends = {i, j}, [j]
+        while ends:
+            ends += [k for k in neighbours[ends.pop()] - behind if not behind.add(k)]  # type: ignore[func-returns-value]
+        rows = sorted(behind - {i, j})
+        turn = Rotation.from_rotvec(angle * (x[j] - x[i]) / np.linalg.norm(x[j] - x[i]))
+        x[rows] = x[j] + turn.apply(x[rows] - x[j])
+    return scene.with_positions(x)
 
 
 def contents(path: Path) -> tuple[Any, Any, dict[str, Any]]:
@@ -84,13 +108,44 @@ def test_a_stereocentre_that_minimising_turns_over_is_refused(
     alanine_dipeptide: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mirrored = alanine_dipeptide.positions_nm * [1.0, 1.0, -1.0]
-    refuse_inverted(alanine_dipeptide, alanine_dipeptide.positions_nm + 0.001)
-    refuse_inverted(alanine_dipeptide.with_positions(mirrored), mirrored)
+    refuse_damaged(alanine_dipeptide, alanine_dipeptide.positions_nm + 0.001)
+    refuse_damaged(alanine_dipeptide.with_positions(mirrored), mirrored)
     flat = alanine_dipeptide.with_positions(mirrored * [1.0, 1.0, 0.0])
-    refuse_inverted(flat, mirrored)
+    refuse_damaged(flat, mirrored)
 
     monkeypatch.setattr(Engine, "minimise", lambda engine, **_: engine.set_positions(mirrored))
     with pytest.raises(PreparationError, match="turns the stereocentre ALA 2 CA over") as caught:
+        simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
+    assert "\n" not in str(caught.value)
+
+
+def test_clashing_atoms_are_minimised_and_said(tmp_path: Path) -> None:
+    """φ and ψ that lay the acetyl carbon 0.72 Å beside a carbonyl oxygen: all bonds and stereocentres survive."""
+    scene = clashing()
+    (tmp_path / "in.pdb").write_bytes(topology_bytes(scene))
+    read = prepare(tmp_path / "in.pdb")
+    said = " ".join(read.provenance["repairs"])
+    assert "ACE A1 C and ALA A5 O are 0.72 Å apart" in said and "minimising has to part them" in said
+    simulate(read, replace(SHORT, equilibrate_ps=1.0), tmp_path / "a.h5")
+    frames = contents(tmp_path / "a.h5")[0]
+    flags = check_frames(frames, geometry_from_scene(prepare("sequence:ACE-ALA-ALA-ALA-ALA-NME")))
+    assert not (flags & (BOND_HALF_ANGSTROM | CHIRALITY)).any()
+    assert not (check_frames(frames[-5:], geometry_from_scene(scene)) & CLASH).any()
+    assert (check_frames(scene.positions_nm[None], geometry_from_scene(scene)) & CLASH).all()  # the check sees it
+
+
+def test_a_bond_that_minimising_breaks_is_refused(
+    alanine_dipeptide: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = alanine_dipeptide.positions_nm.copy()
+    names = list(alanine_dipeptide.atom_names)
+    ca, cb = names.index("CA"), names.index("CB")
+    broken[cb : cb + 4] += 0.4 * (broken[cb] - broken[ca])  # the methyl group, 1.4 times as far
+    refuse_damaged(alanine_dipeptide, alanine_dipeptide.positions_nm)
+    refuse_damaged(alanine_dipeptide.with_positions(broken), broken)  # as the scene has it
+
+    monkeypatch.setattr(Engine, "minimise", lambda engine, **_: engine.set_positions(broken))
+    with pytest.raises(PreparationError, match=r"breaks the bond ALA 2 CA - ALA 2 CB \(2\.1") as caught:
         simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
     assert "\n" not in str(caught.value)
 
@@ -167,8 +222,9 @@ def test_resume_after_kill_9_equals_an_uninterrupted_run(
     positions, times, record = contents(out)
     whole, whole_times, _ = contents(uninterrupted)
     np.testing.assert_array_equal(times, whole_times)
-    # A DCD holds Å in single precision; its rounding is all that may differ.
-    np.testing.assert_allclose(positions, whole, rtol=0 if suffix == ".h5" else 3e-7)
+    # A DCD holds Å in single precision, an XTC three decimals; rounding is all that may differ.
+    rtol, atol = TOLERANCES[suffix]
+    np.testing.assert_allclose(positions, whole, rtol=rtol, atol=atol)
     assert record["completed"] is True
     assert record["cost"]["energy_evaluations"] == 60_000
     assert not checkpoint_path(out).exists()
@@ -395,7 +451,8 @@ def test_a_full_disk_is_one_clear_line_and_resumable(
     assert kept < 200
     simulate(alanine_dipeptide, config, out, resume=True)
     whole = simulate(alanine_dipeptide, config, tmp_path / "whole.h5")
-    np.testing.assert_allclose(contents(out)[0], contents(whole)[0], rtol=0 if suffix == ".h5" else 3e-7)
+    rtol, atol = TOLERANCES[suffix]
+    np.testing.assert_allclose(contents(out)[0], contents(whole)[0], rtol=rtol, atol=atol)
 
 
 def test_no_room_for_the_checkpoint_is_one_clear_line(

@@ -126,8 +126,24 @@ def test_runs_that_were_trained_on_are_refused(
         write(tmp_path / f"hot{k}.h5", alanine_dipeptide, toy_frames(alanine_dipeptide, k, 200), temperature_k=350.0)
         for k in (5, 6)
     ]
-    with pytest.raises(InputError, match="no truth to judge it by"):
+    with pytest.raises(InputError, match=r"has temperature_k 350\.0, .* was trained for 300\.0"):
         refuse_trained_on(weights, hot[:1], hot[1:])
+
+
+def test_frames_further_apart_than_the_weights_step_are_compared_and_what_differs_is_said(
+    held: tuple[Path, Path], weights: Weights
+) -> None:
+    """References every 10 ps: a multiple of the weights' step is compared, and nothing else."""
+    lag_ps = weights.domain.lag_ps
+    finer = replace(weights, domain=replace(weights.domain, lag_ps=0.1 * lag_ps))
+    assert refuse_trained_on(finer, held[:1], held[1:]) == refuse_trained_on(weights, held[:1], held[1:])
+    assert refuse_trained_on(weights, held[:1], held[1:], lag_ps=2 * lag_ps)
+    coarser = replace(weights, domain=replace(weights.domain, lag_ps=3 * lag_ps))
+    with pytest.raises(InputError, match="apart cannot be compared: steps of"):
+        refuse_trained_on(coarser, held[:1], held[1:])
+    assert refuse_trained_on(coarser, held[:1], held[1:], lag_ps=3 * lag_ps)
+    with pytest.raises(InputError, match="apart cannot be compared: frames of"):
+        refuse_trained_on(weights, held[:1], held[1:], lag_ps=1.5 * lag_ps)
 
 
 def test_settings_are_combinations_of_what_is_asked(weights: Weights) -> None:

@@ -82,7 +82,7 @@ def test_a_single_path_is_one_candidate_and_no_other_file_is_read(
     _write(here / "out.dcd", alanine_dipeptide, 1)
     # "." of out.dcd is the current folder, whose trajectories are others.
     _write(here / "other.h5", alanine_dipeptide, 2)
-    result = sm.compare(as_path("ref.h5"), as_path("out.dcd"), labels="mine", lag_ps="1ps")
+    result = sm.compare(as_path("ref.h5"), as_path("out.dcd"), labels="mine", dt_ps="1ps")
     assert [judgement.account.sources for judgement in result.judgements] == [("out.dcd",)]
     assert [judgement.account.label for judgement in result.judgements] == ["mine"]
     several = sm.compare("ref.h5", ["out.dcd", "other.h5"])

@@ -133,15 +133,15 @@ def test_an_element_column_that_repeats_the_name_is_no_metal(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("gap", "elements", "expected"), [
-    (1.6, "CO", ""), (1.4, "CO", "minimising"), (0.95, "CO", "refused"), (1.0, "CH", "minimising"),
-    (0.85, "CH", "refused"), (0.8, "HH", "minimising"), (0.6, "HH", "refused"),
+    (1.6, "CO", ""), (1.4, "CO", "minimising"), (0.85, "CO", "minimising"), (1.0, "CH", "minimising"),
+    (0.2, "CO", "minimising"), (0.8, "HH", "minimising"), (0.05, "CO", "refused"), (0.0, "HH", "refused"),
 ])  # fmt: skip
-def test_atoms_in_each_other_are_refused_and_close_ones_said(gap: float, elements: str, expected: str) -> None:
+def test_atoms_in_one_place_are_refused_and_close_ones_said(gap: float, elements: str, expected: str) -> None:
     atoms = [
         AtomRecord(str(k), e, "", "LIG", "A", str(k), (k * gap, 0.0, 0.0), 1.0, e, True) for k, e in enumerate(elements)
     ]
     if expected == "refused":
-        with pytest.raises(PreparationError, match=f"{gap:.2f} Å apart.*stand in each other"):
+        with pytest.raises(PreparationError, match=f"{gap:.2f} Å apart.*have the same place"):
             check_contacts(atoms, np.empty((0, 2), dtype=np.int64))
     else:
         assert expected in " ".join(check_contacts(atoms, np.empty((0, 2), dtype=np.int64)))

@@ -28,24 +28,25 @@ def test_mdtraj_and_mdanalysis_read_it(tmp_path: Path, suffix: str, alanine_dipe
     if suffix == ".h5":
         pdb.write_text(pdb_text(alanine_dipeptide))
     seen = mdtraj.load(str(path)) if suffix == ".h5" else mdtraj.load(str(path), top=str(pdb))
-    np.testing.assert_allclose(seen.xyz, positions, atol=1e-6)
+    coarse = 5.1e-4 if suffix == ".xtc" else 0.0  # nm; it keeps three decimals
+    np.testing.assert_allclose(seen.xyz, positions, atol=1e-6 + coarse)
     assert [a.name for a in seen.topology.atoms] == list(alanine_dipeptide.atom_names)
     assert [a.element.symbol for a in seen.topology.atoms] == list(alanine_dipeptide.elements)
     bonds = sorted(tuple(sorted((b.atom1.index, b.atom2.index))) for b in seen.topology.bonds)
     assert bonds == sorted(map(tuple, alanine_dipeptide.bonds.tolist()))
-    if suffix == ".h5":
+    if suffix != ".dcd":
         np.testing.assert_array_equal(seen.time, 3.0 + np.arange(n) * 0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        universe = mda.Universe(str(pdb), str(path), format="H5MD" if suffix == ".h5" else "DCD")
+        universe = mda.Universe(str(pdb), str(path), format="H5MD" if suffix == ".h5" else None)
         assert universe.trajectory.n_frames == n
-        if suffix == ".dcd":  # MDAnalysis reads times, but no dt, from H5MD
+        if suffix != ".h5":  # MDAnalysis reads times, but no dt, from H5MD
             assert universe.trajectory.dt == pytest.approx(0.5, rel=1e-6)
         for k, step in enumerate(universe.trajectory):
-            np.testing.assert_allclose(step.positions, positions[k] * 10.0, atol=1e-4)
+            np.testing.assert_allclose(step.positions, positions[k] * 10.0, atol=1e-4 + 10 * coarse)
             assert step.time == pytest.approx(3.0 + 0.5 * k, rel=1e-6)
             assert step.dimensions is None
-            if suffix == ".h5":
+            if suffix != ".dcd":
                 assert step.data["step"] == round((3.0 + 0.5 * k) / 0.004)
 
 

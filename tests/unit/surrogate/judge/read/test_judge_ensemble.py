@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from surrogate.data.frames import collect_frames
 from surrogate.judge.read.ensemble import Ensemble, alike, load_ensemble
+from surrogate.verbs.outputs import find_trajectories
 from surrogate.verbs.run.stages import worth_saying
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
+from systems.trajectory.joined_file import join
 
 Save = Callable[..., Path]
 
@@ -113,6 +116,27 @@ def test_replicas_become_segments_and_costs_add_up(save: Save, frames: np.ndarra
     assert "cost" not in load_ensemble([paths[0], without]).record, "half a cost is no cost"
 
 
+@pytest.mark.parametrize("suffix", [".h5", ".dcd", ".xtc"])
+def test_replicas_in_one_file_are_read_as_those_in_many(save: Save, frames: np.ndarray, suffix: str) -> None:
+    costs = [{"cost": {"wall_s": 2.0}, "seed": 1}, {"cost": {"wall_s": 3.0}, "seed": 2}]
+    parts = [frames[:20], frames[20:]]  # what follows on in time, so that nothing but the record tells
+    paths = [save(f"a_r{k}{suffix}", parts[k], steps(len(parts[k])), record=costs[k]) for k in range(2)]
+    joined = join(paths, paths[0].with_name(f"a{suffix}"))
+    one, many = load_ensemble([joined]), load_ensemble(paths)
+    assert one.segment_lengths == many.segment_lengths == [20, 40]
+    for a, b in zip(one.segments, many.segments, strict=True):
+        np.testing.assert_allclose(a, b, atol=6e-4 if suffix == ".xtc" else 1e-6)
+    assert one.record["cost"] == many.record["cost"] == {"wall_s": 5.0}
+    assert load_ensemble([joined], lag_ps=2.0).segment_lengths == [20, 40]
+    assert any("2 replicas in one file" in note for note in one.notes)
+    assert find_trajectories(joined.parent) == paths, "nothing is counted twice"
+    assert find_trajectories(joined) == [joined]
+    plain = save(f"b{suffix}", frames, steps(60))
+    assert load_ensemble([plain]).segment_lengths == [60]
+    with pytest.raises(InputError, match="joins 2 replicas"):
+        collect_frames([joined])
+
+
 def test_a_jump_in_time_begins_a_segment(save: Save, frames: np.ndarray) -> None:
     times = np.concatenate([steps(25), steps(35, start=500.0)])
     ensemble = load_ensemble([save("jump.h5", frames, times)])
@@ -184,7 +208,7 @@ def test_shapes_are_checked(alanine_dipeptide: Scene) -> None:
         Ensemble("bad", [np.zeros((5, 21, 3), dtype=np.float32)], 1.0, alanine_dipeptide)
     with pytest.raises(InputError, match="no frames"):
         Ensemble("empty", [], 1.0, alanine_dipeptide)
-    with pytest.raises(InputError, match="state it with `lag_ps"):
+    with pytest.raises(InputError, match="state it with `dt_ps"):
         Ensemble("still", [np.zeros((5, 22, 3), dtype=np.float32)], 0.0, alanine_dipeptide)
     with pytest.raises(InputError, match="do not match the segments"):
         Ensemble("flags", [np.zeros((5, 22, 3), dtype=np.float32)], 1.0, alanine_dipeptide,

@@ -199,7 +199,7 @@ def test_a_file_without_times_needs_the_lag(tmp_path: Path, simulate: Callable[.
     frames = mdtraj.Trajectory(made.segments[0][:], made.scene.to_mdtraj_topology(), time=2.0 * np.arange(30))
     for name in ("a.dcd", "a.pdb"):
         frames.save(str(tmp_path / name))
-        with pytest.raises(InputError, match=r"no usable times; state the time between frames with `lag_ps"):
+        with pytest.raises(InputError, match=r"no usable times; state the time between frames with `dt_ps"):
             load_ensemble([tmp_path / name], template=made.scene)
         assert load_ensemble([tmp_path / name], template=made.scene, lag_ps=2.0).lag_ps == 2.0
 

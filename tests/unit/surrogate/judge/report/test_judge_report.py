@@ -142,7 +142,7 @@ def test_costs_skips_definitions_and_command_are_there(written: tuple[str, dict[
     for text in ("25.9 µs/day", "20 × the reference", "Left out, and why", "Planar rings: the scene has none",
                  "Jensen-Shannon distance", "How to make this report again",
                  "surromd compare r0.h5,r1.h5 &#39;a b.h5&#39;",
-                 "--top ala2.pdb --lag 1ps -o report.html",
+                 "--top ala2.pdb --dt 1ps -o report.html",
                  "100 chunks", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
         assert text in html, text
 

@@ -133,7 +133,7 @@ def test_a_replicate_that_differs_is_not_the_candidates_fault(simulate: Callable
 
 def test_times_that_no_program_meant_are_not_believed() -> None:
     for step in (4.9e-5, 0.04888821):
-        with pytest.raises(InputError, match=r"told nothing .*`lag_ps='1ps"):
+        with pytest.raises(InputError, match=r"told nothing .*`dt_ps='1ps"):
             time_axis("x.dcd", np.arange(20) * step, 20, None)
     assert time_axis("x.dcd", np.arange(20) * 5e-4, 20, None)[0] == pytest.approx(5e-4)
     assert time_axis("x.dcd", np.arange(20) * 4.9e-5, 20, 1.0)[0] == 1.0
