@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from surrogate.data.tensor_checksums import tensor_checksum
 from surrogate.models.interface import Surrogate
 from surrogate.models.registry import architecture
-from surrogate.models.stiff import StiffPlan, StiffTerms
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
@@ -23,7 +22,6 @@ from systems.scene import Scene
 FORMAT = "surromd-weights-1"
 # Settings that are no sizes (an interval in ps) may be as large as this, however small the model.
 _LEAST_SIZE = 1_000_000
-_STIFF = "stiff."
 
 
 @dataclass(frozen=True)
@@ -79,15 +77,13 @@ class TrainingDomain:
 
 @dataclass(frozen=True)
 class Weights:
-    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes; `stiff`: terms
-    that its frames get from the reference (models.stiff), where it has any."""
+    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
 
     model: Surrogate
     domain: TrainingDomain
     provenance: dict[str, Any]
     hash: str
     path: Path
-    stiff: StiffTerms | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,6 @@ class Header:
     config: dict[str, Any]
     domain: TrainingDomain
     provenance: dict[str, Any]
-    stiff: StiffPlan | None = None
 
 
 def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
@@ -116,10 +111,9 @@ def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
 
 def save_weights(
     path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *,
-    stiff: StiffTerms | None = None, half: bool = False,
+    half: bool = False,
 ) -> None:  # fmt: skip
-    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping, but for the
-    numbers of `stiff` terms, which are few."""
+    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
     from safetensors.torch import save_file
 
     header = {
@@ -130,9 +124,6 @@ def save_weights(
     }
     dtype = torch.float16 if half else torch.float32
     tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
-    if stiff is not None:
-        header["stiff"] = asdict(stiff.plan)
-        tensors |= {_STIFF + name: values.float().contiguous() for name, values in stiff.numbers.items()}
     text = json.dumps(header)
     metadata = {"format": FORMAT, "surromd": text, "sha256": tensor_checksum(text, tensors)}
     create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
@@ -194,7 +185,6 @@ def load_weights(path: str | Path) -> Weights:
         model = arch.model(arch.config(header.config))
     except (*UNREADABLE, ArithmeticError, AssertionError, SurromdError) as error:
         raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
-    stiff = _stiff_terms(path, header.stiff, state)
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
@@ -210,16 +200,4 @@ def load_weights(path: str | Path) -> Weights:
         provenance=header.provenance,
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,
-        stiff=stiff,
     )
-
-
-def _stiff_terms(path: Path, plan: StiffPlan | None, state: dict[str, torch.Tensor]) -> StiffTerms | None:
-    """Take the tensors of stiff terms out of a file's. Raises WeightsError where they are not those of its record."""
-    numbers = {name: state.pop(_STIFF + name).double() for name in StiffTerms.NAMES if _STIFF + name in state}
-    if plan is None:
-        return None
-    expected = StiffTerms.NAMES if plan.rows else StiffTerms.NAMES[:1]
-    if sorted(numbers) != sorted(expected) or not all(torch.isfinite(values).all() for values in numbers.values()):
-        raise WeightsError(f"{path} is damaged: its stiff terms are not whole; restore it from a whole copy.")
-    return StiffTerms(plan, numbers)

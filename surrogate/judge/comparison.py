@@ -22,7 +22,6 @@ from surrogate.judge.rows import curves, metrics
 from surrogate.judge.rows.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
 from surrogate.judge.rows.charts import Chart
 from surrogate.judge.rows.curves import Curves
-from surrogate.judge.rows.imposed_rows import imposed_notes
 from surrogate.judge.rows.intervention_rows import intervention_rows
 from surrogate.judge.rows.motion import relaxation_rows
 from surrogate.judge.rows.motion.forecast import find_pairs, forecast_charts
@@ -318,7 +317,7 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
     if samples < remarks.LEAST_FOR_TESTS or left_open.why:
         every = verdict.untested(every, start=bool(left_open.why))
     every = by_group([*every, *(x.row() for x in left_open.excess)])
-    judged = verdict.judge_rows(every, options, account.imposed)
+    judged = verdict.judge_rows(every, options)
     found = verdict.findings(judged)
     truth = trio.reference
     doubts = remarks.doubts(trio, max(correlation, own), left_open.in_words(setting.convergence))
@@ -360,7 +359,6 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
             + (["Equivalent MD time is withheld: it takes a converged reference."] * bool(left_open.why))
             + remarks.unlike(judged, options)
             + copied_from(trio)[1]
-            + imposed_notes(account.label, judged, account.imposed)
         ),
         curves=Curves(
             ramachandran=curves.ramachandran_maps(trio),

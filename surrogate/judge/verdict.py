@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 from surrogate.judge.measure.statistics import holm
-from surrogate.judge.rows.imposed_rows import is_imposed
 from surrogate.judge.rows.rows import UNLIKE_BELOW, Options, Row, Word
 from systems.chemistry import validity
 
@@ -16,7 +15,7 @@ Status = Literal["indistinguishable", "close", "different", "broken", "undecided
 
 _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
-_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0, "imposed": 0}
+_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
 _MENTIONED = 3
 _WITHIN_KEYS = ("phi_given", "torsions_given", "torsion_step", "hydrogen_bond_lifetime")
 _STATE_KEYS = ("phi_given", "torsions_given", "hydrogen_bond_lifetime")
@@ -39,21 +38,17 @@ class Doubts(NamedTuple):
 SURE = Doubts()
 
 
-def judge_rows(rows: Sequence[Row], options: Options, imposed: Collection[str] = ()) -> tuple[Row, ...]:
+def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
     """Return the rows with corrected p-values and a word each.
 
     agrees: no significant difference (5 % over all rows, Holm), and a difference beyond the tolerance would have shown;
     close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
-    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance;
-    imposed: of terms that the candidate's frames were given (systems.imposed), which count for nothing.
+    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
     """
-    given = [is_imposed(row, imposed) for row in rows]
-    corrected = holm(
-        [math.nan if r.kind == "share" or known else r.p_value for r, known in zip(rows, given, strict=True)]
-    )
+    corrected = holm([math.nan if r.kind == "share" else r.p_value for r in rows])
     judged = [
-        replace(row, p_corrected=p, verdict="imposed" if known else _word(row, p, options.significance))
-        for row, p, known in zip(rows, corrected, given, strict=True)
+        replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
+        for row, p in zip(rows, corrected, strict=True)
     ]
     hard = [r.verdict for r in judged if r.kind == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
     worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
@@ -148,7 +143,7 @@ def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
         return "undecided"
     if "differs" in words:
         return "different"
-    statistical = [r.verdict for r in rows if r.kind != "share" and r.verdict != "imposed"]
+    statistical = [r.verdict for r in rows if r.kind != "share"]
     if doubts.short or doubts.start:
         return "undecided"
     if statistical and statistical.count("undecided") > 0.5 * len(statistical):
@@ -187,16 +182,13 @@ def _excess(row: Row) -> float:
 def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, doubts: Doubts = SURE) -> str:
     """Return the verdict in one or two sentences; `compared` is the compared length in words."""
     kind = status(rows, doubts)
-    imposed = sum(r.verdict == "imposed" for r in rows)
-    n = len(rows) - imposed
+    n = len(rows)
     undecided = sum(r.verdict == "undecided" for r in rows)
     worst = "; ".join(found[:_MENTIONED])
     more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
     tail = ""
     if undecided:
         tail = f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
-    if imposed:
-        tail += f" {imposed} more are imposed and left out."
     if kind == "broken":
         return f"Broken: {worst}{more}.{tail}"
     if kind == "different":

@@ -116,11 +116,6 @@ class Surrogate(nn.Module, ABC):
         return 10
 
     @property
-    def imposed(self) -> tuple[str, ...]:
-        """Terms of its frames that it takes from its reference as they are (systems.imposed)."""
-        return ()
-
-    @property
     def knows_bonds(self) -> bool:
         """Whether the model wants a molecule's features of the covalent graph (`Molecule.atoms`)."""
         return False

@@ -45,15 +45,13 @@ class ChunkSampler:
 
     Atoms are in the model's order throughout. `batch` is the most replicas computed at once: None for all, until
     memory runs out, and then half as many, for good. `compile`: the networks are compiled for the first batch drawn;
-    others, such as a single chunk drawn again, go through the plain ones. `stiff`: 'modelled' leaves bonds and angles
-    as the network has them, 'imposed' takes them from the weights' reference, None does what the weights can. Raises
-    InputError for a solver, precision or stiff terms that do not suit the weights, and where there is nothing to
-    compile with.
+    others, such as a single chunk drawn again, go through the plain ones. Raises InputError for a solver or
+    precision that does not suit the weights, and where there is nothing to compile with.
     """
 
     def __init__(
         self, weights: Weights, *, solver_steps: int | None = None, solver: str | None = None, precision: str = "auto",
-        compile: bool = False, stiff: str | None = None,
+        compile: bool = False,
     ) -> None:  # fmt: skip
         model, template = weights.model, weights.domain.scene
         keep_freed_memory()
@@ -63,12 +61,6 @@ class ChunkSampler:
                 f"the solver {solver!r} does not suit {weights.path.name}; "
                 + (f"choose {' or '.join(known)}." if known else "its model has no solver; leave `solver` out.")
             )
-        if stiff == "imposed" and weights.stiff is None:
-            raise InputError(
-                f"{weights.path.name} holds no stiff terms of its reference to impose; leave `stiff` out, or train "
-                "with training.stiff = 'drawn'."
-            )
-        self._stiff = None if stiff == "modelled" else weights.stiff
         self.solver = solver or (known[0] if known else None)
         self.solver_steps = solver_steps or model.usual_steps
         self.precision = choose_precision(precision, suits=model.bf16_by_default)
@@ -92,12 +84,6 @@ class ChunkSampler:
     def n_new(self) -> int:
         """Frames in a chunk."""
         return self._model.n_new
-
-    @property
-    def imposed(self) -> tuple[str, ...]:
-        """Terms of its frames that come from the reference and not from the network (systems.imposed)."""
-        own: tuple[str, ...] = self._model.imposed
-        return own if self._stiff is None else tuple(dict.fromkeys((*own, *self._stiff.imposed)))
 
     @property
     def evaluations_per_chunk(self) -> float:
@@ -171,8 +157,7 @@ class ChunkSampler:
         usual = self.solver_steps if self._model.solvers else 1
         self.drawn += len(seeds)
         self.evaluations += len(seeds) * (usual if chunk.evaluations is None else chunk.evaluations)
-        frames = chunk.frames_nm if self._stiff is None else self._stiff.apply(chunk.frames_nm, seeds)
-        moved = frames.double().numpy() - translation[:, None, None, :]
+        moved = chunk.frames_nm.double().numpy() - translation[:, None, None, :]
         ends = None
         if chunk.velocities_nm_ps is not None:
             ends = np.einsum("rji,rnj->rni", rotation, chunk.velocities_nm_ps.double().numpy()).astype(kind)

@@ -39,9 +39,6 @@ class RolloutConfig:
     )
     energy_every: int = option("Interval of energy checks with OpenMM, in frames; 0 for none.", 0, within=(0, None))
     md_between_ps: float = option("Length of MD with OpenMM after each chunk.", 0.0, within=(0.0, None))
-    stiff: str | None = option(
-        "Bonds and angles.", None, choices=("modelled", "imposed"), unset="imposed, where the weights know how"
-    )
     select: str | None = option("Atoms to save, as an MDTraj selection: 'backbone'.", None)
     atoms: str = option("Save all atoms or heavy atoms only.", "all", choices=("all", "heavy"))
     force: bool = option("Roll out scenes outside the training domain; frames are flagged.", False)

@@ -19,7 +19,6 @@ from surrogate.sampling.interventions import Chunk
 from surrogate.sampling.rollout_account import Tally
 from surrogate.sampling.rollout_checkpoint import Progress
 from surrogate.sampling.rollout_plan import Plan
-from systems.imposed import KEY
 from systems.trajectory.base import TrajectoryWriter
 from systems.units import format_time_ps
 
@@ -49,8 +48,6 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
         **weights.domain.conditions,
         "interventions": _interventions(plan, Tally(), {}, checks),
     }
-    if sampler.imposed:
-        record[KEY] = list(sampler.imposed)
     if not plan.match.seen:
         record["unseen_molecule"] = True
     if plan.match.deviations:

@@ -76,7 +76,7 @@ def settle_plan(
         "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
     }
     del settings["time_ps"]  # a rollout may be resumed to become longer
-    for key in ("lag_ps", "compile", "stiff", "friction_per_ps", "timestep_ps", "ensemble", "anneal_ps"):
+    for key in ("lag_ps", "compile", "friction_per_ps", "timestep_ps", "ensemble", "anneal_ps"):
         if settings[key] in (None, False):
             del settings[key]  # as checkpoints of earlier versions have it
     return Plan(

@@ -102,7 +102,6 @@ def rollout(
         solver=config.solver,
         precision=precision,
         compile=config.compile,
-        stiff=config.stiff,
     )
     plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     checks = Guard(weights.domain)

@@ -216,7 +216,6 @@ def _weights(path: Path) -> dict[str, Any]:
         "lag_ps": weights.domain.lag_ps,
         "longest_lag_ps": weights.domain.longest_lag_ps,
         "conditions": weights.domain.conditions,
-        **({} if weights.stiff is None else {"imposed": list(weights.stiff.imposed)}),
         "config": weights.model.config.to_dict(),
         "provenance": weights.provenance,
         "size_mb": path.stat().st_size / 1e6,

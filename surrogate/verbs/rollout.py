@@ -33,9 +33,7 @@ def rollout(
     run in one batch, are named as by `reference` and joined as there. `solver`: 'multistep', 'fitted' (for few
     `solver_steps`, 2 to 10), 'euler' or the adaptive 'dopri5', None for the one that suits the weights. `precision`:
     'fp32', 'bf16' or 'auto'. `compile`: the networks, by torch; it takes a C++ compiler and about a minute, and pays in
-    long rollouts. `stiff`: bonds and angles 'modelled' by the network, or 'imposed': rigid bonds as long as the
-    reference's, the width of the others drawn given the torsions, as far as the weights hold that; None imposes what
-    they hold. The record names imposed terms (`imposed`), and `compare` leaves them out of its verdict.
+    long rollouts.
 
     Every frame is checked as it is made against what the training reference does. `guard` says what is done about one
     that fails: 'flag' marks it, 'resample' draws the chunk again, 'repair' relaxes it with OpenMM, 'fallback' runs real

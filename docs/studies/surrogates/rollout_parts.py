@@ -22,7 +22,6 @@ from surrogate.bench.machine import machine_facts
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
 from surrogate.models.interface import draw_noise
-from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.guards import Guard
@@ -44,10 +43,10 @@ def parts(name: str, batch: int, rounds: int, precision: str, folder: Path) -> d
     """Return ms a frame of each part. Raises TypeError for weights of another model than LaM-SLidE."""
     weights = load_weights(weights_path(name))
     sampler, guard, scene = ChunkSampler(weights, precision=precision), Guard(weights.domain), weights.domain.scene
-    model, stiff = sampler._model, weights.stiff
+    model = sampler._model
     if not isinstance(model, LamSlide):
         raise TypeError(f"{name} are weights of {weights.model.arch}; parts are known of lam-slide.")
-    c, seeds = model.config.approximator, list(range(batch))
+    seeds = list(range(batch))
     last = scene.positions_nm[None, None].repeat(batch, axis=0)
     drawn = sampler.draw(last, seeds).frames_nm
     posed = torch.from_numpy(last.astype(np.float32))
@@ -56,21 +55,15 @@ def parts(name: str, batch: int, rounds: int, precision: str, folder: Path) -> d
     found: dict[str, float] = {}
     with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=sampler.precision.bf16):
         known, tau = model.encode(posed, elements), torch.full((1,), 0.5)
-        kind = model.approximator.draw_kinds(known, noise)
-        latents = model.approximator(noise, tau, known, None, kind)[:, model.n_conditioning :]
+        latents = model.approximator(noise, tau, known)[:, model.n_conditioning :]
         calls: dict[str, Callable[[], object]] = {
-            "network, one evaluation": lambda: model.approximator(noise, tau, known, None, kind),
+            "network, one evaluation": lambda: model.approximator(noise, tau, known),
             "encoder": lambda: model.encode(posed, elements),
             "decoder": lambda: model.decode(latents, scene.n_atoms),
             "canonical pose": lambda: superposition(last[:, -1], sampler._target, idx=sampler._fit),
             "noise": lambda: draw_noise(model, scene.n_atoms, [torch.Generator().manual_seed(s) for s in seeds]),
             "guards": lambda: guard.check(drawn, last[:, -1]),
         }
-        if stiff is not None:
-            calls["stiff terms"] = lambda: stiff.apply(torch.from_numpy(drawn), seeds)
-        if c.rare_kinds:
-            windows = np.concatenate([last, drawn], axis=1).astype(np.float32)
-            calls["kinds of windows"] = lambda: kinds_of_windows(windows, c.rare_kinds)
         for what, call in calls.items():
             found[what] = least_ms(call, rounds)
     with open_writer(folder / "parts.h5", scene, {}) as writer:

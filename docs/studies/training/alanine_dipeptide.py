@@ -70,7 +70,7 @@ def train(folder: Path, budget_s: float) -> Path:
     """Train both stages, a fifth of the budget for the first, and write `model.safetensors`."""
     out = folder / "model.safetensors"
     if not is_trained(out):
-        config = TrainingConfig(budget_s=budget_s, time_reversal=True, stiff="modelled")
+        config = TrainingConfig(budget_s=budget_s, time_reversal=True)
         with training_bar("alanine dipeptide") as report:
             train_lam_slide(training_frames(folder), out, MODEL, config, resume=True, progress=report)
     return out

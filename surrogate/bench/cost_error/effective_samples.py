@@ -81,7 +81,7 @@ def training_cost(weights: Weights, md_s_per_ns: float) -> dict[str, float | Non
         for key in ("stage_one_s", "stage_two_s", "spent_s", "training_s"):
             if isinstance(record.get(key), int | float):
                 seconds, known = seconds + float(record[key]), True
-        for source in (*record.get("sources", ()), *record.get("stiff_terms", {}).get("sources", ())):
+        for source in record.get("sources", ()):
             frames[str(source.get("sha256"))] = int(source.get("n_frames", 0))
         record = record.get("from")
     simulated_ns = 1e-3 * sum(frames.values()) * weights.domain.lag_ps

@@ -13,8 +13,6 @@ import numpy.typing as npt
 from surrogate.judge.read.common_atoms import Match, match_scenes, solute_atoms
 from surrogate.judge.read.stored_frames import StoredFrames, bond_tree
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
-from systems.imposed import KEY as IMPOSED
-from systems.imposed import imposed_terms
 from systems.scene import Scene
 from systems.selection import part_of
 from systems.trajectory.base import TrajectoryReader
@@ -160,6 +158,4 @@ def merged_record(records: Sequence[dict[str, Any]], label: str, notes: list[str
         shared = set.intersection(*(set(c) for c in costs))
         numbers = sorted(k for k in shared if all(isinstance(c[k], (int, float)) for c in costs))
         merged["cost"] = {k: sum(c[k] for c in costs) for k in numbers}
-    if imposed := dict.fromkeys(term for r in records for term in imposed_terms(r)):
-        merged[IMPOSED] = list(imposed)
     return merged

@@ -172,9 +172,7 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Words",
         "agrees: no significant difference, and one as large as the tolerance would have shown. close: significant, "
         "but within the tolerance. differs: significant and beyond the tolerance. fails: cannot be computed where the "
-        "reference can, or a validity check missed tenfold. undecided: error bars wider than the tolerance. "
-        "imposed: bonds or angles that the candidate's file says were taken from its training reference: shown, not "
-        "judged.",
+        "reference can, or a validity check missed tenfold. undecided: error bars wider than the tolerance.",
         "",
     ),
 )

@@ -10,7 +10,7 @@ from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.rows.rows import Row
 from systems.units import format_time_ps
 
-MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?", "imposed": "="}
+MARKS = {"agrees": "✓", "close": "≈", "differs": "✗", "fails": "‼", "undecided": "?"}
 STATUS_MARKS = {"indistinguishable": "✓", "close": "≈", "different": "✗", "broken": "‼", "undecided": "?"}
 GROUP_TITLES = {
     "validity": "Validity of frames",
@@ -22,7 +22,7 @@ GROUP_TITLES = {
     "experiment": "To lay beside experiment",
     "energies": "Energies",
 }
-_SEVERITY = ("agrees", "imposed", "undecided", "close", "differs", "fails")
+_SEVERITY = ("agrees", "undecided", "close", "differs", "fails")
 _UNITS = {"_per_ps": "/ps", "_k": "K", "_ps": "ps", "_da": "Da", "_nm": "nm", "_s": "s"}
 
 

@@ -13,7 +13,6 @@ from surrogate.judge.rows import metrics
 from surrogate.judge.rows.rows import Sample
 from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
-from systems.imposed import imposed_terms
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Account:
 
     `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
     `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds
-    no cost; `imposed` are terms that no model made (systems.imposed).
+    no cost.
     """
 
     label: str
@@ -37,7 +36,6 @@ class Account:
     wall_s: float | None
     ns_per_day: float | None
     cost: dict[str, Any]
-    imposed: tuple[str, ...] = ()
     length: str = ""
 
 
@@ -89,7 +87,6 @@ def account_of(ensemble: Ensemble) -> Account:
         wall_s=wall_s,
         ns_per_day=None if wall_s is None else ensemble.total_ps * 1e-3 * 86_400.0 / wall_s,
         cost=dict(cost),
-        imposed=imposed_terms(record),
         length=ensemble.length_words,
     )
 

@@ -28,7 +28,7 @@ from systems.units import format_time_ps
 FloatArray = npt.NDArray[np.float64]
 Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
 Kind = Literal["share", "distance", "observable"]
-Word = Literal["agrees", "close", "differs", "fails", "undecided", "imposed"]
+Word = Literal["agrees", "close", "differs", "fails", "undecided"]
 
 # A replicate this unlikely to be of one simulation with the reference does not speak for it.
 UNLIKE_BELOW = 1e-3

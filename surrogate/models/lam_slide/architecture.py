@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from surrogate.models.architecture import Architecture, Suitability, Survey
-from surrogate.models.lam_slide.config import of_weights
+from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.model import LamSlide
 
 if TYPE_CHECKING:
@@ -22,4 +22,4 @@ def _suits(survey: Survey) -> Suitability | None:
     return Suitability(0, "one molecule") if survey.one_molecule else None
 
 
-LAM_SLIDE = Architecture("lam-slide", of_weights, LamSlide, _trainer, _suits)
+LAM_SLIDE = Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, _trainer, _suits)

@@ -5,18 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from surrogate.data.rarity import rare_kinds
 from surrogate.data.references import References
 from surrogate.data.weights import load_weights, read_header
-from surrogate.models.architecture import Survey
-from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig, of_weights
+from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
 
-# Frames from which on rare states are weighted in a further training: fewer do not tell how often they come.
-_FRAMES_FOR_RARE = 50_000
-_RARE_DRAWS = 0.3
 _SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
 
@@ -35,9 +30,7 @@ class LamSlideTrainer(Trainer):
     def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
         """See `Trainer.choose`."""
         survey, found = references.survey, list[Choice]()
-        if request.start_from is not None:
-            found = _rare_states(references, survey, self.settings(request).model)
-        else:
+        if request.start_from is None:
             default = AutoencoderConfig.identifier_pool
             pool = request.model.get("autoencoder", {}).get("identifier_pool", default)
             if (n := survey.scenes[0].n_atoms) > pool:
@@ -49,7 +42,7 @@ class LamSlideTrainer(Trainer):
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""
         if request.start_from is not None:
-            model = of_weights(read_header(request.start_from).config)
+            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
         else:
             model = LamSlideConfig.from_dict(request.model)
         steps, first = request.steps, None
@@ -95,19 +88,3 @@ def _is_set(key: str, request: TrainingRequest) -> bool:
             return False
         found = found[name]
     return True
-
-
-def _rare_states(references: References, survey: Survey, model: LamSlideConfig) -> list[Choice]:
-    """Return how rare states are weighted in a further training of one molecule at one lag, where it shows any."""
-    told = model.approximator
-    if told.lag_range_ps or survey.n_frames < _FRAMES_FOR_RARE or not survey.one_molecule:
-        return []
-    try:
-        n = len(rare_kinds(references.frames(canonical=model.canonical), told.chunk_frames))
-    except InputError:
-        return []
-    why = f"{n} kinds of rare windows in {survey.n_frames} frames"
-    return [
-        Choice("training.rare_kinds", True, f"{why}, known to the network"),
-        Choice("training.rare_draws", _RARE_DRAWS, "rare windows drawn more often, each weighted down by as much"),
-    ]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from surrogate.models.lam_slide.kinds import Kind
 from surrogate.models.settings import build
 from systems.errors import InputError
 
@@ -62,21 +61,10 @@ class ApproximatorConfig:
     auxiliary_frames: int = 4
     # Shortest and longest spacing of frames, in ps: the network is told which it is asked for. None: one spacing alone.
     lag_range_ps: tuple[float, float] | None = None
-    # Kinds of rare windows that the network is told of and a head gives the odds of (data.rarity).
-    rare_kinds: tuple[Kind, ...] = ()
 
     def __post_init__(self) -> None:
         if self.loss_on_given and self.clean_conditioning:
             raise InputError("approximator.loss_on_given: with clean_conditioning given frames come back as they are.")
-
-    @property
-    def n_kinds(self) -> int:
-        return len(self.rare_kinds)
-
-
-# Settings that weights of earlier versions carry and that no model has any more, whole and of each stage.
-_RETIRED = {"": ("graph", "atoms", "hydrogens", "entities", "hydrogen_plan", "residues"),
-            "autoencoder": ("frame_weight", "torsion_weight"), "approximator": ("frame_weight",)}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -96,15 +84,3 @@ class LamSlideConfig:
     def from_dict(record: dict[str, Any]) -> LamSlideConfig:
         """Raises InputError for an unknown key, naming the nearest."""
         return build(LamSlideConfig, record)
-
-
-def of_weights(record: dict[str, Any]) -> LamSlideConfig:
-    """Return the configuration that a weights file carries, without what earlier versions kept there and did not use.
-    Raises InputError where it used it."""
-    if record.get("graph") or record.get("hydrogen_plan") or record.get("residues"):
-        raise InputError("these weights know atoms by their bonds, or place hydrogens; this version does neither.")
-    kept = {k: v for k, v in record.items() if k not in _RETIRED[""]}
-    for stage in ("autoencoder", "approximator"):
-        if isinstance(kept.get(stage), dict):
-            kept[stage] = {k: v for k, v in kept[stage].items() if k not in _RETIRED[stage]}
-    return LamSlideConfig.from_dict(kept)

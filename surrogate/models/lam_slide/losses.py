@@ -65,16 +65,12 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
 class FlowWindows:
     """A batch of windows of one molecule as stage two sees them: clean `latents (b, T, L, dim)` of `n_atoms` atoms.
 
-    `lag`: see `LamSlide.embedded_lag`. `importance (b,)`: what each window counts (data.rarity); None is one each. With
-    the `kind (b,)` of each window it counts in the cross entropy of the kinds alone: the network is told the kind, and
-    within a kind draws are plain.
+    `lag`: see `LamSlide.embedded_lag`.
     """
 
     latents: Tensor
     n_atoms: int
     lag: Tensor | None = None
-    importance: Tensor | None = None
-    kind: Tensor | None = None
 
 
 def flow_loss(
@@ -88,25 +84,19 @@ def flow_loss(
     decoder's own error is not charged to the approximator.
     """
     c = model.config.approximator
-    latents, importance, kind = windows.latents, windows.importance, windows.kind
+    latents = windows.latents
     known = latents[:, : c.n_conditioning]
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
     noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, kind=kind, lag=windows.lag)[:, first:]
+    prediction = model.approximator(noisy, tau, known, lag=windows.lag)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
         weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
-    if importance is not None and kind is None:
-        weight = weight * importance
     loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
     terms = {"flow": loss.detach()}
-    if kind is not None:
-        each = F.cross_entropy(model.approximator.kind_logits(known), kind, reduction="none")
-        odds = each.mean() if importance is None else (each * importance).mean()
-        loss, terms["kind"] = loss + odds, odds.detach()
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from typing import ClassVar
 
 import torch
@@ -13,14 +12,8 @@ from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.autoencoder import Autoencoder
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.further_noise import REDRAWS, generators
-from surrogate.models.lam_slide.kinds import kinds_of_windows
 from surrogate.models.lam_slide.transformer import Approximator
 from systems.errors import InputError
-
-# Redraws of a chunk that is not of the kind that was drawn. Kinds that a network hardly follows would cost as much
-# as all others.
-MAX_REDRAWS = 12
 
 
 class LamSlide(Surrogate):
@@ -31,7 +24,7 @@ class LamSlide(Surrogate):
     """
 
     arch: ClassVar[str] = "lam-slide"
-    float32_layers: tuple[str, ...] = ("autoencoder.to_position", "approximator.odds")
+    float32_layers: tuple[str, ...] = ("autoencoder.to_position",)
     config: LamSlideConfig
     latent_mean: Tensor
     latent_scale: Tensor
@@ -117,43 +110,14 @@ class LamSlide(Surrogate):
         c = self.config.approximator
         known = self.encode(last_frames_nm, molecule.elements)
         lag = self.embedded_lag(None, len(known))
-        kind = self.approximator.draw_kinds(known, noise)
-        evaluations = 0.0
+        memory = self.approximator.remember(known, lag) if c.clean_conditioning else None
+        evaluations = 0
 
-        def solve(rows: Tensor, noise: Tensor) -> Tensor:
-            told = None if kind is None else kind[rows]
-            before = known[rows]
-            of_lag = None if lag is None else lag[rows]
-            memory = self.approximator.remember(before, of_lag) if c.clean_conditioning else None
+        def predict(o: Tensor, tau: Tensor) -> Tensor:
+            nonlocal evaluations
+            evaluations += 1
+            return self.approximator(o, tau, known, memory, lag)
 
-            def predict(o: Tensor, tau: Tensor) -> Tensor:
-                nonlocal evaluations
-                evaluations += len(rows) / len(known)
-                return self.approximator(o, tau, before, memory, told, of_lag)
-
-            latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
-            return self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
-
-        frames = solve(torch.arange(len(noise), device=noise.device), noise)
-        if kind is not None:
-            self._hold_to_kinds(frames, last_frames_nm, kind, noise, solve)
-        return Chunk(frames, evaluations=evaluations)
-
-    def _hold_to_kinds(self, frames: Tensor, last_frames_nm: Tensor, kind: Tensor, noise: Tensor,
-                       solve: Callable[[Tensor, Tensor], Tensor]) -> None:  # fmt: skip
-        """Draw the rows of `frames` (b, n_new, n_atoms, 3) that are not of their `kind` again, up to MAX_REDRAWS times.
-
-        What remains of each kind is a plain draw given that kind (rejection sampling), so that rare states are entered
-        and left as often as the odds say, however loosely the network follows what it was told.
-        """
-        kinds = self.config.approximator.rare_kinds
-        rows = torch.arange(len(frames), device=frames.device)
-        for attempt in range(MAX_REDRAWS + 1):
-            windows = torch.cat([last_frames_nm[rows].to(frames.dtype), frames[rows]], dim=1).float().cpu().numpy()
-            wrong = torch.from_numpy(kinds_of_windows(windows, kinds)).to(kind.device) != kind[rows]
-            rows = rows[wrong]
-            if attempt == MAX_REDRAWS or not len(rows):
-                return
-            drawn = generators(noise[rows], REDRAWS, attempt)
-            fresh = torch.stack([torch.randn(noise.shape[1:], generator=g) for g in drawn]).to(noise)
-            frames[rows] = solve(rows, fresh).to(frames.dtype)
+        latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
+        frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
+        return Chunk(frames, evaluations=float(evaluations))

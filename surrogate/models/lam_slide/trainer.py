@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.features.stiff_terms import LOOKED_AT, drawn_terms, rigid_terms
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
 from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
@@ -23,7 +20,6 @@ from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, dra
 from surrogate.models.lam_slide.model import LamSlide
 from surrogate.models.lam_slide.subjects import Subject, normalise_latents
 from surrogate.models.precision import bf16_pays
-from surrogate.models.stiff import StiffTerms
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from surrogate.training.provenance import provenance_of, training_domain
@@ -57,20 +53,8 @@ class TrainingConfig:
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
     # reversibility), and each rare event then shows how it begins and how it ends.
     time_reversal: bool = False
-    # Share of stage two's windows drawn for a rare state they show, weighted down by as much (data.rarity); 0 is plain.
-    rare_draws: float = 0.0
-    # Tell the network which rare state a window visits, and learn the odds of each kind by themselves: rare windows
-    # then count as much as others and yet come as often as they should.
-    rare_kinds: bool = False
     # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
     longest_lag_ps: float | None = None
-    # What rollouts take from the reference (models.stiff): 'held', the bonds that it holds rigid; 'drawn', the width of
-    # its other bonds and of its angles too; 'modelled', nothing.
-    stiff: str = "held"
-
-    def __post_init__(self) -> None:
-        if self.stiff not in ("held", "drawn", "modelled"):
-            raise InputError(f"training.stiff = {self.stiff!r} is unknown; choose held, drawn or modelled.")
 
     def stages(self, *, with_autoencoder: bool = True) -> tuple[StageConfig, StageConfig]:
         """Return both stages; stage two gets the whole budget where there is no autoencoder to train."""
@@ -106,11 +90,7 @@ def train_lam_slide(
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
-    stiff = _stiff_terms(frames, config, start)
     model_config = _settle(frames, model_config, config)
-    length = model_config.approximator.chunk_frames
-    told_of = model_config.approximator.rare_kinds
-    kinds = window_kinds(frames, told_of, length) if told_of else None
     strides = _strides(frames, model_config)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
@@ -122,7 +102,7 @@ def train_lam_slide(
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
     places = [StagePlace(state, log_path, device, resume) for state in states]
-    shown = _Shown(model, subject, kinds, strides)
+    shown = _Shown(model, subject, strides)
     one, two = config.stages(with_autoencoder=start is None)
     spent_one = 0.0
     if start is None:
@@ -130,17 +110,13 @@ def train_lam_slide(
         normalise_latents(model, subject, config.seed)
     else:
         _check_start(start, frames, model_config)
-        _take_over(model, start)
-    if kinds is not None and (start is None or not start.model.config.approximator.rare_kinds):
-        own = frames.window_starts(length, validation=False)
-        model.approximator.set_odds(np.bincount(kinds[own], minlength=len(told_of) + 1) / len(own))
-
+        model.load_state_dict(start.model.state_dict())
     domain = training_domain(frames, strides=strides if len(strides) > 1 else ())
     origin = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
 
     def write(spent_s: float) -> None:
         settings = _told(config) | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
-        save_weights(out, model, domain, provenance_of(origin, settings, start), stiff=stiff)
+        save_weights(out, model, domain, provenance_of(origin, settings, start))
 
     spent_two = _stage_two(shown, config, two, places[1], progress, write)
     if is_first_process():
@@ -161,19 +137,7 @@ def _settle(frames: TrainingFrames, model_config: LamSlideConfig, config: Traini
     told = model_config.approximator
     if config.longest_lag_ps is not None:
         told = replace(told, lag_range_ps=(frames.lag_ps, config.longest_lag_ps))
-    if told.lag_range_ps and (config.rare_draws or config.rare_kinds or told.rare_kinds):
-        raise InputError("rare windows are told of one molecule at one lag; leave rare_draws and rare_kinds out.")
-    if config.rare_kinds and not told.rare_kinds:
-        told = replace(told, rare_kinds=rare_kinds(frames, told.chunk_frames))
     return replace(model_config, approximator=told)
-
-
-def _stiff_terms(frames: TrainingFrames, config: TrainingConfig, start: Weights | None) -> StiffTerms | None:
-    """Return the stiff terms that the weights are to have: drawn where they are asked for, or were before."""
-    before = None if start is None else start.stiff
-    if config.stiff == "drawn" or (before is not None and before.plan.rows):
-        return drawn_terms(frames)
-    return rigid_terms(frames.scene, frames.some_nm(LOOKED_AT)) if config.stiff == "held" else None
 
 
 def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
@@ -195,12 +159,10 @@ def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int,
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """What both stages are shown. `kinds` (n_frames,) of the windows from each frame on (data.rarity), where the
-    network is told; `strides` that windows are drawn with."""
+    """What both stages are shown; `strides` that windows are drawn with."""
 
     model: LamSlide
     subject: Subject
-    kinds: npt.NDArray[np.int64] | None
     strides: tuple[int, ...]
 
 
@@ -236,12 +198,11 @@ def _stage_two(
     shown: _Shown, config: TrainingConfig, stage: StageConfig, place: StagePlace, progress: ProgressFn | None,
     write: Callable[[float], None],
 ) -> float:  # fmt: skip
-    model, subject, kinds, strides = shown.model, shown.subject, shown.kinds, shown.strides
+    model, subject, strides = shown.model, shown.subject, shown.strides
     length, device = model.config.approximator.chunk_frames, model.latent_mean.device
     if len(strides) > 1:
         wide = StrideSampler.of(subject.frames, length, strides)
-    else:
-        plain = window_sampler(subject.frames, length, config.rare_draws, kinds)
+    starts = torch.from_numpy(subject.frames.window_starts(length, validation=False))
     model.autoencoder.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
@@ -250,24 +211,24 @@ def _stage_two(
     if model.canonical and 4 * subject.frames.n_frames * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
         subject.keep_latents(model)
 
-    def loss_of(idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator,
-                **more: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
+    def loss_of(
+        idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         latents = subject.windows(model, idx, generator)
         lag = model.embedded_lag(None if stride is None else (stride * subject.frames.lag_ps).to(device), len(idx))
-        return flow_loss(model, FlowWindows(latents, subject.n_atoms, lag, **more), tau, generator)
+        return flow_loss(model, FlowWindows(latents, subject.n_atoms, lag), tau, generator)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        importance = kind = stride = None
+        stride = None
         if len(strides) > 1:
             first, stride = wide.draw(stage.batch, generator)
         else:
-            first, importance, kind = plain.draw(stage.batch, generator)
+            first = starts[torch.randint(len(starts), (stage.batch,), generator=generator)]
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
-        weight = None if importance is None else importance.to(device)
-        return loss_of(idx, stride, tau, generator, importance=weight, kind=None if kind is None else kind.to(device))
+        return loss_of(idx, stride, tau, generator)
 
-    held, held_stride, held_kind = _held_windows(subject, length, strides, kinds)
+    held, held_stride = _held_windows(subject, length, strides)
     with_bf16 = stage.bf16 and bf16_pays(device.type)
 
     @torch.no_grad()
@@ -276,8 +237,7 @@ def _stage_two(
         generator = torch.Generator().manual_seed(0)
         tau = draw_flow_times(model, len(held), generator).to(device)
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=with_bf16):
-            _, terms = loss_of(held, held_stride, tau, generator,
-                               kind=None if held_kind is None else held_kind.to(device))  # fmt: skip
+            _, terms = loss_of(held, held_stride, tau, generator)
         return {f"validation_{key}": float(value) for key, value in terms.items()}
 
     next_snapshot = [config.snapshot_every_s or float("inf")]
@@ -292,26 +252,21 @@ def _stage_two(
     return run_stage(model.approximator, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
 
 
-def _held_windows(
-    subject: Subject, length: int, strides: tuple[int, ...], kinds: npt.NDArray[np.int64] | None
-) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Return up to 256 held-out windows, evenly spaced, as frames `(b, length)`, their strides and kinds."""
+def _held_windows(subject: Subject, length: int, strides: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
+    """Return up to 256 held-out windows, evenly spaced, as frames `(b, length)`, and their strides."""
     if len(strides) > 1:
         sampler = StrideSampler.of(subject.frames, length, strides, validation=True)
         first, stride = sampler.draw(256, torch.Generator().manual_seed(0))
-        return first[:, None] + torch.arange(length) * stride[:, None], stride, None
+        return first[:, None] + torch.arange(length) * stride[:, None], stride
     held = torch.from_numpy(subject.frames.window_starts(length, validation=True))
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
-    return held[:, None] + torch.arange(length), None, None if kinds is None else torch.from_numpy(kinds)[held]
+    return held[:, None] + torch.arange(length), None
 
 
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
     """Refuse (InputError) to go on from weights of another molecule, frame spacing or configuration."""
     name, of = start.path.name, start.domain
-    # Weights that know no kinds may learn them.
-    told = start.model.config.approximator.rare_kinds or model_config.approximator.rare_kinds
-    same = replace(start.model.config, approximator=replace(start.model.config.approximator, rare_kinds=told))
-    if same != model_config:
+    if start.model.config != model_config:
         raise InputError(f"{name} has another configuration; a training goes on with the one it began with.")
     if of.scene.topology_hash != frames.scene.topology_hash:
         raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
@@ -319,17 +274,9 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
 
 
-def _take_over(model: LamSlide, start: Weights) -> None:
-    """Load the tensors of `start`; what tells rare kinds may be new."""
-    missing, surplus = model.load_state_dict(start.model.state_dict(), strict=False)
-    assert not surplus and all(name.startswith(("approximator.embed_kind", "approximator.odds")) for name in missing)
-
-
 def _told(config: TrainingConfig) -> dict[str, Any]:
     """Return what the weights' provenance says of the settings."""
     return {
         "seed": config.seed,
         "time_reversal": config.time_reversal,
-        "rare_draws": config.rare_draws,
-        "rare_kinds": config.rare_kinds,
     }

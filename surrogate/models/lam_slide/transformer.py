@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -85,13 +83,6 @@ class Approximator(nn.Module):
         self.final_modulation = nn.Linear(c.width, 2 * c.width)
         self.final = nn.Linear(c.width, latent_dim)
         self.embed_lag = None if c.lag_range_ps is None else LagEmbedding(c.width, c.lag_range_ps)
-        if c.n_kinds:
-            if c.n_conditioning < 1:
-                raise InputError("rare_kinds need a conditioning frame, from which the odds of each kind follow.")
-            self.embed_kind = nn.Embedding(c.n_kinds + 1, c.width)
-            nn.init.zeros_(self.embed_kind.weight)
-            n_in = c.n_conditioning * n_latents * latent_dim
-            self.odds = nn.Sequential(nn.Linear(n_in, c.width), nn.SiLU(), nn.Linear(c.width, c.n_kinds + 1))
         for module in (self.modulation, self.final_modulation, self.final):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
@@ -101,52 +92,24 @@ class Approximator(nn.Module):
             self.register_buffer(f"cos_{name}", angles.cos(), persistent=False)
             self.register_buffer(f"sin_{name}", angles.sin(), persistent=False)
 
-    @torch.no_grad()
-    def set_odds(self, shares: Sequence[float] | npt.NDArray[np.float64]) -> None:
-        """Begin with the same odds `shares` (n_kinds + 1,) after every frame."""
-        last = self.odds[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        last.bias.copy_(torch.tensor(shares).clamp(min=1e-9).log())
-
-    def kind_logits(self, conditioning: Tensor) -> Tensor:
-        """Return the log-odds `(b, n_kinds + 1)` of the kinds of window that may follow; 0 is the ordinary one."""
-        with torch.autocast(conditioning.device.type, enabled=False):
-            logits: Tensor = self.odds(conditioning.flatten(1).float())
-        return logits
-
-    def draw_kinds(self, conditioning: Tensor, noise: Tensor) -> Tensor | None:
-        """Return the kind `(b,)` of each window, drawn from its odds by a number of `noise` that nothing else uses.
-
-        The noise `(b, T, L, dim)` of the conditioning frames is replaced by their clean latents. None without kinds.
-        """
-        if not self.config.n_kinds:
-            return None
-        uniform = torch.special.ndtr(noise[:, 0, 0, 0].double())
-        upper = self.kind_logits(conditioning).double().softmax(-1).cumsum(-1)
-        return (uniform[:, None] >= upper).sum(-1).clamp(max=self.config.n_kinds)
-
     def forward(
-        self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, kind: Tensor | None = None,
-        lag: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+        self, o: Tensor, tau: Tensor, conditioning: Tensor, memory: Memory | None = None, lag: Tensor | None = None
+    ) -> Tensor:
         """Return the predicted data `(b, T, L, dim)`.
 
         `o` (b, T, L, dim) noisy latents, `tau` (b,), `conditioning` (b, n_conditioning, L, dim) clean latents of the
         first frames. The first frames of `o` carry no information: they are replaced by the clean ones. With
         `clean_conditioning` they come back as they are, and `memory` is what `remember` said of them, so that the
-        evaluations of one chunk compute it once. `kind` (b,) of each window, for a network that knows kinds; `lag`
-        (b, width), the embedded lag, for one that takes it.
+        evaluations of one chunk compute it once. `lag` (b, width): the embedded lag, for a network that takes it.
         """
         c = self.config
-        of_kind = None if kind is None else self.embed_kind(kind)[:, None, None, :]
         time = self.embed_time(tau) if lag is None else self.embed_time(tau) + lag
         if c.clean_conditioning:
             known = self.remember(conditioning, lag) if memory is None else memory
             n_known = conditioning.shape[1]
-            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, time, known, n_known, of_kind))
+            found = self._denoise(o[:, n_known:], tau, lambda x: self._network_after(x, time, known, n_known))
             return torch.cat([conditioning.to(found.dtype), found], dim=1)
-        return self._denoise(o, tau, lambda x: self._network(x, time, conditioning, of_kind))
+        return self._denoise(o, tau, lambda x: self._network(x, time, conditioning))
 
     def remember(self, conditioning: Tensor, lag: Tensor | None = None) -> Memory:
         """Return keys and values of clean frames `(b, n_conditioning, L, dim)`, which see each other alone and no flow
@@ -168,7 +131,7 @@ class Approximator(nn.Module):
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, c.interpolant))
         return skip * o + out * network(o * scale_in)
 
-    def _network(self, o: Tensor, time: Tensor, conditioning: Tensor, of_kind: Tensor | None) -> Tensor:
+    def _network(self, o: Tensor, time: Tensor, conditioning: Tensor) -> Tensor:
         shape = o.shape
         o, conditioning = self._tokens(o), self._tokens(conditioning)
         n_known, n_frames = conditioning.shape[1], o.shape[1]
@@ -178,13 +141,10 @@ class Approximator(nn.Module):
         noisy = torch.where(known[None, :, None, None] == 1, 0.0, o)
         h = self.embed_noisy(noisy) + self.embed_conditioning(padded)
         h = h + self.embed_mask(known)[None, :, None, :] + self.embed_latent
-        h = h if of_kind is None else h + of_kind
         return self._transform(h, time, 0, [None] * len(self.layers)).reshape(shape)
 
-    def _network_after(self, o: Tensor, time: Tensor, memory: Memory, n_known: int,
-                       of_kind: Tensor | None) -> Tensor:  # fmt: skip
+    def _network_after(self, o: Tensor, time: Tensor, memory: Memory, n_known: int) -> Tensor:
         h = self.embed_noisy(self._tokens(o)) + self.embed_mask.weight[0] + self.embed_latent
-        h = h if of_kind is None else h + of_kind
         return self._transform(h, time, n_known, memory).reshape(o.shape)
 
     def _transform(self, h: Tensor, time: Tensor, first: int, past: Sequence[KeysValues | None]) -> Tensor:

@@ -36,7 +36,6 @@ class SimulationOptions:
 
     seed: int = from_field(RolloutConfig, "seed")
     lag_ps: float | None = from_field(RolloutConfig, "lag_ps")
-    stiff: str | None = from_field(RolloutConfig, "stiff")
     force: bool = from_field(RolloutConfig, "force")
     solver: str | None = from_field(RolloutConfig, "solver")
     solver_steps: int | None = from_field(RolloutConfig, "solver_steps")
@@ -55,7 +54,7 @@ class Simulation:
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
-    the time of a step, of weights that were trained for several. `stiff`: as `rollout` takes it.
+    the time of a step, of weights that were trained for several.
     Raises OutOfDomainError, InputError, WeightsError.
     """
 
@@ -86,7 +85,6 @@ class Simulation:
             solver_steps=options.solver_steps,
             solver=options.solver,
             precision=options.precision,
-            stiff=options.stiff,
         )
         self._seed = options.seed
         self._order, self._back = match.order, np.argsort(match.order)
@@ -173,7 +171,6 @@ class Simulation:
     def _settings(self) -> dict[str, Any]:
         lag_ps = self.weights.model.lag_ps
         return ({} if lag_ps is None else {"lag_ps": lag_ps}) | {
-            "imposed": list(self._sampler.imposed) or None,
             "weights_hash": self.weights.hash,
             "topology_hash": self.scene.topology_hash,
             "seed": self._seed,

@@ -74,7 +74,7 @@ def test_a_model_without_such_parts_is_taken_as_it_is() -> None:
 @pytest.mark.parametrize(("precision", "tolerance_nm"), [("fp32", 2e-5), ("bf16", 4e-3)])
 def test_rollouts_draw_the_chunks_of_the_plain_networks(precision: str, tolerance_nm: float) -> None:
     weights = load_weights(weights_path("alanine-dipeptide"))
-    sampler = ChunkSampler(weights, precision=precision, solver="fitted", solver_steps=4, stiff="modelled")
+    sampler = ChunkSampler(weights, precision=precision, solver="fitted", solver_steps=4)
     plain = copy.copy(sampler)
     plain._model = with_bf16_weights(weights.model) if precision == "bf16" else weights.model
     start = weights.domain.scene.positions_nm[None, None].repeat(2, axis=0)

@@ -155,21 +155,6 @@ def test_the_explained_file_gives_the_same_training(alanine: Path, tmp_path: Pat
     assert all(np.array_equal(written["direct"][k], written["filled"][k]) for k in written["direct"])
 
 
-def test_rare_states_are_weighted_in_a_further_training_that_shows_them(
-    tmp_path: Path, small_weights_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trained = load_weights(small_weights_file)
-    scene = trained.domain.scene
-    few = write(tmp_path, scene)
-    request = TrainingRequest("lam-slide", tmp_path / "w.safetensors", steps=4, start_from=small_weights_file)
-    trainer, references = choices.LamSlideTrainer(), References((few,))
-    assert trainer.choose(references, request) == (), "64 frames tell nothing of what is rare"
-    monkeypatch.setattr(choices, "_FRAMES_FOR_RARE", 10)
-    monkeypatch.setattr(choices, "rare_kinds", lambda frames, length: ("kind",))
-    found = {choice.key: choice.value for choice in trainer.choose(references, request)}
-    assert found == {"training.rare_kinds": True, "training.rare_draws": 0.3}
-
-
 def test_more_atoms_than_identifiers_get_more_of_these(tmp_path: Path) -> None:
     chain = write(tmp_path, prepare("smiles:CCCCCCCCCCC"))
     record, lines = explained([chain])
