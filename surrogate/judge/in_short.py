@@ -45,7 +45,7 @@ def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
     """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
     good, bad, unknown = [], [], []
     for group, name in _WHAT.items():
-        words = [r.verdict for r in rows if r.group == group and r.verdict != "imposed" and r.key != ALL_KEY]
+        words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
         if not words:
             continue
         if any(w in _BAD for w in words):
