@@ -225,7 +225,9 @@ class _Job:
     def _submit_scene(self, name: str) -> None:
         spec = next(scene for scene in self._campaign.scenes if scene.name == name)
         seed = first_seed(self._campaign.seed, name, 0.0)
-        task = SceneTask(self._token, str(self._campaign.folder.resolve()), spec, self._runs[name][0], seed)
+        runs = self._runs[name]
+        replicas = 1 + max(run.replica for run in runs)
+        task = SceneTask(self._token, str(self._campaign.folder.resolve()), spec, runs[0], seed, replicas)
         self._submit(f"scene/{name}", prepare_scene, task, priority=1 << 62)
 
     def _submit_run(self, run: Run) -> None:

@@ -7,11 +7,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from md_reference.campaign.campaign_file import SceneSpec
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
@@ -25,11 +28,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """What replicas share: the scene, the force field settled for it, and the platform they run on."""
+    """What replicas share: the scene, the force field settled for it, and the platform they run on; where each begins,
+    `(n_atoms, 3)` nm, none where all begin in the scene's structure, and how that was found."""
 
     scene: Scene
     force: ForceFieldSpec
     platform: PlatformChoice
+    starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    started: str = ""
+
+    def start_of(self, replica: int) -> Scene:
+        """Return what a replica starts from."""
+        if not self.starts_nm:
+            return self.scene
+        return replace(self.scene, positions_nm=np.array(self.starts_nm[replica % len(self.starts_nm)]))
 
     def account(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
@@ -41,15 +53,17 @@ class PreparedScene:
             "molecule_key": molecule_key(self.scene),
             "platform": self.platform.name,
             "force": asdict(self.force),
+            "starts": self.started,
             "repairs": list(map(str, repairs)) if isinstance(repairs, list | tuple) else [],
         }
 
 
-def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> PreparedScene:
+def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1) -> PreparedScene:
     """Return the prepared scene, from `path` where it lies there already, else made and written to `path`.
 
     Prepared, solvated where the solvent is made of molecules (`seed`), its forces built, so that parameters which take
-    long are in the cache, and its platform chosen. Raises what `prepare` and the force field refuse.
+    long are in the cache, its platform chosen, and starts for its `replicas` drawn. Raises what `prepare` and the force
+    field refuse.
     """
     if path.is_file():
         return load_prepared(path)
@@ -66,8 +80,18 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Pr
     system = build_system(scene, force)
     platform = measured_platform(scene, replace(config, force=force), system=lambda: system)
     prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
-    record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
-
+    if replicas > 1 and config.starts == "many":
+        starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
+        apart = any(start is not prepared.scene for start in starts.scenes)
+        frames = tuple(s.positions_nm.tolist() for s in starts.scenes) if apart else ()
+        prepared = replace(prepared, starts_nm=frames, started=starts.how)
+    record = {
+        "scene": prepared.scene.to_dict(),
+        "force": asdict(force),
+        "platform": asdict(prepared.platform),
+        "starts_nm": prepared.starts_nm,
+        "started": prepared.started,
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     create_whole(path, json.dumps(record))
     return prepared

@@ -70,13 +70,15 @@ def dask_setup(_: Any) -> None:
 
 @dataclass(frozen=True)
 class SceneTask:
-    """Prepare a scene: `run` is any of its runs (they share all but temperature and seed), `seed` the scene's own."""
+    """Prepare a scene: `run` is any of its runs (they share all but temperature and seed), `seed` the scene's
+    own, `replicas` how many begin apart."""
 
     token: str
     folder: str
     spec: SceneSpec
     run: Run
     seed: int
+    replicas: int = 1
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def prepare_scene(task: SceneTask) -> dict[str, Any]:
         from md_reference.campaign.start_scene import prepare_once
 
         path = scene_path(Path(task.folder), task.spec.name)
-        return prepare_once(path, task.spec, task.run.config, task.seed).account()
+        return prepare_once(path, task.spec, task.run.config, task.seed, task.replicas).account()
 
     return guarded(task.token, Path(task.folder) / MANIFEST_NAME, work)
 
@@ -167,7 +169,7 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     Claim(out, patience_s=_CLAIM_PATIENCE_S, stopped=session.should_stop).close()
     simulate(
-        prepared.scene,
+        prepared.start_of(task.run.replica),
         config,
         out,
         resume=True,

@@ -10,7 +10,8 @@ connect in both directions gets no weight and is named.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -148,16 +149,12 @@ def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int 
 
 
 def _with_weights(found: Equilibrium, weights: list[FloatArray]) -> Equilibrium:
-    from dataclasses import replace
-
     mean = sum(w.sum() for w in weights) / sum(map(len, weights))
     return replace(found, weights=tuple(w / mean for w in weights))
 
 
 def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equilibrium:
     """Return plain averages over all frames behind the first `left_out` of each replica."""
-    from dataclasses import replace
-
     n_micro = len(found.populations)
     weights = [((np.arange(len(m)) >= left_out) & (m >= 0)).astype(np.float64) for m in micro]
     counts = np.array([
@@ -177,7 +174,7 @@ def _units(micro: list[IntArray], lag: int) -> list[tuple[int, int, int]]:
     for k, m in enumerate(micro):
         n = max(1, min(pieces, len(m) // (2 * lag)))
         edges = np.linspace(0, len(m), n + 1).astype(int).tolist()
-        units += [(k, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        units += [(k, a, b) for a, b in pairwise(edges)]
     return units
 
 

@@ -21,6 +21,7 @@ from surrogate.judge.measure.slow_motion import SLOW_KINDS
 from surrogate.judge.measure.structure import Backbone, backbone
 from surrogate.judge.measure.torsions import Torsion, find_torsions
 from surrogate.judge.read.ensemble import Ensemble
+from systems.chemistry.validity import INVALID
 from systems.errors import InputError
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
@@ -35,6 +36,8 @@ _MAP_BINS = 36
 _WELL_BINS, _SMOOTHED, _WELL_DEPTH = 72, 3, math.e
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
+# A state that has a smaller share of a rollout is no reason to begin there.
+_DRAWN_SHARE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class StateEnergy:
 class Answer:
     """What MD says of a molecule. `weights`: of every frame, an array a replica; `lag_ps` between frames;
     `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy in kJ/mol
-    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `missing`: what it cannot tell, a sentence each."""
+    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `missing`: what it cannot tell."""
 
     method: str
     n_replicas: int
@@ -108,9 +111,10 @@ class Answer:
         if not off:
             return f"The surrogate's populations agree with MD's within errors in all {len(told)} states."
         worst = off[0]
+        instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
         return (
-            f"The surrogate's populations differ from MD's in {len(off)} of {len(told)} states, most in {worst.torsion} "
-            f"{worst.state}: {100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}."
+            f"The surrogate's populations differ from MD's in {len(off)} of {len(told)} states, most in "
+            f"{worst.torsion} {worst.state}: {instead}."
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -170,9 +174,7 @@ class _Torsions:
         return out
 
 
-def md_answer(
-    md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0
-) -> Answer:
+def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0) -> Answer:
     """Return what MD replicas say of equilibrium, and how a surrogate's populations compare with that.
 
     `md`: one segment a replica; `temperature_k` of its bath. Raises InputError where no torsion of the molecule turns
@@ -269,7 +271,9 @@ def _named_states(torsions: _Torsions, angles: list[FloatArray], own: list[Float
 
     for residue in torsions.backbone.residues:
         labels, rolled = both(
-            lambda phi, psi: np.where(phi > 0, 2, np.where(is_alpha(psi), 0, 1)), residue.phi, torsions.n_phi + residue.psi
+            lambda phi, psi: np.where(phi > 0, 2, np.where(is_alpha(psi), 0, 1)),
+            residue.phi,
+            torsions.n_phi + residue.psi,
         )
         found.append((residue.label, labels, ("α", "β", "left-handed"), rolled))
     first = torsions.n_phi + torsions.n_psi
@@ -406,3 +410,36 @@ def _maps(
         with np.errstate(divide="ignore"):
             found[residue.label] = np.asarray(-kt * np.log(density / max(float(density.max()), 1e-300)))
     return found
+
+
+def frames_over_states(ensemble: Ensemble, n: int, *, seed: int = 0) -> npt.NDArray[np.float32]:
+    """Return `n` valid frames `(n, n_atoms, 3)` nm of an ensemble, drawn so that no state of any torsion is left out.
+
+    By turns a frame from the state that was drawn least so far, and any frame: rough weights are kept where there is
+    room. In this order, so that the first few cover as much as they can.
+    """
+    rng = np.random.default_rng(seed)
+    torsions = _Torsions(ensemble)
+    angles = torsions.of(ensemble)
+    flags = ensemble.flags or [np.zeros(len(a), dtype=np.uint16) for a in angles]
+    good = np.concatenate([(f & INVALID) == 0 for f in flags]) & np.isfinite(np.concatenate(angles)).all(axis=1)
+    valid = np.flatnonzero(good) if good.any() else np.arange(len(good))
+    labels = [np.concatenate(named[1])[valid] for named in _named_states(torsions, angles, None)]
+    states = [(x, s) for x in labels for s in np.unique(x).tolist() if (x == s).mean() >= _DRAWN_SHARE]
+    drawn = np.zeros(len(states), dtype=int)
+    picks = []
+    for k in range(n):
+        pool = np.arange(len(valid))
+        if k % 2 == 0 and states:
+            x, s = states[int(np.argmin(drawn + 1e-3 * rng.random(len(states))))]
+            pool = np.flatnonzero(x == s)
+        pick = int(rng.choice(pool))
+        drawn += [int(x[pick] == s) for x, s in states]
+        picks.append(int(valid[pick]))
+    ends = np.cumsum([len(a) for a in angles])
+    found = []
+    for pick in picks:
+        k = int(np.searchsorted(ends, pick, side="right"))
+        at = pick - (int(ends[k - 1]) if k else 0)
+        found.append(np.asarray(ensemble.segments[k][at : at + 1])[0])
+    return np.stack(found)

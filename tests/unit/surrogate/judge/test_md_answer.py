@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surrogate.judge.markov import equilibrium
-from surrogate.judge.md_answer import md_answer, wells
+from surrogate.judge.md_answer import frames_over_states, md_answer, wells
 from surrogate.judge.read.ensemble import Ensemble
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
@@ -145,3 +145,12 @@ def test_equilibrium_takes_what_no_state_holds() -> None:
     states = jumps(MATRIX, [0, 1] * 8, 300, 0)
     states[:, ::50] = -1
     assert equilibrium(list(states)).populations.sum() == pytest.approx(1.0)
+
+
+def test_starts_are_drawn_over_all_states_of_a_rollout(forms: np.ndarray) -> None:
+    rare = drawn(forms, np.array([0.95, 0.03, 0.02]))
+    frames = frames_over_states(rare, 16, seed=1)
+    known = {forms[s, k].tobytes(): s for s in range(3) for k in range(FORMS)}
+    counts = np.bincount([known[f.tobytes()] for f in frames], minlength=3)
+    assert counts.min() >= 2 and counts.sum() == 16
+    np.testing.assert_array_equal(frames, frames_over_states(rare, 16, seed=1))
