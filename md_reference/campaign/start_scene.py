@@ -29,19 +29,22 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class PreparedScene:
     """What replicas share: the scene, the force field settled for it, and the platform they run on; where each begins,
-    `(n_atoms, 3)` nm, none where all begin in the scene's structure, and how that was found."""
+    `(n_atoms, 3)` nm, as far as that is known, how it was found, and the seed of that."""
 
     scene: Scene
     force: ForceFieldSpec
     platform: PlatformChoice
     starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
     started: str = ""
+    seed: int = 0
 
-    def start_of(self, replica: int) -> Scene:
-        """Return what a replica starts from."""
-        if not self.starts_nm:
+    def start_of(self, replica: int, config: MDConfig) -> Scene:
+        """Return what a replica starts from; that of one by which the campaign has grown is drawn now."""
+        if replica < len(self.starts_nm):
+            return replace(self.scene, positions_nm=np.array(self.starts_nm[replica]))
+        if replica == 0 or config.starts != "many":
             return self.scene
-        return replace(self.scene, positions_nm=np.array(self.starts_nm[replica % len(self.starts_nm)]))
+        return many_starts(self.scene, replace(config, force=self.force, seed=self.seed), replica + 1).scenes[-1]
 
     def account(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
@@ -79,11 +82,10 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int, repli
         scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
     system = build_system(scene, force)
     platform = measured_platform(scene, replace(config, force=force), system=lambda: system)
-    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()))
+    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(platform, timings=()), seed=seed)
     if replicas > 1 and config.starts == "many":
         starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
-        apart = any(start is not prepared.scene for start in starts.scenes)
-        frames = tuple(s.positions_nm.tolist() for s in starts.scenes) if apart else ()
+        frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
         prepared = replace(prepared, starts_nm=frames, started=starts.how)
     record = {
         "scene": prepared.scene.to_dict(),
@@ -91,6 +93,7 @@ def prepare_once(path: Path, spec: SceneSpec, config: MDConfig, seed: int, repli
         "platform": asdict(prepared.platform),
         "starts_nm": prepared.starts_nm,
         "started": prepared.started,
+        "seed": seed,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     create_whole(path, json.dumps(record))

@@ -169,7 +169,7 @@ def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     Claim(out, patience_s=_CLAIM_PATIENCE_S, stopped=session.should_stop).close()
     simulate(
-        prepared.start_of(task.run.replica),
+        prepared.start_of(task.run.replica, task.run.config),
         config,
         out,
         resume=True,

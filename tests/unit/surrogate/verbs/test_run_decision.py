@@ -24,11 +24,11 @@ def named(decision: Decision) -> list[str]:
     return [stage.name for stage in decision.stages]
 
 
-def test_weights_that_outrun_md_are_rolled_and_checked_by_bursts() -> None:
+def test_weights_that_outrun_md_find_states_and_md_has_most_of_the_time() -> None:
     found = decide(COVERED, 600.0)
     assert found.way == "rollout"
-    assert named(found) == ["rollout", "bursts", "held-out md", "report"]
-    assert found.n_bursts >= 60
+    assert named(found) == ["rollout", "held-out md", "report"]
+    assert found.seconds("held-out md") > 5 * found.seconds("rollout")
     assert found.expected_rollout_ps == pytest.approx(1600.0 * found.seconds("rollout"))
 
 
@@ -108,15 +108,7 @@ def test_stages_fill_the_budget(rates: Rates, way: str, budget_s: float) -> None
     found = decide(rates, budget_s, way)
     assert 0.95 * budget_s < sum(stage.seconds for stage in found.stages) <= budget_s
     assert min(stage.seconds for stage in found.stages) > 0.0
-    assert ("bursts" in named(found)) == (found.n_bursts > 0)
     assert table(rates, found, budget_s)[-1][0] == "in all"
-
-
-def test_bursts_that_are_too_dear_are_left_out_and_said_to_be() -> None:
-    found = decide(DEAR, 3600.0)
-    assert found.n_bursts == 0 and any("no bursts" in line for line in found.why)
-    cheap = replace(DEAR, step_s=20e-6, md_ps_per_s=50.0)
-    assert decide(cheap, 3600.0, "surrogate").n_bursts > 0, "control"
 
 
 def test_frames_are_saved_no_more_often_than_the_judge_can_read() -> None:
@@ -126,11 +118,6 @@ def test_frames_are_saved_no_more_often_than_the_judge_can_read() -> None:
         assert found.save_every_ps % FAST.lag_ps == 0.0
     assert long.expected_rollout_ps / long.save_every_ps < 400_000
     assert decide(COVERED, 36_000.0, save_every_ps=1.0).save_every_ps == 1.0
-
-
-def test_other_work_on_the_machine_leaves_fewer_bursts() -> None:
-    busy = replace(COVERED, stretch=2.0, md_ps_per_s=160.0)
-    assert decide(busy, 60.0).n_bursts < decide(COVERED, 60.0).n_bursts
 
 
 def test_work_beside_us_stretches_time() -> None:

@@ -26,7 +26,7 @@ from surrogate.verbs.run.stages import Site, StageOf
 from systems.errors import InputError, SimulationError
 from systems.trajectory.codec import open_trajectory
 
-# As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock, and bursts are too dear.
+# As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock.
 RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("alanine-dipeptide", 1.0, 0.25))
 BUDGET_S = 400.0
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=16, md_ps_per_s=0.8)
@@ -197,18 +197,6 @@ def spend_until_no_time_for(name: str, folder: Path) -> None:
     order = [stage.name for stage in record.decision.stages]
     left_s = sum(stage.seconds for stage in record.decision.stages[order.index(name) + 1 :]) + one_scene.RESTART_S - 0.5
     write_run(folder, replace(record, spent_s=BUDGET_S - left_s))
-
-
-def test_bursts_without_time_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, step_s=25e-6))
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
-    monkeypatch.setitem(stages.STAGES, "bursts", disturbed(stages.STAGES["bursts"], before=kill))
-    with pytest.raises(Killed):  # where there is time
-        run(tmp_path, "surrogate")
-    spend_until_no_time_for("bursts", tmp_path)
-    found = run(tmp_path, "surrogate", resume=True)
-    assert ended(found)[:2] == [("rollout", "done"), ("bursts", "failed")] and ended(found)[-1] == ("report", "done")
-    assert found["stages"][1]["note"] == "no time was left"
 
 
 def test_files_of_one_frame_are_not_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
