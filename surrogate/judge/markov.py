@@ -33,6 +33,8 @@ _CK_TOLERANCE = 0.05
 # Replicas outlast the slowest process when they are so many times as long; three of these are left out at their start.
 _OUTLASTS, _LEFT_OUT = 20.0, 3.0
 _LEAST_UNITS = 8
+# Fewer transitions of the slowest process, in its rarer direction, tell no populations.
+_LEAST_CROSSINGS = 5
 # What has fewer frames than this share is not named as missing.
 _NAMED_SHARE = 0.005
 
@@ -80,8 +82,9 @@ class Equilibrium:
 
     @property
     def holds(self) -> bool:
-        """Whether the model passed its tests; plain averages need none."""
-        return self.method == "plain averages" or (self.flat and self.ck_holds)
+        """Whether the model passed its tests and rests on more than a few transitions; plain averages need none."""
+        seen = self.crossings >= _LEAST_CROSSINGS or not len(self.timescales)
+        return self.method == "plain averages" or (self.flat and self.ck_holds and seen)
 
     def shares(self, micro: Sequence[IntArray], labels: Sequence[IntArray], n: int) -> tuple[FloatArray, FloatArray]:
         """Return the equilibrium share `(n,)` of each label and its bootstrap draws `(n_draws, n)`.

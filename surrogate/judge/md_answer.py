@@ -98,7 +98,7 @@ class Answer:
             slow = f"; slowest process {format_time_ps(self.timescales_ps[0], 2)}{error}"
         said = f"Equilibrium from MD, {length}, by {self.tests}{slow}."
         if not self.holds:
-            said += " Not converged: longer replicas are needed before these numbers can be used."
+            said += " Not converged: longer replicas, or more, are needed before these numbers can be used."
         return said + (f" Missing: {'; '.join(self.missing)}." if self.missing else "")
 
     @property
@@ -109,7 +109,11 @@ class Answer:
             return ""
         off = sorted((s for s in told if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.share))
         if not off:
-            return f"The surrogate's populations agree with MD's within errors in all {len(told)} states."
+            widest = max(s.error for s in told)
+            return (
+                f"The surrogate's populations agree with MD's in all {len(told)} states, within errors of up to "
+                f"{100 * widest:.2g} %."
+            )
         worst = off[0]
         instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
         return (
@@ -197,7 +201,9 @@ def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None 
             where = _where(lost.microstates, micro, states, torsions, angles, own)
             missing.append(f"not connected: {where} was {lost.fate} ({lost.n_replicas} of {len(micro)} replicas)")
     states = [_said_missing(s) for s in states]
-    missing += [f"{s.torsion} {s.state}: {s.missing}" for s in states if s.missing]
+    missing += [
+        f"{s.torsion} {s.state}: {s.missing}" for s in states if s.missing and (not missing or not s.n_replicas)
+    ]
     if found.method == "Markov model" and not missing and found.crossings == 0 and len(found.timescales):
         missing.append("the slowest process was seen in one direction only")
     ps = md.lag_ps
