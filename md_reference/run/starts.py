@@ -29,9 +29,11 @@ from systems.interrupts import stop_if_asked
 from systems.scene import FloatArray, IntArray, Scene
 from systems.selection import part_of
 
-HOT_K, HOT_PS, COOL_PS, FRICTION_PER_PS = 500.0, 100.0, 20.0, 5.0
-# By OpenMM, one after the other: so long apart.
-_APART_PS = 20.0
+HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
+# Of the time it was hot.
+_COOLING = 0.2
+# By OpenMM, one after the other: so far apart, of that time.
+_APART = 0.2
 _TURNED_PS, _STIFFNESS_KJ_MOL = 20.0, 300.0
 _PIECE = 500
 _KEPT = NOT_FINITE | CHIRALITY | OMEGA | RING
@@ -45,13 +47,13 @@ class Starts:
     how: str
 
 
-def many_starts(scene: Scene, conditions: Conditions, n: int) -> Starts:
+def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float = HOT_PS) -> Starts:
     """Return `n` starts of a scene in different states, drawn with the seed of `conditions`.
 
-    They come from 100 ps at 500 K and 20 ps at the bath's temperature, by SIMD replicas where these run the scene, else
-    by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its dry self then
-    has. Where nothing turns, or nothing can turn it, all begin in the scene's own structure, and `how` says so. Raises
-    SimulationError where hot MD fails, KeyboardInterrupt.
+    They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
+    scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
+    dry self then has. Where nothing turns, or nothing can turn it, all begin in the scene's own structure, and `how`
+    says so. Raises SimulationError where hot MD fails, KeyboardInterrupt.
     """
 
     def one(why: str) -> Starts:
@@ -67,14 +69,14 @@ def many_starts(scene: Scene, conditions: Conditions, n: int) -> Starts:
         dry = replace(dry, cell_nm=None)
     try:
         spec = _hot_forces(dry, conditions.force)
-        frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n)
+        frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
         if scene.cell_nm is not None:
             frames = _in_water(
                 scene, conditions, dry, np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
             )
     except (PreparationError, SimdUnavailableError) as error:
         return one(str(error).rstrip("."))
-    how = f"{n} starts: the structure given and, {by}, states after {HOT_PS:g} ps at {HOT_K:g} K"
+    how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
     return Starts(_scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water"))
 
 
@@ -119,7 +121,7 @@ def _hot_forces(dry: Scene, force: ForceFieldSpec) -> ForceFieldSpec:
     return force
 
 
-def _hot(dry: Scene, conditions: Conditions, n: int) -> tuple[FloatArray, str]:
+def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[FloatArray, str]:
     """Return frames `(n, n_atoms, 3)`, the first as given and minimised, the others from hot MD; and by what."""
     system = build_system(dry, conditions.force)
     on_cpu = replace(conditions, platform="Reference" if dry.n_atoms < 300 else "CPU")
@@ -128,10 +130,10 @@ def _hot(dry: Scene, conditions: Conditions, n: int) -> tuple[FloatArray, str]:
         start = engine.positions()
     geometry = geometry_from_scene(dry)
     try:
-        batches, by = _by_simd(system, conditions, start), "by SIMD replicas"
+        batches, by = _by_simd(system, conditions, start, hot_ps), "by SIMD replicas"
         first = next(batches)
     except SimdUnavailableError:
-        batches, by = _by_openmm(dry, system, on_cpu, start), "by OpenMM"
+        batches, by = _by_openmm(dry, system, on_cpu, start, hot_ps), "by OpenMM"
         first = next(batches)
     found = [start]
     batch = first
@@ -144,13 +146,13 @@ def _hot(dry: Scene, conditions: Conditions, n: int) -> tuple[FloatArray, str]:
     return np.stack([found[k % len(found)] for k in range(n)]), by
 
 
-def _by_simd(system: Any, conditions: Conditions, start: FloatArray) -> Iterator[FloatArray]:
+def _by_simd(system: Any, conditions: Conditions, start: FloatArray, hot_ps: float) -> Iterator[FloatArray]:
     """Yield batches of sixteen states that were hot and have cooled down."""
     how: dict[str, Any] = {"friction_per_ps": FRICTION_PER_PS, "timestep_ps": conditions.timestep_ps}
     at = start[None]
     seed = conditions.seed
     while True:
-        for temperature_k, time_ps in ((HOT_K, HOT_PS), (conditions.temperature_k, COOL_PS)):
+        for temperature_k, time_ps in ((HOT_K, hot_ps), (conditions.temperature_k, _COOLING * hot_ps)):
             run = SimdReplicas(system, temperature_k=temperature_k, seed=seed % 2**31, **how)
             run.set_positions(np.repeat(start[None], run.n_replicas, axis=0) if len(at) == 1 else at)
             run.thermalise()
@@ -160,7 +162,9 @@ def _by_simd(system: Any, conditions: Conditions, start: FloatArray) -> Iterator
         # The next batch goes on from here: it has been hot for longer.
 
 
-def _by_openmm(scene: Scene, system: Any, conditions: Conditions, start: FloatArray) -> Iterator[FloatArray]:
+def _by_openmm(
+    scene: Scene, system: Any, conditions: Conditions, start: FloatArray, hot_ps: float
+) -> Iterator[FloatArray]:
     """Yield states of one hot run, each minimised, which cooling would do."""
     hot = replace(conditions, temperature_k=HOT_K, friction_per_ps=FRICTION_PER_PS)
     with Engine(scene, hot, threads=1, system=system) as engine:
@@ -168,7 +172,7 @@ def _by_openmm(scene: Scene, system: Any, conditions: Conditions, start: FloatAr
         engine.thermalise()
         while True:
             stop_if_asked()
-            engine.step(round(_APART_PS / hot.timestep_ps))
+            engine.step(max(1, round(_APART * hot_ps / hot.timestep_ps)))
             kept = engine.positions()
             engine.minimise(max_iterations=200)
             yield engine.positions()[None]

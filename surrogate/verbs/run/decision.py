@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -208,6 +209,30 @@ def _interval(rates: Rates, way: Way, least_ps: float) -> float:
     """Return the interval between saved frames: a round multiple of what the surrogate, or else MD, steps by."""
     base_ps = rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.dear else 1.0
     return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
+
+
+def expected_errors(rates: Rates, decision: Decision, relaxation_ps: float, model_error: float) -> dict[str, float]:
+    """Return the error to expect of the population of a state that is there half of the time, at the end of a budget.
+
+    Of all MD together `sqrt(relaxation / length) / sqrt(2)` (independent samples are two relaxation times apart:
+    Müller-Krumbhaar and Binder, J. Stat. Phys. 8, 1 (1973)). Replicas from one start have their mean bias beside that,
+    half of `(1 - exp(-t)) / t` with t their length over the relaxation time; those from many are weighted by their
+    transitions and have none. A rollout has its `model_error`.
+    """
+    seconds = sum(stage.seconds for stage in decision.stages if stage.name != "report")
+
+    def sampling(total_ps: float) -> float:
+        return min(0.5, math.sqrt(0.5 * relaxation_ps / max(total_ps, 1e-9)))
+
+    all_md_ps = rates.md_ps_per_s * seconds
+    lengths = max(all_md_ps / rates.replicas / max(relaxation_ps, 1e-9), 1e-9)
+    bias = 0.5 * -math.expm1(-lengths) / lengths
+    found = {"MD from one start": math.hypot(sampling(all_md_ps), bias), "MD from many": sampling(all_md_ps)}
+    if rates.rolls is not None and decision.way != "md":
+        own_ps = rates.md_ps_per_s * decision.seconds("held-out md")
+        found["the rollout alone"] = math.hypot(sampling(rates.rolls.ps_per_s * seconds), model_error)
+        found["rollout and MD"] = sampling(own_ps)
+    return found
 
 
 def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, str]]:

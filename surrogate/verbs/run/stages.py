@@ -17,7 +17,7 @@ from surrogate.verbs.compare import compare
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
 from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
+from surrogate.verbs.run.decision import Decision, Stage, expected_errors, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
@@ -117,7 +117,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
                 raise said
 
         with accounted_outputs(files):
-            starts, config = _starts(site, record, config, len(files))
+            starts, config = _starts(site, record, config, files)
             simulate_replicas(starts, config, files, resume=True, announce=heard)
         done = found(site, record)
         if done is None:
@@ -142,25 +142,34 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     return StageOf(work, found)
 
 
-def _starts(site: Site, record: RunRecord, config: MDConfig, n: int) -> tuple[Scene | list[Scene], MDConfig]:
-    """Return where replicas of MD begin: at frames of the rollout, drawn over all its states, where there is one."""
-    from md_reference.run.starts import frames_as_starts
+def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) -> tuple[Scene | list[Scene], MDConfig]:
+    """Return where replicas of MD begin, and their settings: at frames of the rollout, drawn over all its states, where
+    there is one, else at states of hot MD, which takes a small part of their time."""
+    from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
     from surrogate.judge.md_answer import frames_over_states
     from surrogate.judge.read.ensemble import load_ensemble
+    from systems.trajectory.checkpoint import checkpoint_path
 
-    _, decision = _rates_and_decision(record)
-    if config.starts == "one" or decision.way == "md" or not record.trajectory or n < 2:
+    rates, decision = _rates_and_decision(record)
+    if config.starts == "one" or len(files) < 2:
         return site.scene, config
-    rolled = load_ensemble([site.folder / file for file in record.trajectory])
-    if rolled.scene.n_atoms != site.scene.n_atoms:  # water was not rolled
+    rolled = None
+    if decision.way != "md" and record.trajectory:
+        rolled = load_ensemble([site.folder / file for file in record.trajectory])
+        if rolled.scene.n_atoms != site.scene.n_atoms:  # water was not rolled
+            rolled = None
+    if rolled is not None:
+        left_out_ps = max(config.equilibrate_ps, min(_LEFT_OUT_PS, 2.5 * config.equilibrate_ps))
+        config = replace(config, starts="rollout", equilibrate_ps=left_out_ps)
+    if all(path.exists() or checkpoint_path(path).exists() for path in files):
         return site.scene, config
-    frames = frames_over_states(rolled, 2 * n, seed=site.options.seed)
-    try:
-        found = frames_as_starts(site.scene, config, frames, n)
-    except SimulationError:
-        return site.scene, config
-    left_out_ps = max(config.equilibrate_ps, _LEFT_OUT_PS)
-    return list(found.scenes), replace(config, starts="rollout", equilibrate_ps=left_out_ps)
+    if rolled is not None:
+        with suppress(SimulationError):
+            frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
+            return list(frames_as_starts(site.scene, config, frames, len(files)).scenes), config
+    # On one core, while the others wait.
+    hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)
+    return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps).scenes), config
 
 
 def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
@@ -337,6 +346,10 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
     found = outcome(decision.way, comparison, costs_of(record, comparison, held_ps), answer, notes)
     lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s)]
+    if answer is not None and answer.timescales_ps:
+        errors = expected_errors(rates, decision, answer.timescales_ps[0], answer.model_error)
+        said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
+        lines.append(("expected error", f"of a population, in this budget: {said}"))
     write_report(
         comparison,
         site.folder / REPORT_NAME,

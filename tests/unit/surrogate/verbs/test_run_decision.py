@@ -8,7 +8,15 @@ import pytest
 
 from md_reference.run.machine import available_cores
 from surrogate.verbs.options import RunOptions
-from surrogate.verbs.run.decision import Decision, PlannedStage, decide, report_s, seconds_of_first, table
+from surrogate.verbs.run.decision import (
+    Decision,
+    PlannedStage,
+    decide,
+    expected_errors,
+    report_s,
+    seconds_of_first,
+    table,
+)
 from surrogate.verbs.run.rates import Rates, Rolls, measured_stretch
 from surrogate.verbs.run.stage_clock import Pace
 from systems.errors import InputError
@@ -87,6 +95,19 @@ def test_stages_before_the_last_leave_the_others_what_was_planned() -> None:
     assert seconds_of_first(found.stages, COVERED, 1.0, 600.0, 0, Pace(50.0, 10.0)) == pytest.approx(600.0 - planned)
     late = [PlannedStage("held-out md", 100.0), PlannedStage("report", 30.0)]
     assert seconds_of_first(late, COVERED, 1.0, 10.0, 0, Pace(0.0, 0.0)) == 2.0, "what is over the budget is short"
+
+
+def test_what_forgets_its_start_is_expected_to_be_as_good_as_many_starts_and_else_is_not() -> None:
+    simd = replace(COVERED, platform="simd", at_once=16, md_ps_per_s=1000.0)
+    found = decide(simd, 120.0)
+    assert found.way == "rollout"
+    slow, fast = (expected_errors(simd, found, tau_ps, 0.05) for tau_ps in (2000.0, 10.0))
+    assert slow["MD from one start"] > 2 * slow["MD from many"]
+    assert fast["MD from one start"] < 1.2 * fast["MD from many"]
+    assert slow["the rollout alone"] > 0.05 and slow["rollout and MD"] < 1.2 * slow["MD from many"]
+    longer = expected_errors(simd, decide(simd, 480.0), 2000.0, 0.05)
+    assert longer["rollout and MD"] == pytest.approx(slow["rollout and MD"] / 2, rel=0.1)
+    assert "rollout and MD" not in expected_errors(UNCOVERED, decide(UNCOVERED, 120.0), 100.0, 0.0)
 
 
 def test_dear_truth_is_learned_where_there_is_time_to() -> None:
