@@ -137,6 +137,25 @@ def test_kills_before_and_after_each_stage_change_nothing(
 
 
 @needs_compiler
+def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    one, two = tmp_path / "one", tmp_path / "two"
+    run(one, "surrogate")
+    with monkeypatch.context() as patch:
+        patch.setitem(stages.STAGES, "held-out md", disturbed(stages.STAGES["held-out md"], after=kill))
+        with pytest.raises(Killed):
+            run(two, "surrogate")
+    run(two, "surrogate", resume=True)
+    with open_trajectory(one / "reference" / "held_out_r3.h5") as reader:
+        assert reader.record["starts"] == "rollout"
+    first, second = frames(one), frames(two)
+    assert len(first) == REPLICAS + 16 and first.keys() == second.keys()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@needs_compiler
 @pytest.mark.parametrize("good_frames", [0, 5])
 def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
