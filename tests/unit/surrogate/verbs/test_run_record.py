@@ -36,7 +36,7 @@ def record() -> RunRecord:
     return RunRecord(
         "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
         RATES, decide(RATES, 600.0), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
-        outcome=Outcome("head", "close", "verdict", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
+        outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
     )  # fmt: skip
 
 
