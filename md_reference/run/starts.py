@@ -52,8 +52,8 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
 
     They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
     scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
-    dry self then has. Where nothing turns, or nothing can turn it, all begin in the scene's own structure, and `how`
-    says so. Raises SimulationError where hot MD fails, KeyboardInterrupt.
+    dry self then has. Where nothing turns, or nothing can turn it, or hot MD fails, all begin in the scene's own
+    structure, and `how` says so. Raises KeyboardInterrupt.
     """
 
     def one(why: str) -> Starts:
@@ -74,7 +74,7 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
             frames = _in_water(
                 scene, conditions, dry, np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
             )
-    except (PreparationError, SimdUnavailableError) as error:
+    except (PreparationError, SimulationError) as error:
         return one(str(error).rstrip("."))
     how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
     return Starts(_scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water"))

@@ -54,8 +54,9 @@ class Killed(BaseException):
     """Nobody catches it: what is on disk is what a kill leaves."""
 
 
-def run(folder: Path, asked: str, *, resume: bool = False) -> dict[str, Any]:
-    return api.run("alanine-dipeptide", folder, budget_s=BUDGET_S, way=asked, resume=resume, quiet=True)
+def run(folder: Path, asked: str, *, resume: bool = False, starts: str = "many") -> dict[str, Any]:
+    options: dict[str, Any] = {"budget_s": BUDGET_S, "way": asked, "resume": resume, "starts": starts}
+    return api.run("alanine-dipeptide", folder, quiet=True, **options)
 
 
 def frames(folder: Path) -> dict[str, Any]:
@@ -171,7 +172,7 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     monkeypatch.setattr(SimdReplicas, "step", fails)
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
-    found = run(tmp_path / "run", "md")
+    found = run(tmp_path / "run", "md", starts="one")
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
     assert "MD by SIMD replicas failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
@@ -181,7 +182,7 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
     judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]
-    assert run(tmp_path / "run", "md", resume=True)["outcome"] == found["outcome"]
+    assert run(tmp_path / "run", "md", resume=True, starts="one")["outcome"] == found["outcome"]
 
 
 @pytest.mark.parametrize(
