@@ -40,7 +40,7 @@ def test_short_replicas_tell_equilibrium_wherever_they_begin(starts: list[int]) 
     micro = run(chain(), starts, 300)
     found = equilibrium(micro, seed=1)
     error = found.draws.std(0)
-    assert found.method == "Markov model" and found.holds
+    assert found.method == "Markov model" and found.flat and found.ck_holds
     assert (np.abs(found.populations - POPULATIONS) < 3.0 * error + 0.01).all()
     assert error.max() < 0.2
     # The negative control: their averages are wrong.
