@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import weakref
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +19,8 @@ from systems.files.schema import built
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,7 @@ class Scene:
             near[j].append(i)
         return [sorted(around) for around in near]
 
-    @property
+    @functools.cached_property
     def topology_hash(self) -> str:
         """Hash of the ordered topology, names included, positions left out."""
         record = self.to_dict()
@@ -157,3 +162,25 @@ class Scene:
         import mdtraj
 
         return mdtraj.Topology.from_openmm(self.to_openmm_topology())
+
+
+def once_per_scene(function: Callable[Concatenate[Scene, P], T]) -> Callable[Concatenate[Scene, P], T]:
+    """Return `function` so that it computes what it says of a Scene once, for as long as that object lives.
+
+    A Scene never changes, so neither does what follows from it. All callers share the result, which must not be
+    changed: arrays are made read-only here, graphs are to be frozen. Further arguments must be hashable.
+    """
+    known: weakref.WeakKeyDictionary[Scene, dict[Any, T]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(function)
+    def once(scene: Scene, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        results = known.setdefault(scene, {})
+        key = (args, *sorted(kwargs.items()))
+        if key not in results:
+            made = function(scene, *args, **kwargs)
+            if isinstance(made, np.ndarray):
+                made.setflags(write=False)
+            results[key] = made
+        return results[key]
+
+    return once

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from glob import glob
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_type_hints
 
 from md_reference.campaign.manifest import file_sha256
-from md_reference.campaign.run_options import Settings, read_settings, to_config
-from md_reference.forces.spec import WaterBox
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
-from md_reference.run.defaults import settle_by_name
-from systems.errors import InputError, SurromdError
+from md_reference.run.defaults import settle_by_name, to_config
+from systems.errors import InputError, SurromdError, nearest
 from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
 from systems.library.protocols import find_protocol
-from systems.options import options_of
+from systems.options import Option, options_of
 from systems.preparation import Preparation
-from systems.units import parse_temperature_k, parse_wall_s
+from systems.units import parse_temperature_k, parse_wall_s, parser_of
 
 T = TypeVar("T")
 SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
@@ -29,6 +29,10 @@ SCENE_FILES = (".pdb", ".ent", ".cif", ".mmcif", ".gz", ".sdf", ".mol", ".mol2")
 JOB_LOGS = "jobs"
 _LONGEST_NAME, _MOST_RUNS = 40, 100_000
 _SEEDS = 2**31
+# Settings whose names end so are written without it, as texts with a unit.
+_ENDINGS = ("_per_ps", "_ps", "_k", "_da")
+# These belong to a run's place in the campaign.
+_NOT_SETTINGS = ("seed", "force")
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,15 @@ class Campaign:
     checkpoint_every_s: float = 20.0
     cluster: ClusterSpec | None = None
     text: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What one table says: fields of MDConfig and ForceFieldSpec by name, switches of `prepare`, and the axes."""
+
+    values: dict[str, Any]
+    preparation: dict[str, Any]
+    axes: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -187,6 +200,60 @@ def _read(kind: type[T], table: dict[str, Any], where: str) -> tuple[T, Settings
         where=where,
     )
     return built(kind, {key: value for key, value in table.items() if key in own}, where), settings
+
+
+def _known_fields() -> dict[str, Field[Any]]:
+    return {f.name: f for kind in (MDConfig, ForceFieldSpec) for f in fields(kind) if f.name not in _NOT_SETTINGS}
+
+
+def key_of(name: str) -> str:
+    """Return the key in a file of a field: `timestep` of `timestep_ps`."""
+    return next((name.removesuffix(ending) for ending in _ENDINGS if name.endswith(ending)), name)
+
+
+def read_settings(
+    table: dict[str, Any],
+    *,
+    axes: Mapping[str, Any],
+    preparation: Mapping[str, Option],
+    others: Iterable[str],
+    where: str,
+) -> Settings:
+    """Return a table's settings, in our units. `axes`: the annotations of what else it may say of runs; `preparation`:
+    the options of how a scene is made.
+
+    Raises InputError for a key that is neither (with the nearest that is; `others` are keys the caller has read),
+    ValueError for values of the wrong kind.
+    """
+    hints = get_type_hints(MDConfig) | get_type_hints(ForceFieldSpec)
+    by_key = {key_of(name): name for name in _known_fields()}
+    found = Settings({}, {}, {})
+    for key, value in table.items():
+        if key in axes:
+            found.axes[key] = fitted(value, axes[key], f"{where}{key}")
+        elif key in preparation:
+            found.preparation[key] = preparation[key].value(value, f"{where}{key}")
+        elif key in by_key:
+            name = by_key[key]
+            found.values[name] = _value(name, hints[name], value, f"{where}{key}")
+        else:
+            meant = nearest(key, [*by_key, *preparation, *axes, *others])
+            raise InputError(f"{where}unknown key {key!r}.{meant}")
+    return found
+
+
+def _value(name: str, hint: Any, value: Any, where: str) -> Any:
+    if type(None) in get_args(hint) and value in ("natural", "none"):
+        return None
+    if name.endswith(_ENDINGS):
+        return parser_of(name)(str(fitted(value, float | str, where)), where)
+    return fitted(value, hint, where)
+
+
+def default_of(name: str) -> Any:
+    """Return the default of a setting, or None where it has none."""
+    known = _known_fields().get(name)
+    return None if known is None or known.default is MISSING else known.default
 
 
 def _scene_tables(head: _Head, base: Path) -> list[dict[str, Any]]:

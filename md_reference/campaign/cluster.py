@@ -1,40 +1,36 @@
-"""Workers for a campaign: processes of this machine, a Dask scheduler that runs already, or jobs of a batch system."""
+"""Dask for campaigns: workers of this machine, of a scheduler that runs already or of a batch system; and the sessions
+by which a worker's tasks report how far they are, and stop when the command that started them is gone."""
 
 from __future__ import annotations
 
 import importlib
 import logging
+import os
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from md_reference.campaign.campaign_file import JOB_LOGS, ClusterSpec
 from md_reference.forces.small_molecules.programs import scratch_folder
 from md_reference.run.machine import available_cores
-from systems.errors import InputError, SimulationError
-from systems.interrupts import deferred_interrupt, stop_if_asked
+from systems.errors import InputError, SimulationError, StorageError, SurromdError
+from systems.interrupts import deferred_interrupt, stop_if_asked, stop_when
 
-_CLASSES = {
-    "slurm": "SLURMCluster",
-    "pbs": "PBSCluster",
-    "sge": "SGECluster",
-    "lsf": "LSFCluster",
-    "htcondor": "HTCondorCluster",
-    "moab": "MoabCluster",
-    "oar": "OARCluster",
-    "local": "LocalCluster",
-}
+# Without a word from the command that started them for so long, runs stop.
+LEASE_S = 60.0
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENMM_CPU_THREADS": "1"}
 # Dask listens for browsers in any case: where nobody does, and at no port that another asks for.
 _NO_PAGE = "127.0.0.1:0"
 _NO_PAGES = {"DASK_DISTRIBUTED__WORKER__HTTP__ROUTES": "[]"}
 # So long a scheduler may take to answer.
 _ANSWER_S = 20.0
-_PRELOAD = "md_reference.campaign.worker"
 
 
 @contextmanager
@@ -54,14 +50,20 @@ def open_client(
     interface, local workers on the loopback, and shows no status page unless `[cluster] dashboard` asks for one.
     Raises InputError when no scheduler answers or dask-jobqueue is not installed.
     """
-    _refuse_both(workers, scheduler)
+    if workers is not None and scheduler is not None:
+        raise InputError("`workers` starts workers here, `scheduler` uses those that are there; give one of them.")
     import dask
     from distributed import Client
 
     settings = {"distributed.scheduler.allowed-failures": retries, "distributed.worker.http.routes": []}
     if cluster is None or not cluster.dashboard:
         settings["distributed.scheduler.http.routes"] = []
-    with _quiet(), dask.config.set(settings), ExitStack() as stack:
+    with ExitStack() as stack:
+        # What matters of Dask's messages stands in the campaign's own summary.
+        for logger in map(logging.getLogger, ("distributed", "tornado", "asyncio", "dask_jobqueue")):
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+        stack.enter_context(dask.config.set(settings))
         if scheduler is not None:
             try:
                 client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S, set_as_default=False))
@@ -72,29 +74,14 @@ def open_client(
                 scratch = stack.enter_context(scratch_folder("surromd-dask-"))
                 stack.enter_context(dask.config.set({"temporary-directory": str(scratch)}))
             with deferred_interrupt():  # Dask cannot be stopped while it starts
-                started = _local(workers or available_cores()) if cluster is None else _jobs(cluster, folder)
-                client = stack.enter_context(Client(stack.enter_context(started), set_as_default=False))
+                started = _local(workers or available_cores()) if cluster is None else job_cluster(cluster, folder)
+                stack.enter_context(started)
+                if cluster is not None:
+                    # Jobs end with their walltime: new ones are asked for as long as there is work.
+                    started.adapt(minimum_jobs=0, maximum_jobs=cluster.jobs, interval="5s")
+                client = stack.enter_context(Client(started, set_as_default=False))
                 stop_if_asked()
         yield client
-
-
-def _refuse_both(workers: int | None, scheduler: str | None) -> None:
-    if workers is not None and scheduler is not None:
-        raise InputError("`workers` starts workers here, `scheduler` uses those that are there; give one of them.")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence Dask's loggers: what matters of them stands in the campaign's own account."""
-    loggers = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio", "dask_jobqueue")]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
 
 
 def _local(workers: int) -> Any:
@@ -112,15 +99,8 @@ def _local(workers: int) -> Any:
         memory_limit=0,
         silence_logs=logging.CRITICAL,
         env=_ONE_THREAD,
-        preload=[_PRELOAD],
+        preload=[__name__],
     )
-
-
-def _jobs(spec: ClusterSpec, folder: Path) -> Any:
-    started = job_cluster(spec, folder)
-    # Jobs end with their walltime: new ones are asked for as long as there is work.
-    started.adapt(minimum_jobs=0, maximum_jobs=spec.jobs, interval="5s")
-    return started
 
 
 def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
@@ -133,7 +113,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     on_ctrl_c = signal.getsignal(signal.SIGINT)
     try:
         # LocalCluster stands in its own module only.
-        classes = importlib.import_module(f"dask_jobqueue.{spec.kind}")
+        module = importlib.import_module(f"dask_jobqueue.{spec.kind}")
     except ImportError:
         raise InputError("[cluster] needs dask-jobqueue: pip install 'surromd[cluster]'.") from None
     finally:
@@ -143,6 +123,7 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     from distributed import Security
     from distributed.utils import get_ip
 
+    made = next(value for name, value in vars(module).items() if name.lower() == f"{spec.kind}cluster")
     one_thread = [f"{name}={value}" for name, value in (_ONE_THREAD | _NO_PAGES).items()]
     python, prologue = spec.python, [*(f"export {entry}" for entry in one_thread), *spec.prologue]
     if spec.kind == "local":
@@ -155,26 +136,98 @@ def job_cluster(spec: ClusterSpec, folder: Path) -> Any:
     scheduler: dict[str, Any] = {"dashboard": bool(spec.dashboard), "dashboard_address": spec.dashboard or _NO_PAGE}
     if not spec.interface:
         scheduler["host"] = "127.0.0.1" if spec.kind == "local" else get_ip()
-    arguments: dict[str, Any] = {
-        "protocol": "tls://",
-        "security": Security.temporary(),
-        "shared_temp_directory": str(logs),
-        "scheduler_options": scheduler,
-        "cores": spec.cores,
-        "processes": spec.cores,
-        "memory": spec.memory,
-        "job_extra_directives": list(spec.directives),
-        "job_script_prologue": prologue,
-        "worker_extra_args": ["--preload", _PRELOAD, "--no-dashboard"],
-        "log_directory": str(logs),
-    }
-    named = ("walltime", "queue", "account", "interface")
-    arguments |= {key: value for key in named if (value := getattr(spec, key))}
-    if python:
-        arguments["python"] = python
+    given = {key: getattr(spec, key) for key in ("walltime", "queue", "account", "interface")} | {"python": python}
     try:
-        return getattr(classes, _CLASSES[spec.kind])(**arguments)
+        return made(
+            protocol="tls://",
+            security=Security.temporary(),
+            shared_temp_directory=str(logs),
+            scheduler_options=scheduler,
+            cores=spec.cores,
+            processes=spec.cores,
+            memory=spec.memory,
+            job_extra_directives=list(spec.directives),
+            job_script_prologue=prologue,
+            worker_extra_args=["--preload", __name__, "--no-dashboard"],
+            log_directory=str(logs),
+            **{key: value for key, value in given.items() if value},
+        )
     except (TypeError, ValueError) as error:
         raise InputError(f"[cluster] {spec.kind} does not take this: {error}.") from error
     except OSError as error:
         raise SimulationError(f"[cluster] {spec.kind} cannot be started here: {error}.") from error
+
+
+@dataclass
+class Session:
+    """One command as its worker sees it: when it was last heard of, and the frames done per active run."""
+
+    heard_at: float = field(default_factory=time.monotonic)
+    stopped: bool = False
+    frames: dict[str, int] = field(default_factory=dict)
+
+    def should_stop(self) -> bool:
+        return self.stopped or time.monotonic() - self.heard_at > LEASE_S
+
+
+_sessions: dict[str, Session] = {}
+_sessions_lock = threading.Lock()
+
+
+def session_of(token: str) -> Session:
+    """Return this worker's session of the command that goes by `token`."""
+    with _sessions_lock:
+        return _sessions.setdefault(token, Session())
+
+
+def poll(token: str) -> dict[str, Any]:
+    """Return this worker's process and the frames done by each of its active runs; the command is heard of."""
+    session = session_of(token)
+    session.heard_at = time.monotonic()
+    return {"pid": os.getpid(), "host": socket.gethostname(), "frames": dict(session.frames)}
+
+
+def stop(token: str) -> None:
+    """Have the runs of a command stop between two frames, with a checkpoint."""
+    session_of(token).stopped = True
+
+
+def dask_setup(_: Any) -> None:
+    """Called by Dask in a worker that starts: Ctrl-C goes to the command, which tells its workers."""
+    with suppress(ValueError):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def guarded(token: str, witness: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own.
+
+    `witness`: a file that whoever started the task has written where the task is to write. What waits within it, for a
+    frame or for another program's charges, hears when the command is to stop.
+    """
+    session = session_of(token)
+    if session.stopped:
+        return {"status": "stopped"}
+    try:
+        # A file system that lags behind, or is not shared, is the only reason for its absence.
+        if not witness.is_file():
+            raise StorageError(f"{socket.gethostname()} does not see {witness}; all workers must share that folder.")
+        with stop_when(session.should_stop):
+            return {"status": "complete", **work()}
+    except KeyboardInterrupt:
+        return {"status": "stopped"}
+    except SurromdError as error:
+        return {"status": "failed", "reason": str(error), "hopeless": isinstance(error, InputError)}
+    except Exception as error:
+        return {"status": "failed", "reason": f"{type(error).__name__}: {error}", "hopeless": False}
+
+
+def result_of(future: Any) -> dict[str, Any]:
+    """Return what a task returned; one that Dask itself gave up counts as failed, and may be tried again."""
+    if future.status == "cancelled":
+        raise SimulationError("the Dask scheduler is gone; the same command goes on with another.")
+    if future.status == "error":
+        error = future.exception()
+        killed = type(error).__name__ == "KilledWorker"
+        reason = "its workers were killed again and again" if killed else f"{type(error).__name__}: {error}"
+        return {"status": "failed", "reason": reason, "hopeless": False}
+    return dict(future.result())

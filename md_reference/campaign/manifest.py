@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from systems.errors import InputError, TrajectoryError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
 
 MANIFEST_NAME = "manifest.json"
 FORMAT = 1
@@ -95,10 +96,6 @@ class Manifest:
     programs: dict[str, str] = field(default_factory=dict)
     started: str = ""
 
-    def with_run(self, entry: RunEntry) -> Manifest:
-        """Return the manifest with one run's entry replaced."""
-        return replace(self, runs={**self.runs, entry.name: entry})
-
     def counts(self) -> dict[str, int]:
         """Return how many runs are in each state; states without runs are left out."""
         states = [entry.status for entry in self.runs.values()]
@@ -107,8 +104,6 @@ class Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `manifest.json` into the folder, whole or not at all. Raises StorageError."""
-    from systems.files.whole_file import create_whole
-
     record = {"format": FORMAT, **asdict(manifest)}
     # Lists read better than tables whose keys repeat a name that each entry has.
     record["scenes"], record["runs"] = list(record["scenes"].values()), list(record["runs"].values())
@@ -153,25 +148,19 @@ def campaign_trajectories(path: Path, *, verify: bool = False) -> tuple[list[Pat
     complete = [run for run in entries if run.status == COMPLETE]
     if not complete:
         raise InputError(f"{path}: none of the {len(entries)} runs of this campaign here is complete.")
-    if verify:
-        for run in complete:
-            verify_run(folder, run)
+    for run in complete if verify else ():
+        for name, expected in run.sha256.items():
+            file = folder / name
+            if not file.is_file():
+                raise TrajectoryError(
+                    f"{file} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
+                )
+            if file_sha256(file) != expected:
+                raise TrajectoryError(
+                    f"{file} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); "
+                    "delete it and run the campaign again to remake it."
+                )
     return [folder / run.file for run in complete], len(entries) - len(complete)
-
-
-def verify_run(folder: Path, run: RunEntry) -> None:
-    """Hold the files of a complete run against the manifest's hashes. Raises TrajectoryError."""
-    for name, expected in run.sha256.items():
-        path = folder / name
-        if not path.is_file():
-            raise TrajectoryError(
-                f"{path} is gone, though {MANIFEST_NAME} lists it; run the campaign again to remake it."
-            )
-        if file_sha256(path) != expected:
-            raise TrajectoryError(
-                f"{path} is not the file that the campaign wrote (its sha256 differs from {MANIFEST_NAME}); "
-                "delete it and run the campaign again to remake it."
-            )
 
 
 def file_sha256(path: Path) -> str:

@@ -6,17 +6,20 @@ checkpoint. `manifest.json` says what is done; it is written by this process alo
 
 from __future__ import annotations
 
-import queue
+import itertools
+import platform
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, first_seed
+from md_reference.campaign.campaign_file import JOB_LOGS, Campaign, Run, SceneSpec, default_of, first_seed, key_of
+from md_reference.campaign.cluster import poll, result_of, stop
 from md_reference.campaign.manifest import (
     COMPLETE,
     FAILED,
@@ -24,16 +27,17 @@ from md_reference.campaign.manifest import (
     RUNNING,
     WAITING,
     Manifest,
+    RunEntry,
+    SceneEntry,
     read_manifest,
     write_manifest,
 )
-from md_reference.campaign.planned_manifest import check_same_campaign, new_manifest
-from md_reference.campaign.worker import RunTask, SceneTask, poll, prepare_scene, simulate_run, stop
-from systems.errors import InputError, SimulationError, TrajectoryError
+from md_reference.run.config import flat_settings
+from systems.errors import InputError, TrajectoryError
 from systems.interrupts import deferred_interrupt
 from systems.trajectory.claim import Claim
 
-_TICK_S = 0.25
+_TICK_S = 0.1
 _WRITE_EVERY_S = 2.0
 # Runs that were asked to stop have so long to come to the end of a frame.
 _STOP_PATIENCE_S = 60.0
@@ -51,19 +55,81 @@ class CampaignProgress:
     active: dict[int, dict[str, int]]
 
 
-@dataclass
-class _State:
-    """What the campaign's process keeps while running."""
+def new_manifest(campaign: Campaign) -> Manifest:
+    """Return the manifest of a campaign that has not begun."""
+    from importlib.metadata import version
 
-    manifest: Manifest
-    futures: dict[str, Any] = field(default_factory=dict)
-    attempts: dict[str, int] = field(default_factory=dict)
-    active: dict[int, dict[str, int]] = field(default_factory=dict)
-    changed: bool = True
+    scenes = [SceneEntry(s.name, s.source, s.source_sha256, s.preparation) for s in campaign.scenes]
+    runs = [
+        RunEntry(
+            name=run.name,
+            scene=run.scene,
+            temperature_k=run.config.temperature_k,
+            replica=run.replica,
+            seed=run.config.seed,
+            file=run.file,
+            settings=flat_settings(run.config),
+            n_frames_wanted=run.config.n_frames,
+        )
+        for run in campaign.runs
+    ]
+    return Manifest(
+        name=campaign.name,
+        seed=campaign.seed,
+        scenes={scene.name: scene for scene in scenes},
+        runs={run.name: run for run in runs},
+        programs={"python": platform.python_version()} | {name: version(name) for name in ("openmm", "distributed")},
+        started=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
 
-    def update(self, name: str, **entries: Any) -> None:
-        self.manifest = self.manifest.with_run(replace(self.manifest.runs[name], **entries))
-        self.changed = True
+
+def check_same_campaign(old: Manifest, new: Manifest, folder: Path) -> Manifest:
+    """Return the manifest to go on with: what `old` has done, and what `new` asks for besides.
+
+    A campaign may grow (scenes, temperatures, replicas are added), never change: seeds and settings of every old run
+    must be those of the file. Raises InputError with the first key that differs. What is no longer as it was written
+    (a trajectory that is gone or of another size) waits again, and so does what failed.
+    """
+
+    def same(key: str, was: Any, now: Any) -> None:
+        if was != now:
+            raise InputError(
+                f"{folder} belongs to another campaign: there {key} is {was!r}, in this file {now!r}; restore it, or "
+                "name another folder (out = ..., or `out`)."
+            )
+
+    scenes, runs = dict(new.scenes), dict(new.runs)
+    same("seed", old.seed, new.seed)
+    for name, scene in old.scenes.items():
+        same("scenes", name, name if name in scenes else "without it")
+        asked = scenes[name]
+        if not scene.source_sha256 or scene.source_sha256 != asked.source_sha256:  # else the same file, moved
+            same(f"source of scene {name}", scene.source, asked.source)
+        same(f"source sha256 of scene {name}", scene.source_sha256, asked.source_sha256)
+        same(f"preparation of scene {name}", scene.preparation, asked.preparation)
+        scenes[name] = replace(scene, status=WAITING, reason="") if scene.status == FAILED else scene
+    for name, run in old.runs.items():
+        if name not in runs:
+            is_replica = any((r.scene, r.temperature_k) == (run.scene, run.temperature_k) for r in new.runs.values())
+            axis = "replicas" if is_replica else "temperatures"
+            same(f"{axis} of scene {run.scene}", f"with {name}", "without it")
+        settings = runs[name].settings
+        if run.file != runs[name].file:
+            same("format", Path(run.file).suffix[1:], Path(runs[name].file).suffix[1:])
+            same(f"file of {name}", run.file, runs[name].file)
+        for key in {**run.settings, **settings}:
+            was, now = (given.get(key, default_of(key)) for given in (run.settings, settings))
+            same(f"{key_of(key)} of scene {run.scene} ({key})", was, now)
+        runs[name] = _kept(run, folder / run.file)
+    return replace(new, scenes=scenes, runs=runs, started=old.started)
+
+
+def _kept(run: RunEntry, file: Path) -> RunEntry:
+    is_there = file.is_file()
+    if run.status == COMPLETE and is_there and file.stat().st_size == run.size_bytes:
+        return run
+    # What is gone is made anew, and need not come out the same on another machine; what is there must be what it was.
+    return replace(run, status=WAITING, reason="", n_frames=0, frames_sha256=run.frames_sha256 if is_there else "")
 
 
 def open_campaign(campaign: Campaign) -> Manifest:
@@ -102,117 +168,106 @@ def run_campaign(
     `progress` is called several times a second with what the workers said when last asked. `failed(name, reason)` is
     called when a scene or a run is given up: after `retries` further attempts, or at once where its input is at fault.
     The others run on.
-    Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt with an account.
+    Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt with a summary.
     Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
     """
-    with _only_process(campaign.folder):
-        state = _State(open_campaign(campaign))
-        job = _Job(campaign, client, state, failed or (lambda name, reason: None), poll_every_s)
-        with deferred_interrupt() as asked_to_stop, job.polling():
-            try:
-                job.start()
-                while state.futures:
-                    job.tick()
+    with _only_process(campaign.folder), deferred_interrupt() as asked_to_stop:
+        job = _Job(campaign, client, open_campaign(campaign), failed or (lambda name, reason: None))
+        try:
+            with job.polling(poll_every_s):
+                while job.tick():
                     if progress is not None:
                         progress(job.progress())
                     if asked_to_stop():
                         job.stop()
-                        raise KeyboardInterrupt(_account(state.manifest, campaign.folder))
+                        done, n = job.manifest.counts().get(COMPLETE, 0), len(job.manifest.runs)
+                        raise KeyboardInterrupt(
+                            f"{done} of {n} runs in {campaign.folder} are complete, begun ones are kept; the same "
+                            "command goes on"
+                        )
                 if progress is not None:
                     progress(job.progress())
-            finally:
-                write_manifest(campaign.folder, state.manifest)
-    return state.manifest
-
-
-def _account(manifest: Manifest, folder: Path) -> str:
-    done = sum(run.status == COMPLETE for run in manifest.runs.values())
-    return (
-        f"{done} of {len(manifest.runs)} runs in {folder} are complete, begun ones are kept; the same command goes on"
-    )
+        finally:
+            write_manifest(campaign.folder, job.manifest)
+    return job.manifest
 
 
 class _Job:
-    """The tasks of one campaign: handed out, collected, tried again."""
+    """The tasks of one campaign: scenes first, each scene's runs when it is prepared, what failed once more."""
 
-    def __init__(
-        self,
-        campaign: Campaign,
-        client: Any,
-        state: _State,
-        failed: Callable[[str, str], None],
-        poll_every_s: float,
-    ) -> None:
-        self._campaign, self._client, self._state, self._failed = campaign, client, state, failed
-        self._poll_every_s = poll_every_s
+    def __init__(self, campaign: Campaign, client: Any, manifest: Manifest, failed: Callable[[str, str], None]) -> None:
+        from distributed import as_completed
+
+        self.manifest = manifest
+        self._campaign, self._client, self._failed = campaign, client, failed
+        self._folder = campaign.folder.resolve()  # as workers see it
         self._token = uuid.uuid4().hex
-        self._ended: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._ended = as_completed(loop=client.loop)
+        # Of each task that is out, by its key: what it does, which attempt it is, its future.
+        self._out: dict[str, tuple[SceneSpec | Run, int, Any]] = {}
+        self._numbers = itertools.count()
+        self._active: dict[int, dict[str, int]] = {}
+        self._is_written, self._write_at = True, 0.0
         self._runs: dict[str, list[Run]] = {}
-        self._written_at = 0.0
         for run in campaign.runs:
-            if state.manifest.runs[run.name].status != COMPLETE:
+            if manifest.runs[run.name].status != COMPLETE:
                 self._runs.setdefault(run.scene, []).append(run)
+        for spec in campaign.scenes:
+            if spec.name in self._runs:
+                self._submit(spec)
 
-    def start(self) -> None:
-        """Hand out the preparation of every scene that has runs left; its runs follow when it is done."""
-        for name in self._runs:
-            self._submit_scene(name)
-
-    def tick(self) -> None:
-        """Wait a moment for tasks that end, take their results, and write the manifest now and then."""
-        with suppress(queue.Empty):
-            self._collect(*self._ended.get(timeout=min(_TICK_S, self._poll_every_s)))
-            while True:
-                self._collect(*self._ended.get_nowait())
-        for name in {name for runs in self._state.active.values() for name in runs}:
-            entry = self._state.manifest.runs.get(name)
-            if entry is not None and entry.status == WAITING:
-                self._state.update(name, status=RUNNING)
-        if self._state.changed and time.monotonic() - self._written_at > _WRITE_EVERY_S:
+    def tick(self) -> bool:
+        """Take what has ended, write the manifest now and then, and return whether anything is out still."""
+        if not self._ended.has_ready():
+            time.sleep(_TICK_S)
+        self._collect()
+        for name in {name for runs in self._active.values() for name in runs}:
+            if self.manifest.runs[name].status == WAITING:
+                self._note("runs", name, status=RUNNING)
+        if not self._is_written and time.monotonic() > self._write_at:
             began = time.monotonic()
-            write_manifest(self._campaign.folder, self._state.manifest)
-            self._state.changed = False
+            write_manifest(self._campaign.folder, self.manifest)
+            ended = time.monotonic()
             # A manifest of many thousand runs takes its time: at most a twentieth of all.
-            self._written_at = time.monotonic() + 20 * (time.monotonic() - began)
+            self._is_written, self._write_at = True, ended + _WRITE_EVERY_S + 20 * (ended - began)
+        return bool(self._out)
 
     def stop(self) -> None:
         """Stop active runs between two frames and withdraw the others; return when they have stopped."""
-        state = self._state
-        active = {name for runs in state.active.values() for name in runs}
-        self._client.cancel([future for name, future in state.futures.items() if name not in active])
-        state.futures = {name: future for name, future in state.futures.items() if name in active}
+        active = {name for runs in self._active.values() for name in runs}
+        withdrawn = {key: future for key, (task, _, future) in self._out.items() if task.name not in active}
+        self._out = {key: out for key, out in self._out.items() if key not in withdrawn}
+        self._client.cancel(list(withdrawn.values()))
         with suppress(Exception):  # workers that are gone have stopped
             self._client.run(stop, self._token, on_error="ignore")
         deadline = time.monotonic() + _STOP_PATIENCE_S
-        while state.futures and time.monotonic() < deadline:
-            with suppress(queue.Empty):
-                self._collect(*self._ended.get(timeout=_TICK_S), again=False)
-        for name, entry in state.manifest.runs.items():
+        while self._out and time.monotonic() < deadline:
+            time.sleep(_TICK_S)
+            self._collect(again=False)
+        for name, entry in self.manifest.runs.items():
             if entry.status == RUNNING:
-                state.update(name, status=WAITING)
+                self._note("runs", name, status=WAITING)
 
     def progress(self) -> CampaignProgress:
         """Return how far the campaign is; an active run counts the frames that its worker last reported."""
-        entries = self._state.manifest.runs
+        entries, active = self.manifest.runs, dict(self._active)
         done = sum(run.n_frames for run in entries.values() if run.status == COMPLETE)
-        active = dict(self._state.active)
-        for runs in active.values():
-            done += sum(n for name, n in runs.items() if entries[name].status != COMPLETE)
+        done += sum(n for runs in active.values() for name, n in runs.items() if entries[name].status != COMPLETE)
         states = [run.status for run in entries.values()]
         total = sum(run.n_frames_wanted for run in entries.values() if run.status != FAILED)
         return CampaignProgress(done, total, states.count(COMPLETE), states.count(FAILED), len(states), active)
 
     @contextmanager
-    def polling(self) -> Iterator[None]:
+    def polling(self, every_s: float) -> Iterator[None]:
         """Ask the workers how far they are, in a thread of its own: a worker that hangs must not stop the campaign."""
         over = threading.Event()
 
         def ask() -> None:
-            while not over.wait(self._poll_every_s):
+            while not over.wait(every_s):
                 with suppress(Exception):  # asked again soon
                     found = self._client.run(poll, self._token, on_error="ignore")
                     reports = [report for report in found.values() if isinstance(report, dict)]
-                    self._state.active = {report["pid"]: report["frames"] for report in reports}
+                    self._active = {report["pid"]: report["frames"] for report in reports}
 
         thread = threading.Thread(target=ask, name="campaign-poll", daemon=True)
         thread.start()
@@ -222,100 +277,76 @@ class _Job:
             over.set()
             thread.join(timeout=5.0)
 
-    def _submit_scene(self, name: str) -> None:
-        spec = next(scene for scene in self._campaign.scenes if scene.name == name)
-        seed = first_seed(self._campaign.seed, name, 0.0)
-        runs = self._runs[name]
-        replicas = 1 + max(run.replica for run in runs)
-        task = SceneTask(self._token, str(self._campaign.folder.resolve()), spec, runs[0], seed, replicas)
-        self._submit(f"scene/{name}", prepare_scene, task, priority=1 << 62)
-
-    def _submit_run(self, run: Run) -> None:
-        task = RunTask(
-            self._token,
-            str(self._campaign.folder.resolve()),
-            run,
-            self._campaign.checkpoint_every_s,
-            self._state.manifest.runs[run.name].frames_sha256,
-        )
-        # Long runs first: the workers then end together.
-        atoms = self._state.manifest.scenes[run.scene].n_atoms or 1
-        self._submit(run.name, simulate_run, task, priority=atoms * run.config.n_frames * run.config.steps_per_frame)
-
-    def _submit(self, name: str, work: Callable[[Any], dict[str, Any]], task: Any, *, priority: int) -> None:
-        attempt = self._state.attempts[name] = self._state.attempts.get(name, 0) + 1
-        key = f"surromd-{self._token}-{name}-{attempt}"
-        future = self._client.submit(work, task, key=key, priority=priority, pure=False)
-        self._state.futures[name] = future
-        future.add_done_callback(lambda done: self._ended.put((name, done)))
-
-    def _collect(self, name: str, future: Any, *, again: bool = True) -> None:
-        """Take what a task returned: note it, hand out what it made possible, or try again."""
-        if self._state.futures.get(name) is not future:
-            return
-        del self._state.futures[name]
-        result = result_of(future)
-        kind, _, scene = name.partition("/")
-        is_scene = kind == "scene" and bool(scene)
-        if result["status"] == "complete":
-            result.pop("status")
-            self._scene_done(scene, result) if is_scene else self._run_done(name, result)
-            return
-        if not again:
-            return
-        if result["status"] == "stopped":  # it had not heard of us for long, as when this machine slept
-            self._state.attempts[name] -= 1
-        elif result["hopeless"] or self._state.attempts[name] > self._campaign.retries:
-            self._give_up(scene if is_scene else name, result["reason"], is_scene=is_scene)
-            return
-        if is_scene:
-            self._submit_scene(scene)
+    def _submit(self, task: SceneSpec | Run, attempt: int = 1) -> None:
+        """Hand out a task. Scenes go first, then long runs, so that the workers end together. A key of its own for each
+        attempt: Dask takes a key that it knows for a result that is there."""
+        key = f"surromd-{self._token}-{task.name}-{next(self._numbers)}"
+        own: tuple[Any, ...]
+        if isinstance(task, SceneSpec):
+            seed = first_seed(self._campaign.seed, task.name, 0.0)
+            runs = self._runs[task.name]
+            replicas = 1 + max(run.replica for run in runs)
+            work, own = "prepare_scene", (task, runs[0].config, seed, replicas)
+            priority = 1 << 62
         else:
-            self._submit_run(next(run for run in self._campaign.runs if run.name == name))
+            expected = self.manifest.runs[task.name].frames_sha256
+            work, own = "simulate_run", (task, self._campaign.checkpoint_every_s, expected)
+            atoms = self.manifest.scenes[task.scene].n_atoms or 1
+            priority = atoms * task.config.n_frames * task.config.steps_per_frame
+        future = self._client.submit(_work, work, self._token, self._folder, *own, key=key, priority=priority)
+        self._out[key] = (task, attempt, future)
+        self._ended.add(future)
 
-    def _scene_done(self, name: str, account: dict[str, Any]) -> None:
-        account["repairs"] = tuple(account["repairs"])
-        self._update_scene(name, status=COMPLETE, reason="", **account)
-        for run in self._runs[name]:
-            self._submit_run(run)
+    def _collect(self, *, again: bool = True) -> None:
+        """Note what ended tasks returned, and hand out what that made possible, or what failed `again`."""
+        for future in self._ended.next_batch(block=False):
+            task, attempt, _ = self._out.pop(future.key, (None, 0, None))
+            if task is None:
+                continue  # withdrawn
+            result = result_of(future)
+            status = result.pop("status")
+            if status == COMPLETE:
+                self._done(task, attempt, status=COMPLETE, reason="", **result)
+            elif not again:
+                continue
+            elif status == "stopped":  # it had not heard of us for long, as when this machine slept
+                self._submit(task, attempt)
+            elif result["hopeless"] or attempt > self._campaign.retries:
+                reason = " ".join(result["reason"].split())
+                self._failed(task.name, reason)
+                self._done(task, attempt, status=FAILED, reason=reason)
+            else:
+                self._submit(task, attempt + 1)
 
-    def _run_done(self, name: str, account: dict[str, Any]) -> None:
-        attempts = self._state.manifest.runs[name].attempts + self._state.attempts[name]
-        self._state.update(name, status=COMPLETE, reason="", attempts=attempts, **account)
-
-    def _give_up(self, name: str, reason: str, *, is_scene: bool) -> None:
-        reason = " ".join(reason.split())
-        self._failed(name, reason)
-        if not is_scene:
-            attempts = self._state.manifest.runs[name].attempts + self._state.attempts[name]
-            self._state.update(name, status=FAILED, reason=reason, attempts=attempts)
+    def _done(self, task: SceneSpec | Run, attempt: int, **entries: Any) -> None:
+        if isinstance(task, Run):
+            attempts = self.manifest.runs[task.name].attempts + attempt
+            self._note("runs", task.name, attempts=attempts, **entries)
             return
-        self._update_scene(name, status=FAILED, reason=reason)
-        for run in self._runs[name]:
-            self._state.update(run.name, status=FAILED, reason=f"scene {name}: {reason}")
+        self._note("scenes", task.name, **entries)
+        for run in self._runs[task.name]:
+            if entries["status"] == COMPLETE:
+                self._submit(run)
+            else:
+                self._note("runs", run.name, status=FAILED, reason=f"scene {task.name}: {entries['reason']}")
 
-    def _update_scene(self, name: str, **entries: Any) -> None:
-        manifest = self._state.manifest
-        scene = replace(manifest.scenes[name], **entries)
-        self._state.manifest = replace(manifest, scenes={**manifest.scenes, name: scene})
-        self._state.changed = True
+    def _note(self, table: Literal["scenes", "runs"], name: str, **entries: Any) -> None:
+        old: dict[str, Any] = getattr(self.manifest, table)
+        changed: dict[str, Any] = {table: {**old, name: replace(old[name], **entries)}}
+        self.manifest, self._is_written = replace(self.manifest, **changed), False
 
 
-def result_of(future: Any) -> dict[str, Any]:
-    """Return what a task returned; one that Dask itself gave up counts as failed, and may be tried again."""
-    if future.status == "cancelled":
-        raise SimulationError("the Dask scheduler is gone; the same command goes on with another.")
-    if future.status == "error":
-        error = future.exception()
-        killed = type(error).__name__ == "KilledWorker"
-        reason = "its workers were killed again and again" if killed else f"{type(error).__name__}: {error}"
-        return {"status": "failed", "reason": reason, "hopeless": False}
-    return dict(future.result())
+def _work(name: str, *given: Any) -> dict[str, Any]:
+    """Do a task of `md_reference.campaign.worker`, which imports OpenMM: only workers do."""
+    from md_reference.campaign import worker
+
+    result: dict[str, Any] = getattr(worker, name)(*given)
+    return result
 
 
 @contextmanager
 def _only_process(folder: Path) -> Iterator[None]:
-    """Hold the campaign's claim. Raises InputError when another process runs the campaign."""
+    """Hold the campaign's lock. Raises InputError when another process runs the campaign."""
     existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:

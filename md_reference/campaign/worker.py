@@ -1,4 +1,4 @@
-"""Tasks of a campaign's workers: prepare a scene, simulate one run from wherever it stands, report progress, stop.
+"""Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands.
 
 A run's file belongs to one task at a time (systems.trajectory.claim), and a task stops by itself, with a checkpoint,
 when the campaign that started it has not been heard of for a minute.
@@ -6,90 +6,75 @@ when the campaign that started it has not been heard of for a minute.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
-import signal
 import socket
-import threading
-import time
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from md_reference.campaign.campaign_file import Run, SceneSpec
+from md_reference.campaign.cluster import LEASE_S, guarded, session_of
 from md_reference.campaign.manifest import MANIFEST_NAME, file_sha256, frames_sha256
-from systems.errors import InputError, StorageError, SurromdError
-from systems.interrupts import stop_when
+from md_reference.forces.forcefield import build_system, resolve
+from md_reference.forces.solvation import require_molecules, solvate
+from md_reference.forces.spec import ForceFieldSpec, WaterBox
+from md_reference.run.config import MDConfig
+from md_reference.run.platforms import PlatformChoice, measured_platform
+from md_reference.run.simulate import simulate
+from md_reference.run.starts import many_starts
+from systems.chemistry.graph import molecule_key
+from systems.errors import InputError
+from systems.files.outside import content
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
+from systems.options import options_of
+from systems.preparation import Preparation
+from systems.scene import Scene
+from systems.source import prepare
+from systems.trajectory.claim import Claim
+from systems.trajectory.codec import companions, open_trajectory
+from systems.trajectory.topology_file import topology_path
 
-# Without a word from the campaign for so long its runs stop.
-LEASE_S = 60.0
-# So long a task waits for another one, which is about to end, to let go of its file.
-_CLAIM_PATIENCE_S = 2 * LEASE_S
-
-
-@dataclass
-class _Session:
-    """One `surromd campaign` as its worker sees it: when it was last heard of, and the frames done per active run."""
-
-    heard_at: float = field(default_factory=time.monotonic)
-    stopped: bool = False
-    frames: dict[str, int] = field(default_factory=dict)
-
-    def should_stop(self) -> bool:
-        return self.stopped or time.monotonic() - self.heard_at > LEASE_S
-
-
-_sessions: dict[str, _Session] = {}
-_sessions_lock = threading.Lock()
-
-
-def _session(token: str) -> _Session:
-    with _sessions_lock:
-        return _sessions.setdefault(token, _Session())
-
-
-def poll(token: str) -> dict[str, Any]:
-    """Return this worker's process and the frames done by each of its active runs; the campaign is heard of."""
-    session = _session(token)
-    session.heard_at = time.monotonic()
-    return {"pid": os.getpid(), "host": socket.gethostname(), "frames": dict(session.frames)}
-
-
-def stop(token: str) -> None:
-    """Have the runs of a campaign stop between two frames, with a checkpoint."""
-    _session(token).stopped = True
-
-
-def dask_setup(_: Any) -> None:
-    """Called by Dask in a worker that starts: Ctrl-C goes to the campaign, which tells its workers."""
-    with suppress(ValueError):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class SceneTask:
-    """Prepare a scene: `run` is any of its runs (they share all but temperature and seed), `seed` the scene's
-    own, `replicas` how many begin apart."""
+class PreparedScene:
+    """What replicas share: the scene, the force field resolved for it, and the platform they run on; where each begins,
+    `(n_atoms, 3)` nm, as far as that is known, how it was found, and the seed of that."""
 
-    token: str
-    folder: str
-    spec: SceneSpec
-    run: Run
-    seed: int
-    replicas: int = 1
+    scene: Scene
+    force: ForceFieldSpec
+    platform: PlatformChoice
+    starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    started: str = ""
+    seed: int = 0
 
+    def start_of(self, replica: int, config: MDConfig) -> Scene:
+        """Return what a replica starts from; that of one by which the campaign has grown is drawn now."""
+        if replica < len(self.starts_nm):
+            return replace(self.scene, positions_nm=np.array(self.starts_nm[replica]))
+        if replica == 0 or config.starts != "many":
+            return self.scene
+        return many_starts(self.scene, replace(config, force=self.force, seed=self.seed), replica + 1).scenes[-1]
 
-@dataclass(frozen=True)
-class RunTask:
-    """Simulate one run. `expected` is the hash of its frames where the manifest already has one."""
-
-    token: str
-    folder: str
-    run: Run
-    checkpoint_every_s: float
-    expected: str = ""
+    def summary(self) -> dict[str, Any]:
+        """Return what the manifest says of it."""
+        repairs = self.scene.provenance.get("repairs")
+        return {
+            "n_atoms": self.scene.n_atoms,
+            "formula": self.scene.formula,
+            "topology_hash": self.scene.topology_hash,
+            "molecule_key": molecule_key(self.scene),
+            "platform": self.platform.name,
+            "force": asdict(self.force),
+            "starts": self.started,
+            "repairs": tuple(map(str, repairs)) if isinstance(repairs, list | tuple) else (),
+        }
 
 
 def scene_path(folder: Path, name: str) -> Path:
@@ -97,90 +82,108 @@ def scene_path(folder: Path, name: str) -> Path:
     return folder / "scenes" / f"{name}.json"
 
 
-def prepare_scene(task: SceneTask) -> dict[str, Any]:
-    """Prepare a scene once, decide what all its replicas share, write `scenes/NAME.json` and return its account.
+def prepare_scene(
+    token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
+) -> dict[str, Any]:
+    """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary.
 
-    Force-field parameters are made here, so that replicas find them in the cache.
+    `config`: of any of its runs, which share all but temperature and seed; `seed`: of the water around it;
+    `replicas`: how many begin apart.
     """
 
     def work() -> dict[str, Any]:
-        from md_reference.campaign.start_scene import prepare_once
+        path = scene_path(folder, spec.name)
+        return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
 
-        path = scene_path(Path(task.folder), task.spec.name)
-        return prepare_once(path, task.spec, task.run.config, task.seed, task.replicas).account()
-
-    return guarded(task.token, Path(task.folder) / MANIFEST_NAME, work)
+    return guarded(token, folder / MANIFEST_NAME, work)
 
 
-def simulate_run(task: RunTask) -> dict[str, Any]:
-    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete."""
-    folder, session = Path(task.folder), _session(task.token)
+def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
+    """Write and return the scene, solvated where the solvent is made of molecules, its platform chosen, starts of its
+    replicas drawn; its forces are built, so that replicas find parameters that take long in the cache."""
+    scene = prepare(spec.source, options=_chosen(Preparation, spec))
+    force = resolve(scene, config.force)
+    if spec.preparation.get("keep_water"):
+        require_molecules(force)
+    if force.is_explicit and scene.cell_nm is None:
+        scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
+    system = build_system(scene, force)
+    choice = measured_platform(scene, replace(config, force=force), system=lambda: system)
+    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(choice, timings=()), seed=seed)
+    if replicas > 1 and config.starts == "many":
+        starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
+        frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
+        prepared = replace(prepared, starts_nm=frames, started=starts.how)
+    record = {
+        "scene": prepared.scene.to_dict(),
+        "force": asdict(force),
+        "platform": asdict(prepared.platform),
+        "starts_nm": prepared.starts_nm,
+        "started": prepared.started,
+        "seed": seed,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    create_whole(path, json.dumps(record))
+    return prepared
+
+
+def _chosen(kind: type[T], spec: SceneSpec) -> T:
+    """Return what a scene's table says of the options of `kind`, the defaults for the rest."""
+    return kind(**{name: value for name, value in spec.preparation.items() if name in options_of(kind)})
+
+
+def load_prepared(path: Path) -> PreparedScene:
+    """Read what `prepare_scene` wrote. Raises InputError when it cannot be read."""
+    try:
+        return built(PreparedScene, parsed(content(path)))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); delete it to have the scene prepared again.") from error
+
+
+def simulate_run(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
+    """Simulate a run, or go on with it, and return what the manifest says of it when it is complete.
+
+    `expected`: the hash of its frames, where the manifest already has one.
+    """
+    frames = session_of(token).frames
 
     def work() -> dict[str, Any]:
         # Read when OpenMM creates its first Context: one thread per replica.
         os.environ["OPENMM_CPU_THREADS"] = "1"
-        session.frames[task.run.name] = 0
+        frames[run.name] = 0
         try:
-            return _simulate(task, folder, session)
+            return _simulate(token, folder, run, checkpoint_every_s, expected)
         finally:
-            session.frames.pop(task.run.name, None)
+            frames.pop(run.name, None)
 
-    return guarded(task.token, folder / MANIFEST_NAME, work)
-
-
-def guarded(token: str, witness: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return what `work` returns, or how it ended; nothing is raised into Dask, which would count it as its own.
-
-    `witness`: a file that whoever started the task has written where the task is to write. What waits within it, for a
-    frame or for another program's charges, hears when the campaign is to stop.
-    """
-    session = _session(token)
-    if session.stopped:
-        return {"status": "stopped"}
-    try:
-        # A file system that lags behind, or is not shared, is the only reason for its absence.
-        if not witness.is_file():
-            raise StorageError(f"{socket.gethostname()} does not see {witness}; all workers must share that folder.")
-        with stop_when(session.should_stop):
-            return {"status": "complete", **work()}
-    except KeyboardInterrupt:
-        return {"status": "stopped"}
-    except SurromdError as error:
-        return {"status": "failed", "reason": str(error), "hopeless": isinstance(error, InputError)}
-    except Exception as error:
-        return {"status": "failed", "reason": f"{type(error).__name__}: {error}", "hopeless": False}
+    return guarded(token, folder / MANIFEST_NAME, work)
 
 
-def _simulate(task: RunTask, folder: Path, session: _Session) -> dict[str, Any]:
-    from md_reference.campaign.start_scene import load_prepared
-    from md_reference.run.simulate import simulate
-    from systems.trajectory.claim import Claim
-    from systems.trajectory.codec import companions, open_trajectory
-    from systems.trajectory.topology_file import topology_path
+def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, expected: str) -> dict[str, Any]:
+    session = session_of(token)
 
     def report(done: int, total: int, note: str | None = None) -> None:
         if note is None:
-            session.frames[task.run.name] = done
+            session.frames[run.name] = done
 
-    prepared = load_prepared(scene_path(folder, task.run.scene))
-    config = replace(task.run.config, force=prepared.force)
-    out = folder / task.run.file
+    prepared = load_prepared(scene_path(folder, run.scene))
+    out = folder / run.file
     out.parent.mkdir(parents=True, exist_ok=True)
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
-    Claim(out, patience_s=_CLAIM_PATIENCE_S, stopped=session.should_stop).close()
+    Claim(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
     simulate(
-        prepared.start_of(task.run.replica, task.run.config),
-        config,
+        prepared.start_of(run.replica, run.config),
+        replace(run.config, force=prepared.force),
         out,
         resume=True,
         progress=report,
-        checkpoint_every_s=task.checkpoint_every_s,
+        checkpoint_every_s=checkpoint_every_s,
         choice=prepared.platform,
     )
     with open_trajectory(out) as reader:
         record, n_frames = dict(reader.record), reader.n_frames
     digest = frames_sha256(out)
-    if task.expected and digest != task.expected:
+    if expected and digest != expected:
         raise InputError(
             f"{out} is not what this campaign once wrote there (its frames differ from {MANIFEST_NAME}); delete it to "
             "have the run made again."

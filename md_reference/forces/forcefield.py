@@ -18,10 +18,11 @@ from md_reference.forces.spec import MODEL, PROTEIN_FORCE_FIELDS, QUANTUM, Force
 from md_reference.forces.template_files import cutoff_nm
 from md_reference.forces.templates import build_templated, uncovered_residue
 from systems.errors import PreparationError
-from systems.scene import IntArray, Scene
+from systems.scene import IntArray, Scene, once_per_scene
 from systems.selection import part_of
 
 
+@once_per_scene
 def resolve(scene: Scene, spec: ForceFieldSpec) -> ForceFieldSpec:
     """Return the spec with 'auto' settled for this scene; this is what a record states.
 

@@ -8,7 +8,7 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.symmetry import element_graph
+from systems.chemistry.symmetry import bonded_graph
 from systems.scene import Scene
 
 # Amber's radius set mbondi3: hydrogens on the guanidinium of arginine, in nm.
@@ -76,7 +76,7 @@ def _charges(system: Any) -> list[Any]:
 
 def _guanidinium_hydrogens(scene: Scene) -> list[int]:
     """Hydrogens on the nitrogens of carbons that have three of them."""
-    graph: nx.Graph = element_graph(scene.elements, scene.bonds)
+    graph: nx.Graph = bonded_graph(scene)
     symbol = scene.elements
     found = []
     for c in (i for i, e in enumerate(symbol) if e == "C"):

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.capped_residues import cap
 from md_reference.forces.regrouping import permuted, regroup
-from md_reference.forces.residue_templates import ResidueTemplate, make_template
+from md_reference.forces.residue_templates import ResidueTemplate, cap, make_template
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.errors import PreparationError

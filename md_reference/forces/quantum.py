@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from systems.chemistry.distance_bonds import changed_bond
+from systems.chemistry.geometry_rules import changed_stereo
 from systems.errors import PreparationError, first_line
 from systems.scene import FloatArray, Scene
 
@@ -72,8 +73,8 @@ def build_quantum_system(
 
 
 def refuse_rearranged(scene: Scene, positions_nm: FloatArray) -> None:
-    """Raise PreparationError where a minimum `(n_atoms, 3)` nm has other bonds than the scene."""
-    if what := changed_bond(scene, positions_nm):
+    """Raise PreparationError where a minimum `(n_atoms, 3)` nm has other bonds or another handedness than the scene."""
+    if what := changed_bond(scene, positions_nm) or changed_stereo(scene, positions_nm[None])[0]:
         raise PreparationError(
             f"scene {scene.name!r} becomes another molecule when GFN2-xTB minimises it: {what}. Give the form that it "
             "becomes (a neutral one for a zwitterion), or simulate it with `solvent='alpb-water'`."

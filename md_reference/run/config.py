@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.integrators import check_ensemble
-from systems.errors import InputError, UnknownNameError
+from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
 from systems.trajectory.codec import refuse_columns
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
 # What `platform` says for replicas in vector registers (`md_reference.simd`); to OpenMM it is none.
 SIMD = "simd"
+ENSEMBLES = ("nvt", "nve", "npt")
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,11 @@ def settings_of(config: MDConfig) -> dict[str, Any]:
     return {**flat, **force}
 
 
+def flat_settings(config: MDConfig) -> dict[str, Any]:
+    """Return what `settings_of` does but the seed, which belongs to a run's place among others."""
+    return {key: value for key, value in settings_of(config).items() if key != "seed"}
+
+
 def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring: tuple[str, ...] = ()) -> None:
     """Raise InputError unless a record or a checkpoint states the settings of `config`.
 
@@ -109,17 +114,38 @@ def check_same_run(old: dict[str, Any], config: MDConfig, out: Path, *, ignoring
         )
 
 
-def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
-    """Return the settings with force field and ensemble settled for this scene, before anything is computed.
+def resolved(scene: Scene, config: MDConfig) -> MDConfig:
+    """Return the settings with force field, solvent and ensemble resolved for this scene (solvated, where the solvent
+    is explicit): the one value that every later stage of a run takes.
 
-    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
+    Raises UnknownNameError (with the nearest name), InputError for a constant pressure without a periodic cell, and
+    what `forcefield.resolve` raises.
     """
     from md_reference.forces.forcefield import resolve  # the builders of forces are slow to import
 
-    _ = config.steps_per_frame
     if config.keep not in ("auto", "solute", "all"):
         raise UnknownNameError(f"unknown `keep` {config.keep!r}; known: solute, all, auto.")
+    ensemble = config.ensemble.lower()
+    if ensemble not in ENSEMBLES:
+        raise UnknownNameError(
+            f"unknown ensemble {config.ensemble!r}; known: {', '.join(ENSEMBLES)}." + nearest(ensemble, list(ENSEMBLES))
+        )
+    if ensemble == "npt" and scene.cell_nm is None:
+        raise InputError(
+            f"ensemble npt needs a volume, and scene {scene.name!r} has no periodic cell; use nvt, or give an explicit "
+            "`solvent`."
+        )
+    return replace(config, force=resolve(scene, config.force), ensemble=ensemble)
+
+
+def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
+    """Return the settings `resolved` for this scene, before anything is computed.
+
+    Raises UnitError for uneven intervals, InputError for what `out` cannot hold or the scene cannot have.
+    """
+    _ = config.steps_per_frame
+    config = resolved(scene, config)
     kept = config.kept_atoms(scene)
     check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
     refuse_columns(out, config.columns)
-    return replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
+    return config

@@ -75,6 +75,17 @@ def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = N
     return settings, f"{what}: {', '.join(_say(key, value) for key, value in decided.items())} ({source})"
 
 
+def to_config(values: Mapping[str, Any], *, seed: int) -> MDConfig:
+    """Return a run of these settings, by the names of MDConfig and ForceFieldSpec; forces left open are settled for its
+    scene later. Raises InputError where its length is not given, and what the fields refuse."""
+    if "time_ps" not in values:
+        raise InputError("time is missing; write, for example, time = '10ns'.")
+    of_forces = {f.name for f in fields(ForceFieldSpec)}
+    force = {"force_field": "auto", "solvent": "auto"} | {k: v for k, v in values.items() if k in of_forces}
+    own = {key: value for key, value in values.items() if key not in of_forces}
+    return MDConfig(**own, seed=seed, force=ForceFieldSpec(**force))
+
+
 def _of_quantum(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the defaults at quantum level beside what is asked for. Raises InputError for too long a step."""
     is_flexible = asked.get("constrain_hydrogens") is False or asked.get("hydrogen_mass_da", _HYDROGEN_MASS_DA) is None

@@ -14,7 +14,6 @@ from md_reference.forces.mixture import solute_of
 from md_reference.forces.quantum import refuse_rearranged
 from md_reference.forces.spec import QUANTUM
 from md_reference.run.config import Conditions
-from md_reference.run.integrators import add_barostat, check_ensemble, make_integrator
 from md_reference.run.machine import platform_properties
 from md_reference.run.platforms import choose_platform
 from systems.chemistry.element_data import covalent_radius_nm
@@ -27,6 +26,7 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8
 _FLAT_NM3 = 2e-4
+_STEPS_BETWEEN_VOLUME_MOVES = 25
 # A bond is broken that is longer than so many sums of covalent radii; the longest of a minimised molecule are 1.1.
 _BROKEN = 1.25
 
@@ -95,10 +95,10 @@ def _atom_name(scene: Scene, i: int) -> str:
 class Engine:
     """One scene, one force field, one integrator, one Context. Use as a context manager or call `close`.
 
-    `threads`: of the CPU platform, where they are settled. `native_gb`: see `build_system`. `system`: what that
-    returned for this scene and these forces, where it is there already; a barostat is added to it. Virtual sites are
-    placed here and appear nowhere else. Raises what `build_system` and `check_ensemble` raise, and SimulationError when
-    the platform cannot run the scene.
+    `conditions`: force field and ensemble resolved for the scene (`config.resolved`). `threads`: of the CPU platform,
+    where they are settled. `native_gb`: see `build_system`. `system`: what that returned for this scene and these
+    forces, where it is there already; a barostat is added to it. Virtual sites are placed here and appear nowhere else.
+    Raises what `build_system` raises, and SimulationError when the platform cannot run the scene.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Engine:
     ) -> None:
         import openmm
 
-        self.ensemble = check_ensemble(conditions.ensemble, scene)
+        self.ensemble = conditions.ensemble
         self.scene = scene
         self.spec = conditions.force
         choice = choose_platform(scene.n_atoms, conditions.platform, born=self.spec.solvent != "vacuum")
@@ -327,3 +327,50 @@ class Engine:
     def close(self) -> None:
         """Free the Context. The engine cannot be used afterwards."""
         self._context = None
+
+
+def integrator_name(ensemble: str) -> str:
+    """Return the name that records have for the integrator of an ensemble."""
+    return "VelocityVerlet" if ensemble == "nve" else "LangevinMiddle"
+
+
+def make_integrator(
+    system: Any, ensemble: str, *, temperature_k: float, friction_per_ps: float, timestep_ps: float
+) -> Any:
+    """Return the `openmm.Integrator` of an ensemble."""
+    import openmm
+
+    if ensemble != "nve":
+        return openmm.LangevinMiddleIntegrator(temperature_k, friction_per_ps, timestep_ps)
+    return velocity_verlet(timestep_ps, constrained=system.getNumConstraints() > 0)
+
+
+def velocity_verlet(timestep_ps: float, *, constrained: bool) -> Any:
+    """Return velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with RATTLE where bonds are constrained.
+
+    Unlike those of OpenMM's VerletIntegrator, a leapfrog, its velocities belong to the same time as its positions.
+    """
+    import openmm
+
+    integrator = openmm.CustomIntegrator(timestep_ps)
+    integrator.addUpdateContextState()
+    integrator.addComputePerDof("v", "v+0.5*dt*f/m")
+    integrator.addComputePerDof("x", "x+dt*v")
+    if constrained:
+        integrator.addPerDofVariable("unconstrained", 0.0)
+        integrator.addComputePerDof("unconstrained", "x")
+        integrator.addConstrainPositions()
+        integrator.addComputePerDof("v", "v+0.5*dt*f/m+(x-unconstrained)/dt")
+        integrator.addConstrainVelocities()
+    else:
+        integrator.addComputePerDof("v", "v+0.5*dt*f/m")
+    return integrator
+
+
+def add_barostat(system: Any, *, pressure_bar: float, temperature_k: float, seed: int) -> None:
+    """Add a Monte Carlo barostat (Åqvist et al., Chem. Phys. Lett. 384, 288 (2004)) to a periodic System."""
+    import openmm
+
+    barostat = openmm.MonteCarloBarostat(pressure_bar, temperature_k, _STEPS_BETWEEN_VOLUME_MOVES)
+    barostat.setRandomNumberSeed(seed)
+    system.addForce(barostat)

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.forcefield import build_system, resolve
+from md_reference.forces.forcefield import build_system
 from md_reference.forces.mixture import molecules_of
 from md_reference.forces.nonstandard import lacking_residues
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import SIMD, MDConfig
+from md_reference.run.config import SIMD, MDConfig, resolved
 from md_reference.run.engine import Engine
-from md_reference.run.integrators import check_ensemble
 from md_reference.run.machine import available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform, simd_choice
 from md_reference.run.timing import as_records
@@ -81,8 +80,8 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
     planned and as OpenMM would do it unasked; 0 times nothing, and the size of the scene decides.
     Raises PreparationError (no parameters), UnknownNameError (platform), SimulationError (the scene cannot be stepped).
     """
-    spec = resolve(scene, config.force)
-    config = replace(config, ensemble=check_ensemble(config.ensemble, scene), force=spec)
+    config = resolved(scene, config)
+    spec = config.force
     system = build_system(scene, spec)
     n_constraints = int(system.getNumConstraints())
     cores = available_cores()
@@ -110,7 +109,7 @@ def make_plan(scene: Scene, config: MDConfig, *, replicas: int = 1, measure_s: f
             default, _ = _time_step_s(scene, config, measure_s, alone, relaxed_nm=relaxed_nm)
     wall_s = _wall_s(config, replicas, planned) if config.time_ps else None
     return Plan(
-        line=plan_line(scene, config, choice, step_s=planned, wall_s=wall_s),
+        line=plan_line(scene, config, choice, step_s=planned, replicas=replicas),
         scene=scene.name,
         formula=scene.formula,
         n_atoms=scene.n_atoms,
@@ -220,12 +219,18 @@ def plan_line(
     choice: PlatformChoice,
     *,
     step_s: float | None = None,
-    wall_s: float | None = None,
+    replicas: int = 0,
 ) -> str:
     """Return the plan in one line: what runs on what, what is left out, and how long it takes where that is known.
 
-    `config`: force field and ensemble settled. `step_s`: of one step, `wall_s`: of the whole run, in seconds.
+    `config`: `resolved`. `step_s`: seconds of a step, by the timing that chose the platform where it is not given;
+    `replicas`: of how many the wall time is told, 0 for no such time.
     """
+    if step_s is None:
+        chosen = (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads))
+        timed = next(chosen, None)
+        step_s = None if timed is None else timed * 1e-6
+    wall_s = _wall_s(config, replicas, step_s) if replicas and config.time_ps else None
     spec = config.force
     periodic = scene.cell_nm is not None
     threads = "1 thread" if choice.threads == 1 else f"{choice.threads} threads"
@@ -244,16 +249,6 @@ def plan_line(
     if wall_s is not None:
         parts.append(f"about {format_wall(wall_s)}")
     return "; ".join(parts)
-
-
-def line_of_run(scene: Scene, config: MDConfig, choice: PlatformChoice, *, replicas: int) -> str:
-    """Return the line of a run whose platform has been chosen, by the timing that chose it."""
-    config = replace(config, force=resolve(scene, config.force), ensemble=check_ensemble(config.ensemble, scene))
-    timed = next(
-        (t.us_per_step for t in choice.timings if (t.platform, t.threads) == (choice.name, choice.threads)), None
-    )
-    step_s = None if timed is None else timed * 1e-6
-    return plan_line(scene, config, choice, step_s=step_s, wall_s=_wall_s(config, replicas, step_s))
 
 
 def _parallel(replicas: int, cores: int, threads: int) -> str:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from md_reference.forces.forcefield import resolve
 from md_reference.run.batch import simulate_batch
 from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.machine import available_cores
-from md_reference.run.plan import line_of_run
+from md_reference.run.plan import plan_line
 from md_reference.run.platforms import measured_platform, simd_choice
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
 from md_reference.run.starts import many_starts
@@ -63,7 +62,7 @@ def simulate_replicas(
     given = None if isinstance(scene, Scene) else list(scene)
     scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
-        check_run(scene, config, out)
+        config = check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
     jobs = [[k] for k in range(len(outs))]
     if config.platform == SIMD:
@@ -75,16 +74,15 @@ def simulate_replicas(
     choice = None
     if fresh and config.platform == SIMD:
         if announce is not None:
-            announce(line_of_run(scene, config, simd_choice(), replicas=len(outs)))
+            announce(plan_line(scene, config, simd_choice(), replicas=len(outs)))
     elif fresh:
-        settled = replace(config, force=resolve(scene, config.force))
-        choice = measured_platform(scene, settled, max_threads=max(1, available_cores() // width), side_by_side=width)
+        choice = measured_platform(scene, config, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
-            announce(line_of_run(scene, config, choice, replicas=len(outs)))
+            announce(plan_line(scene, config, choice, replicas=len(outs)))
     scenes = [scene] * len(outs) if given is None else given
     if fresh and given is None and config.starts == "many" and len(outs) > 1:
         tell_preparing(progress, 0.0)
-        starts = many_starts(scene, replace(config, force=resolve(scene, config.force)), len(outs))
+        starts = many_starts(scene, config, len(outs))
         scenes = list(starts.scenes)
         if announce is not None:
             announce(starts.how)

@@ -14,8 +14,7 @@ import numpy as np
 
 from md_reference.forces.forcefield import build_system
 from md_reference.run.config import MDConfig, check_run, check_same_run, settings_of
-from md_reference.run.engine import Engine, State, refuse_damaged
-from md_reference.run.integrators import integrator_name
+from md_reference.run.engine import Engine, State, integrator_name, refuse_damaged
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError

@@ -20,6 +20,7 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
 from systems.chemistry.distance_bonds import changed_bond
+from systems.chemistry.geometry_rules import changed_stereo
 from systems.chemistry.graph import turn_torsions
 from systems.errors import PreparationError, SimulationError
 from systems.parent_watch import end_with_parent
@@ -97,8 +98,13 @@ class Teacher:
     def label(self, positions_nm: FloatArray) -> Labels:
         """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out, as are those
         of another molecule."""
-        asked = list(np.asarray(positions_nm, dtype=np.float64))
-        states = [state for state in asked if not changed_bond(self.scene, state, stretch=_BROKEN)]
+        asked = np.asarray(positions_nm, dtype=np.float64)
+        stereo = changed_stereo(self.scene, asked)
+        states = [
+            state
+            for state, turned in zip(asked, stereo, strict=True)
+            if not turned and not changed_bond(self.scene, state, stretch=_BROKEN)
+        ]
         self.n_rearranged += len(asked) - len(states)
         if self._pool is None:
             answers = [_answer(self._potential, state) for state in states]

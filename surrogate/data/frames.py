@@ -313,8 +313,8 @@ def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities:
                 scene, lag_ps, conditions = reader.scene, float(steps[0]), found
             if reader.scene.topology_hash != scene.topology_hash:
                 raise InputError(
-                    f"{path} holds another topology than {paths[0]}; one model learns one "
-                    "scene, or, with graph = true in [model], many."
+                    f"{path} holds another topology than {paths[0]}; one model learns one scene, or several peptides "
+                    "(`arch='lam-slide-peptides'`)."
                 )
             if not np.isclose(steps[0], lag_ps, rtol=1e-4):
                 raise InputError(f"{path} is saved every {steps[0]:g} ps, {paths[0]} every {lag_ps:g} ps.")

@@ -38,11 +38,6 @@ def standard_turn(scene: Scene) -> FloatArray:
     return axes
 
 
-def order_along_axis(scene: Scene) -> npt.NDArray[np.int64]:
-    """Return the atoms `(n_atoms,)` in their order along the longest axis, however the scene numbers them."""
-    return np.argsort(in_standard_pose(scene).positions_nm[:, 0], kind="stable")
-
-
 def in_standard_pose(scene: Scene) -> Scene:
     """Return the scene laid along its own axes (`standard_turn`), the middle of the fitted atoms at the origin."""
     centred = scene.positions_nm - scene.positions_nm[fitted_atoms(scene)].mean(axis=0)

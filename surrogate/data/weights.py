@@ -35,7 +35,7 @@ class TrainingDomain:
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
-    `transferable`: molecules that look like these from within are covered too (sampling.coverage).
+    `transferable`: other peptides of such residues are covered too (sampling.peptide_coverage).
     """
 
     scene: Scene

@@ -28,12 +28,10 @@ def with_compiled_parts(model: _Model) -> _Model:
     if not any(shutil.which(name) for name in (os.environ.get("CXX") or "g++", "clang++")):
         raise InputError("compiling needs a C++ compiler (g++ or clang++), which is not on the PATH; leave it out.")
     copied = copy.deepcopy(model)
-    # A model that wraps another one (such as heavy atoms with hydrogens placed): the inner one's networks.
-    within = next((child for child in copied.children() if isinstance(child, Surrogate)), copied)
-    if isinstance(within, Surrogate) and within.integrates:
+    if isinstance(copied, Surrogate) and copied.integrates:
         return copied  # what it integrates is compiled as it is
-    lists = [child for child in within.children() if isinstance(child, nn.ModuleList)]
-    parents: list[nn.Module] = [within, *lists]
+    lists = [child for child in copied.children() if isinstance(child, nn.ModuleList)]
+    parents: list[nn.Module] = [copied, *lists]
     for parent in parents:
         for name, child in list(parent.named_children()):
             if type(child).forward is nn.Module.forward and child not in lists:  # it has none

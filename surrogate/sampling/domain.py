@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.data.poses import order_along_axis
-from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, cover, torsion_environments
+from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, member_of, torsion_environments
 from surrogate.sampling.lags import at_lag, choose_lag
 from surrogate.sampling.peptide_coverage import cover_peptide, unseen_neighbours
 from systems.chemistry.graph import bonded_graph
@@ -60,10 +59,9 @@ def find_deviations(
 
     `model`: of these weights; one that knows peptides by residues covers other sequences, too.
 
-    Weights that know atoms by their bonds cover other molecules too: see `coverage.cover`. Compared are elements, the
-    number of atoms, the total charge, bond types (elements and order), the surroundings of rotatable bonds,
-    connectivity, stereo, the starting structure (by the validity of the training reference's frames) and the
-    temperature, where one is asked for.
+    Compared are elements, the number of atoms, the total charge, bond types (elements and order), the surroundings of
+    rotatable bonds, connectivity, stereo, the starting structure (by the validity of the training reference's frames)
+    and the temperature, where one is asked for.
     """
     return _compare(scene, domain, None if model is None else _peptides(model), temperature_k).deviations
 
@@ -151,18 +149,16 @@ def _peptides(model: Surrogate) -> PeptideConfig | None:
 def _compare(
     scene: Scene, domain: TrainingDomain, peptides: PeptideConfig | None, temperature_k: float | None
 ) -> DomainMatch:
-    own, beyond = cover(scene, domain)
-    seen = not domain.transferable or any(own.scene is member.scene for member in domain.members)
-    found, order = list(beyond), np.arange(0)
-    nearness = ""
-    if not seen and peptides is not None:
+    member = member_of(scene, domain)
+    own, order, nearness = member or domain, np.arange(0), ""
+    if member is None and peptides is not None:
         own, order, beyond = cover_peptide(scene, domain, peptides)
         found = list(beyond)
         new = unseen_neighbours(own.scene, domain) if not any(not d.forcible for d in found) else []
         nearness = f"residues that it never saw side by side: {', '.join(new)}" if new else "each pair of residues seen"
-    elif not seen:
-        order = order_along_axis(scene)
-    elif not beyond:
+    elif member is None:
+        found = [Deviation("connectivity", "another molecule than those trained on", forcible=False)]
+    else:
         order, found = _compare_molecules(scene, own.scene)
         if not any(not d.forcible for d in found):
             found += _compare_start(scene, order, Geometry.from_dict(own.geometry))
@@ -171,7 +167,7 @@ def _compare(
     if trained_k is not None and abs(asked_k - trained_k) > TEMPERATURE_TOLERANCE_K:
         reason = f"{asked_k:g} K, trained at {trained_k:g} K, and this model takes no temperature"
         found.append(Deviation("temperature", reason, forcible=True))
-    return DomainMatch(order, own, tuple(found), seen, nearness)
+    return DomainMatch(order, own, tuple(found), member is not None, nearness)
 
 
 def _compare_molecules(scene: Scene, template: Scene) -> tuple[npt.NDArray[np.int64], list[Deviation]]:

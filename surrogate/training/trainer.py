@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from surrogate.data.references import References
-from surrogate.data.weights import Weights, read_header
+from surrogate.data.weights import read_header
 from surrogate.models.settings import build
 from systems.errors import InputError
 
@@ -138,10 +138,6 @@ class Trainer(ABC):
         """Return the settings that suit the references where they differ from the defaults; those that the request
         has already stay as they are."""
         return ()
-
-    def stabler(self, weights: Weights) -> Choice | None:
-        """Return a setting that keeps bonds to hydrogen in place where rollouts of these weights lose them."""
-        return None
 
     @abstractmethod
     def settings(self, request: TrainingRequest) -> Settings:

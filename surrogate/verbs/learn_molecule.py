@@ -63,5 +63,5 @@ def learn_molecule(
         after_s = trial_s(PainetPotential(config), scene)
         out = trainer.learn(truth, request, advance, before_s=time.monotonic() - began, after_s=after_s)
         if truth.n_rearranged and not options.quiet:
-            tell(out.name, f"{truth.n_rearranged} states left out: their bonds are those of another molecule")
+            tell(out.name, f"{truth.n_rearranged} states left out: they are another molecule, by bonds or handedness")
         return out

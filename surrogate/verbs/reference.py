@@ -88,13 +88,11 @@ def settle_run(
 
     Of the options those count that are settings of a run (MDConfig, ForceFieldSpec) or make its box. Raises InputError.
     """
-    from md_reference.campaign.run_options import to_config
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level
-    from md_reference.run.config import MDConfig
-    from md_reference.run.defaults import settle
-    from md_reference.run.integrators import check_ensemble
+    from md_reference.run.config import MDConfig, resolved
+    from md_reference.run.defaults import settle, to_config
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
@@ -118,7 +116,7 @@ def settle_run(
         seed=seed,
         temperature_k=config.temperature_k,
     )
-    config = replace(config, ensemble=check_ensemble(config.ensemble, scene))
+    config = resolved(scene, config)
     if not quiet:
         if scene is not dry:
             tell(scene.name, scene.provenance["repairs"][-1])

@@ -17,7 +17,6 @@ from systems.units import format_time_ps
 if TYPE_CHECKING:
     from surrogate.data.weights import TrainingDomain, Weights
     from surrogate.models.painet.potential.model import PainetPotential
-    from surrogate.training.trainer import Trainer
     from systems.scene import Scene
 
 # Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
@@ -148,8 +147,6 @@ class _Rolled:
     n_frames: int = 0
     n_caught: int = 0
     # Bonds more than 20 % off, and how many of them hold a hydrogen.
-    n_stretched: int = 0
-    n_with_hydrogen: int = 0
     stopped: str = ""
 
     def __post_init__(self) -> None:
@@ -184,37 +181,26 @@ def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
     import numpy as np
 
     from surrogate.sampling.guards import caught
-    from systems.chemistry.validity import Geometry, flag_names
+    from systems.chemistry.validity import flag_names
     from systems.trajectory.codec import open_trajectory
 
     with open_trajectory(path) as reader:
         if not reader.n_frames or reader.flags is None:
             return
-        flags, frames = np.asarray(reader.flags).astype(np.uint16), reader.read()
-    geometry = Geometry.from_dict(domain.geometry)
+        flags = np.asarray(reader.flags).astype(np.uint16)
     found.n_frames += len(flags)
     found.time_ps += len(flags) * domain.lag_ps
     found.n_caught += int(caught(flags).sum())
     for bits in flags[caught(flags)].tolist():
         for name in flag_names(bits):
             found.reasons[name] = found.reasons.get(name, 0) + 1
-    i, j = np.asarray(geometry.bond_idx).reshape(-1, 2).T
-    lengths = np.linalg.norm(frames[:, i] - frames[:, j], axis=-1)
-    stretched = (np.abs(lengths / geometry.bond_mean_nm - 1.0) > 0.2).sum(axis=0)
-    holds = (geometry.hydrogen[i] | geometry.hydrogen[j]).astype(bool)
-    found.n_stretched += int(stretched.sum())
-    found.n_with_hydrogen += int(stretched[holds].sum())
 
 
 def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _Rolled) -> list[str]:
     """Return what would help, what is likeliest first."""
-    from surrogate.models.registry import architecture
     from surrogate.training.loss_curves import series
 
     found = _nearer_weights(weights)
-    trainer: Trainer = architecture(weights.model.arch).trainer()
-    if 2 * rolled.n_with_hydrogen >= rolled.n_stretched and (better := trainer.stabler(weights)) is not None:
-        found.append(f"{better.reason} ({better.key} = {json.dumps(better.value)})")
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
     if weights.model.integrates:
         n_frames = 0  # it learned from states, which need be no MD

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm, is_metal
 from systems.chemistry.geometry import near_pairs
+from systems.elements import PARTICLE
 from systems.errors import PreparationError
 from systems.scene import Scene
 
@@ -25,20 +26,21 @@ def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -
     """Return the scene with bonds, by covalent radii, for residues that hold an atom without any; else as it is.
 
     Two atoms are bonded when they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum
-    of their radii and 0.04 nm. Ions and rare gases stay alone.
+    of their radii and 0.04 nm. Ions, rare gases and virtual sites stay alone.
     Where residues stand in pieces, because a file's atoms are shuffled, every atom is looked at, and bonds that other
     programs have made of the pieces are dropped where they are impossibly long.
     """
     if scene.positions_nm.any() and _are_in_pieces(scene):
         return _all_by_distance(scene)
-    bonded = np.zeros(scene.n_atoms, dtype=bool)
+    virtual = np.array([e == PARTICLE for e in scene.elements])
+    bonded = virtual.copy()
     bonded[scene.bonds.ravel()] = True
     residue = scene.residue_of_atom
     size = np.bincount(residue, minlength=len(scene.residue_names))
     open_residues = np.unique(residue[~bonded & (size[residue] > 1)])
     if not len(open_residues) or not scene.positions_nm.any():
         return scene
-    atoms = np.flatnonzero(np.isin(residue, open_residues))
+    atoms = np.flatnonzero(np.isin(residue, open_residues) & ~virtual)
     found = bonds_by_distance([scene.elements[i] for i in atoms], scene.positions_nm[atoms], cell_nm)
     return _with_more(scene, atoms[found])
 
@@ -57,12 +59,12 @@ def _are_in_pieces(scene: Scene) -> bool:
 def _all_by_distance(scene: Scene) -> Scene:
     i, j = scene.bonds.T
     length = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=1)
-    radii = np.array([covalent_radius_nm(e) for e in scene.elements])
+    radii = np.array([0.0 if e == PARTICLE else covalent_radius_nm(e) for e in scene.elements])
     good = length < radii[i] + radii[j] + _SLACK_NM
     # Orders and charges that were perceived in wrong bonds are none.
     nothing = np.zeros(int(good.sum())), np.zeros_like(scene.formal_charges)
     kept = replace(scene, bonds=scene.bonds[good], bond_orders=nothing[0], formal_charges=nothing[1])
-    atoms = np.flatnonzero([not is_metal(e) for e in scene.elements])
+    atoms = np.flatnonzero([not is_metal(e) and e != PARTICLE for e in scene.elements])
     return _with_more(kept, atoms[bonds_by_distance([scene.elements[k] for k in atoms], scene.positions_nm[atoms])])
 
 

@@ -68,6 +68,27 @@ def signed_volumes(positions_nm: npt.ArrayLike, quads: npt.ArrayLike) -> FloatAr
     return volumes[0] if single else volumes
 
 
+def extend(
+    a: npt.NDArray[np.float64],
+    b: npt.NDArray[np.float64],
+    c: npt.NDArray[np.float64],
+    length: float,
+    angle_deg: float,
+    torsion_deg: float,
+) -> npt.NDArray[np.float64]:
+    """Return the point `(3,)` at `length` from c, at `angle_deg` to b and `torsion_deg` about b-c to a, in the unit of
+    the positions `(3,)`."""
+    angle, twist = np.radians(angle_deg), np.radians(torsion_deg)
+    axis = (c - b) / np.linalg.norm(c - b)
+    normal = np.cross(b - a, axis)
+    normal = normal / np.linalg.norm(normal)
+    inward = np.cross(normal, axis)
+    out: npt.NDArray[np.float64] = c + length * (
+        -np.cos(angle) * axis + np.sin(angle) * (np.cos(twist) * inward + np.sin(twist) * normal)
+    )
+    return out
+
+
 def superposition(
     positions_nm: npt.ArrayLike,
     template_nm: npt.ArrayLike,

@@ -26,6 +26,9 @@ _CLASH_SHARE_OF_LEAST = 0.8
 # Of unit vectors to three neighbours: 0.77 where a fourth is missing, 0 where there is none.
 _PYRAMID = 0.4
 _FRAMES_FOR_SHAPE = 200
+# What is flatter than this has no handedness: a signed volume, a torsion's cosine.
+_FLAT_NM3 = 2e-4
+_FLAT_COSINE = 0.1
 
 
 def n_pairs(n_atoms: int) -> int:
@@ -102,6 +105,31 @@ def measured_rules(scene: Scene, positions_nm: FloatArray) -> dict[str, Any]:
         seen = np.quantile(least, _TOLERATED_SHARE, axis=1, method="lower")
         rules["clash_min_nm"] = np.minimum(_CLASH_SHARE_OF_LEAST * seen, CLASH_AT_MOST_NM)
     return rules
+
+
+def changed_stereo(scene: Scene, positions_nm: FloatArray) -> list[str]:
+    """Return of each state `(n_states, n_atoms, 3)` nm what of the scene's handedness it has not, in words, empty where
+    it has all: a stereocentre turned over, or a double bond gone from cis to trans or back. What the scene has flat may
+    go either way; amides turn without becoming another molecule."""
+    from systems.chemistry.graph import stereocentres
+
+    centres, torsions = stereocentres(scene), _stiff_torsions(scene)
+    order = {frozenset(b): o for b, o in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True)}
+    double = [k for k, (_, i, j, _) in enumerate(torsions.tolist()) if order.get(frozenset((i, j))) == 2.0]
+    torsions = torsions[double]
+    start, states = (np.moveaxis(np.asarray(x, dtype=np.float64), 0, -1).swapaxes(0, 1) for x in
+                     (scene.positions_nm[None], positions_nm))  # fmt: skip
+    volume, cosine = signed_volume(start, centres), torsion_cosine(start, torsions)
+    wrong_centre = (np.abs(volume) > _FLAT_NM3) & (volume * signed_volume(states, centres) < 0)
+    wrong_bond = (np.abs(cosine) > _FLAT_COSINE) & (cosine * torsion_cosine(states, torsions) < 0)
+    name, found = scene.atom_names, [""] * len(positions_nm)
+    for state in np.flatnonzero(wrong_centre.any(axis=0) | wrong_bond.any(axis=0)).tolist():
+        if wrong_centre[:, state].any():
+            found[state] = f"the stereocentre {name[int(centres[wrong_centre[:, state], 0][0])]} turns over"
+        else:
+            i, j = torsions[wrong_bond[:, state]][0, 1:3].tolist()
+            found[state] = f"the double bond {name[i]} - {name[j]} turns from cis to trans or back"
+    return found
 
 
 def centres_without_hydrogen(scene: Scene, positions_nm: FloatArray) -> IntArray:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from systems.chemistry.geometry import torsion
 from systems.chemistry.matching import match_atoms
-from systems.chemistry.symmetry import classify, element_graph
-from systems.scene import FloatArray, Scene
+from systems.chemistry.symmetry import bonded_graph, classify
+from systems.scene import FloatArray, Scene, once_per_scene
 
 IntArray = npt.NDArray[np.int64]
 
@@ -34,14 +34,7 @@ __all__ = [
 ]
 
 
-def bonded_graph(scene: Scene) -> nx.Graph:
-    """Return the graph of atoms (node attribute `element`) and bonds (edge attribute `order`, 0 where unknown)."""
-    graph = element_graph(scene.elements, scene.bonds)
-    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
-        graph.edges[i, j]["order"] = order
-    return graph
-
-
+@once_per_scene
 def molecule_key(scene: Scene) -> str:
     """Return a hash of elements, connectivity, total charge and stereo, 16 hexadecimal digits.
 
@@ -55,6 +48,7 @@ def molecule_key(scene: Scene) -> str:
     return hashlib.sha256(repr(record).encode()).hexdigest()[:16]
 
 
+@once_per_scene
 def atom_classes(scene: Scene) -> IntArray:
     """Return a class number per atom `(n_atoms,)`: equal for atoms that connectivity and stereo do not tell apart.
 
@@ -65,6 +59,7 @@ def atom_classes(scene: Scene) -> IntArray:
     return np.array([rank[c] for c in colours], dtype=np.int64)
 
 
+@once_per_scene
 def stereocentres(scene: Scene) -> IntArray:
     """Return the stereocentres as rows (centre, a, b, c), `(k, 4)`, neighbours in canonical order.
 
@@ -74,9 +69,10 @@ def stereocentres(scene: Scene) -> IntArray:
     return np.array(classify(scene).centres, dtype=np.int64).reshape(-1, 4)
 
 
+@once_per_scene
 def ring_bonds(scene: Scene) -> IntArray:
     """Return the bonds that lie in a ring, `(k, 2)` with i < j."""
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     bridges = {(min(e), max(e)) for e in nx.bridges(graph)}
     rows = [(i, j) for i, j in scene.bonds.tolist() if (min(i, j), max(i, j)) not in bridges]
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
@@ -89,7 +85,7 @@ def backbone_torsions(scene: Scene) -> dict[str, IntArray]:
     carbons X and Y (caps included). CA has no multiple bond in a ring: caffeine and picolinamide are no peptides. Names
     and residues play no part; scenes without peptides give empty arrays.
     """
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     symbol = scene.elements
 
     def near(i: int, element: str) -> list[int]:
@@ -142,9 +138,10 @@ def _along_chain(units: list[tuple[int, int, int]], joined: dict[int, int]) -> l
     return list(out)
 
 
+@once_per_scene
 def exclusions(scene: Scene, depth: int = 3) -> IntArray:
     """Return the pairs (i < j) at most `depth` bonds apart, `(k, 2)`: 1-2, 1-3 and 1-4 pairs by default."""
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     rows = [
         (i, j)
         for i in range(scene.n_atoms)
@@ -191,7 +188,7 @@ def rotatable_torsions(scene: Scene, *, rotors: bool = False) -> IntArray:
     Rotatable: single, in no ring, no amide C-N, heavy atoms beyond both ends. `rotors` adds bonds to groups whose only
     further atoms are hydrogens (methyl, hydroxyl, NH3). The outer atoms are heavy where they can be.
     """
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     in_ring = {(i, j) for i, j in ring_bonds(scene).tolist()}
     amide = {(min(r[1], r[2]), max(r[1], r[2])) for r in backbone_torsions(scene)["omega"].tolist()}
     rank = atom_classes(scene)

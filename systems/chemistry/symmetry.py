@@ -16,11 +16,10 @@ from itertools import pairwise
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.geometry import signed_volumes, torsion
 from systems.elements import ATOMIC_NUMBERS
-from systems.scene import FloatArray, Scene
+from systems.scene import FloatArray, Scene, once_per_scene
 
 _LARGEST_RING = 12
 _CC_DOUBLE_NM = 0.141
@@ -44,20 +43,24 @@ class AtomClasses:
         return tuple(sorted(self.colours))
 
 
-def element_graph(elements: Sequence[str], bonds: npt.NDArray[np.int64]) -> nx.Graph:
-    """Return the graph of bonded atoms, indices as nodes, with the node attribute `element`."""
+@once_per_scene
+def bonded_graph(scene: Scene) -> nx.Graph:
+    """Return the graph of atoms (node attribute `element`) and bonds (edge attribute `order`, 0 where unknown), frozen:
+    it is made once per scene, so `copy()` it to change it."""
     graph = nx.Graph()
-    graph.add_nodes_from((i, {"element": e}) for i, e in enumerate(elements))
-    graph.add_edges_from(bonds.tolist())
-    return graph
+    graph.add_nodes_from((i, {"element": e}) for i, e in enumerate(scene.elements))
+    orders = zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True)
+    graph.add_edges_from((i, j, {"order": order}) for (i, j), order in orders)
+    return nx.freeze(graph)
 
 
+@once_per_scene
 def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> AtomClasses:
     """Return the classes of a scene's atoms; `mirrored` classifies its mirror image, `stereo=False` connectivity only.
 
     Bond orders and atomic charges are left out: programs differ in them for one and the same molecule.
     """
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     rings = _ring_sizes(graph)
     neighbours = [sorted(graph[i]) for i in range(scene.n_atoms)]
     labels = {(i, j): rings.get((min(i, j), max(i, j)), 0) for i in range(scene.n_atoms) for j in neighbours[i]}
@@ -119,7 +122,7 @@ def local_handedness(scene: Scene) -> dict[int, int]:
     Neighbours are ranked by their atomic number, then by the sorted atomic numbers one, two and three bonds behind
     them, as the rules of Cahn, Ingold and Prelog begin; the sign is that of the three highest.
     """
-    graph = element_graph(scene.elements, scene.bonds)
+    graph = bonded_graph(scene)
     number = [ATOMIC_NUMBERS.get(e, 0) for e in scene.elements]
 
     def rank(start: int, centre: int) -> tuple[tuple[int, ...], ...]:

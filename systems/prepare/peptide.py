@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.geometry import signed_volumes, superposition, torsion
+from systems.chemistry.geometry import extend, signed_volumes, superposition, torsion
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
 from systems.prepare.protonation import protonation_account
 from systems.prepare.read.modified_residues import D_RESIDUES
-from systems.prepare.read.structure_text import read_structure
 from systems.prepare.repair import fixed_random_numbers, records_from_openmm
+from systems.prepare.rotamers import residue_shape
 from systems.prepare.structure import scene_from_records
 from systems.scene import Scene
 
@@ -128,8 +126,8 @@ def _heavy_atoms(names: list[str]) -> tuple[Any, Vector]:
         phi = _PROLINE_PHI_DEG if template.name == "PRO" else _PHI_DEG
         at = _place(template.name, at, phi, psi)
         if k == len(names) - 1 and template.is_amino_acid:
-            at["OXT"] = _extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi)
-        at |= {"O": _extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi + 180.0)} if template.is_amino_acid else {}
+            at["OXT"] = extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi)
+        at |= {"O": extend(at["N"], at["CA"], at["C"], _C_O, _CA_C_O, psi + 180.0)} if template.is_amino_acid else {}
         atoms = {}
         for atom in (*template.heavy, *(["OXT"] if "OXT" in at else [])):
             atoms[atom] = topology.addAtom(atom, app.Element.getBySymbol(atom[0]), residue)
@@ -147,46 +145,27 @@ def _place(name: str, before: dict[str, Vector], phi: float, psi: float) -> dict
     if name == "ACE":
         at = {"CH3": np.zeros(3), "C": np.array([_CA_C, 0.0, 0.0])}
         plane = np.array([0.0, 1.0, 0.0])
-        at["O"] = _extend(plane, at["CH3"], at["C"], _C_O, _CA_C_O, 0.0)
+        at["O"] = extend(plane, at["CH3"], at["C"], _C_O, _CA_C_O, 0.0)
         return at
     if not before:
         at = {"N": np.zeros(3), "CA": np.array([_N_CA, 0.0, 0.0])}
-        at["C"] = _extend(np.array([0.0, 1.0, 0.0]), at["N"], at["CA"], _CA_C, _N_CA_C, 180.0)
+        at["C"] = extend(np.array([0.0, 1.0, 0.0]), at["N"], at["CA"], _CA_C, _N_CA_C, 180.0)
     else:
         alpha = before.get("CH3", before.get("CA"))
         assert alpha is not None
         c, o = before["C"], before["O"]
-        away = _extend(o, alpha, c, _C_N, _CA_C_N, 180.0)  # planar carbonyl: N opposite to O
+        away = extend(o, alpha, c, _C_N, _CA_C_N, 180.0)  # planar carbonyl: N opposite to O
         at = {"N": away}
-        at["CA"] = _extend(alpha, c, away, _N_CA, _C_N_CA, 180.0)
+        at["CA"] = extend(alpha, c, away, _N_CA, _C_N_CA, 180.0)
         if name == "NME":
             return {"N": at["N"], "C": at["CA"]}
-        at["C"] = _extend(c, away, at["CA"], _CA_C, _N_CA_C, phi)
-    shape = _residue_shape(name)
+        at["C"] = extend(c, away, at["CA"], _CA_C, _N_CA_C, phi)
+    shape = residue_shape(name)
     backbone = ("N", "CA", "C")
     target = np.array([at[a] for a in backbone])
     rotation, translation = superposition(np.array([[shape[a] for a in backbone]]), target)
     side = {a: rotation[0] @ x + translation[0] for a, x in shape.items() if a not in (*backbone, "O", "OXT")}
     return at | side
-
-
-def _residue_shape(name: str) -> dict[str, Vector]:
-    """Heavy atoms of PDBFixer's template of a residue, nm."""
-    path = Path(str(files("pdbfixer") / "templates" / f"{name}.pdb"))
-    return {a.name: np.array(a.position_angstrom) / 10.0 for a in read_structure(path).atoms if a.element != "H"}
-
-
-def _extend(a: Vector, b: Vector, c: Vector, length: float, angle_deg: float, torsion_deg: float) -> Vector:
-    """The point at `length` from c, at `angle_deg` to b and `torsion_deg` about b-c to a."""
-    angle, twist = np.radians(angle_deg), np.radians(torsion_deg)
-    axis = (c - b) / np.linalg.norm(c - b)
-    normal = np.cross(b - a, axis)
-    normal = normal / np.linalg.norm(normal)
-    inward = np.cross(normal, axis)
-    out: Vector = c + length * (
-        -np.cos(angle) * axis + np.sin(angle) * (np.cos(twist) * inward + np.sin(twist) * normal)
-    )
-    return out
 
 
 def _relaxed(modeller: Any) -> Vector:

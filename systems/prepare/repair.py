@@ -19,6 +19,7 @@ from systems.errors import PreparationError, first_line, listed
 from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_account
 from systems.prepare.read.records import AtomRecord
+from systems.prepare.rotamers import settle_side_chains
 from systems.prepare.structure import atom_label
 
 _C_OXT_ANGSTROM = 1.25
@@ -57,8 +58,11 @@ def complete(
             _forget_linked(fixer, residues)
             fixer.addMissingAtoms(seed=1)
             _add_bonds(fixer.topology, residues, bonding.bonds)
+            rebuilt = _without_overlaps(fixer, residues)
             modeller = app.Modeller(fixer.topology, fixer.positions)
             modeller.addHydrogens(pH=ph, variants=variants, platform=reference)
+    except PreparationError:
+        raise
     except Exception as error:  # PDBFixer and OpenMM raise bare Exceptions, KeyErrors and ValueErrors alike
         raise PreparationError(f"PDBFixer could not complete the structure ({first_line(error)}).") from error
     positions_nm = np.array(modeller.positions.value_in_unit(unit.nanometer), dtype=np.float64)
@@ -67,7 +71,7 @@ def complete(
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
-    account = _account(residues, records, ph)
+    account = _account(residues, records, ph) + rebuilt
     replaced = _with_replaced_hydrogens(residues, records, atoms)
     if replaced:
         account.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
@@ -94,6 +98,31 @@ def _add_bonds(topology: Any, residues: Sequence[Residue], bonds: npt.NDArray[np
     for i, j in bonds.tolist():
         if i in place and j in place and frozenset((place[i], place[j])) not in known:
             topology.addBond(place[i], place[j])
+
+
+def _without_overlaps(fixer: Any, residues: Sequence[Residue]) -> list[str]:
+    """Turn added side chains that stand in other atoms; return a line for each. Raises PreparationError."""
+    from openmm import unit
+
+    if not any(r.missing for r in residues):
+        return []
+    topology = fixer.topology
+    elements = [a.element.symbol for a in topology.atoms()]
+    positions_nm = np.array(fixer.positions.value_in_unit(unit.nanometer), dtype=np.float64)
+    sites = [{a.name: a.index for a in residue.atoms()} for residue in topology.residues()]
+    notes = settle_side_chains(
+        positions_nm,
+        elements,
+        [(a.index, b.index) for a, b in topology.bonds()],
+        [
+            (r.label, r.template.name, at, r.missing if r.template.is_amino_acid else ())
+            for r, at in zip(residues, sites, strict=True)
+            if r.template is not None
+        ],
+    )
+    if notes:
+        fixer.positions = positions_nm * unit.nanometer
+    return notes
 
 
 def records_from_openmm(

@@ -172,7 +172,8 @@ class TrajectoryReader(ABC):
 
     `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames. `run_id` is
     the number of the run that wrote the file, and `checksums` are those of its frames `(n_frames,)`, where it has them.
-    `notes`: sentences on what was assumed or left out, for people.
+    `notes`: sentences on what was assumed or left out, for people. `grid_nm`: what coordinates are rounded to as the
+    file states it, None where it does not say.
     """
 
     path: Path
@@ -188,6 +189,7 @@ class TrajectoryReader(ABC):
     notes: tuple[str, ...] = ()
     run_id: str = ""
     checksums: Mapping[str, Checksums] = MappingProxyType({})
+    grid_nm: float | None = None
 
     def read(self, start: int = 0, stop: int | None = None, stride: int = 1) -> Float32Array:
         """Return positions `(n, n_atoms, 3)` float32 nm of frames `start:stop:stride` (negative counts from the end).

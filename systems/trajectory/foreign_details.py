@@ -17,6 +17,8 @@ from systems.trajectory.stated_units import nm_per, ps_per
 _TRR_MAGIC = 1993
 # Of the header's ten sizes: box, virial, pressure, (topology), positions, velocities and forces have bytes behind it.
 _TRR_X = 7
+# Magic, atoms, step, time, nine numbers of the cell, atoms again; then the precision, a float32.
+_XTC_PRECISION = 56
 _TRR_FLOATS = (2, 3, 4, 7, 8, 9)
 
 
@@ -71,6 +73,26 @@ def trr_positions(path: Path) -> npt.NDArray[np.bool_]:
             file.seek((16 if double else 8) + sum(sizes[k] for k in _TRR_FLOATS), 1)
             found.append(sizes[_TRR_X] > 0)
     return np.array(found, dtype=bool)
+
+
+def trr_has_cell(path: Path) -> bool:
+    """Return whether the first frame of a TRR file states a cell: MDTraj gives memory that nobody set where not."""
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(12)[8:], "big")
+        file.seek(-(-length // 4) * 4 + 8, 1)
+        return int.from_bytes(file.read(4), "big") > 0
+
+
+def xtc_grid_nm(path: Path) -> float | None:
+    """Return what an XTC file rounds coordinates to, nm, by the precision in its first frame's header (1000: 0.001 nm);
+    None where it states none, as of nine atoms or fewer, which are not rounded."""
+    with path.open("rb") as file:
+        header = file.read(_XTC_PRECISION + 8)
+    if len(header) < _XTC_PRECISION + 8 or int.from_bytes(header[4:8], "big") <= 9:
+        return None
+    # Files of 2^31 bytes in a frame (magic 2023) differ behind the precision.
+    precision = float(np.frombuffer(header, ">f4", 1, _XTC_PRECISION)[0])
+    return 1.0 / precision if np.isfinite(precision) and precision > 0 else None
 
 
 class AsciiPath:

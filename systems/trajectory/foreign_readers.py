@@ -6,6 +6,7 @@ block.
 
 from __future__ import annotations
 
+import importlib
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -17,7 +18,15 @@ import numpy as np
 from systems.chemistry.cell_shape import read_cells
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.foreign_details import AsciiPath, counted_note, netcdf_units, trr_positions, unit_note
+from systems.trajectory.foreign_details import (
+    AsciiPath,
+    counted_note,
+    netcdf_units,
+    trr_has_cell,
+    trr_positions,
+    unit_note,
+    xtc_grid_nm,
+)
 from systems.trajectory.foreign_scenes import (
     bonds_completed,
     scene_from_mdtraj_topology,
@@ -78,8 +87,17 @@ class MdtrajReader(TrajectoryReader):
     def _load(self, path: Path, topology: Any) -> Any:
         import mdtraj
 
+        is_mol2 = path.name.lower().endswith(".mol2") and path.is_file()
+        n_molecules = path.read_bytes().count(b"@<TRIPOS>MOLECULE") if is_mol2 else 1
+        if n_molecules > 1:
+            raise InputError(f"{path} holds {n_molecules} molecules, of which MDTraj reads the first; write PDB.")
         try:
+            if is_mol2:
+                importlib.import_module("pandas")
             frames = mdtraj.load(str(self._ascii.path), **({} if topology is None else {"top": topology}))
+        except ImportError as error:
+            lacking = error.name or "a package"
+            raise TrajectoryError(f"{path} cannot be read: MDTraj needs {lacking}, which is not installed.") from error
         except Exception as error:
             needs = topology is None and not self._format.names_atoms
             hint = " (a format without topology: give one with `top`)" if needs else ""
@@ -117,6 +135,8 @@ class MdtrajReader(TrajectoryReader):
         self._nm, ps, self._cell_nm = (0.1, 1.0, 0.1) if self._file.distance_unit == "angstroms" else (1.0, 1.0, 1.0)
         if self._format.name.startswith("NetCDF"):
             self._nm, ps, self._cell_nm = netcdf_units(self._file._handle, self.path)
+        if self._format.name == "XTC":
+            self.grid_nm = xtc_grid_nm(self.path)
         positions, *_ = self._file.read(n_frames=1)
         self.n_atoms = int(positions.shape[1])
         self._file.seek(0)
@@ -174,6 +194,8 @@ class MdtrajReader(TrajectoryReader):
             if stored[2] is None:
                 return None
             return read_cells(np.asarray(stored[2])[::stride] * self._cell_nm, np.asarray(stored[3])[::stride])
+        if self._format.name == "TRR" and not trr_has_cell(self.path):
+            return None
         cells = None if stored[3] is None else np.asarray(stored[3], dtype=np.float64)
         return cells[::stride] if cells is not None and cells.ndim == 3 and cells.any() else None
 

@@ -56,7 +56,7 @@ def beyond(scene: Scene, start: int, end: int) -> list[int]:
     """Atoms on the side of `end` of the bond from `start` to `end`."""
     from systems.chemistry.graph import bonded_graph
 
-    graph = bonded_graph(scene)
+    graph = bonded_graph(scene).copy()
     graph.remove_edge(start, end)
     import networkx as nx
 

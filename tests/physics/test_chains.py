@@ -13,13 +13,12 @@ import pytest
 
 from energies import energy_terms
 from md_reference.forces import nonstandard
-from md_reference.forces.capped_residues import cap
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.glycans import glycan_templates
 from md_reference.forces.regrouping import regroup
-from md_reference.forces.residue_templates import make_template
+from md_reference.forces.residue_templates import cap, make_template
 from md_reference.forces.small_molecules.ambertools import find_ambertools, run
-from md_reference.forces.small_molecules.charge_cost import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
+from md_reference.forces.small_molecules.gaff import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
 from md_reference.forces.spec import ForceFieldSpec
 from systems.chemistry.bond_orders import perceive
 from systems.chemistry.graph import backbone_torsions

@@ -10,8 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from md_reference.forces.quantum import Potential
+from md_reference.forces.quantum import Potential, refuse_rearranged
 from md_reference.run.teacher import Teacher
+from systems.chemistry.geometry_rules import changed_stereo
+from systems.chemistry.graph import bonded_graph, turned
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray, Scene
@@ -129,3 +131,26 @@ def test_bad_molecules_are_refused_in_one_line() -> None:
     beyond = replace(scene, elements=("Fr", *scene.elements[1:]))
     with pytest.raises(PreparationError, match="no parameters for Fr"):
         Teacher(beyond, workers=1)
+
+
+def test_states_of_another_handedness_are_not_learned() -> None:
+    """The mirror image of a stereocentre and the other isomer of a double bond; a turned amide is the same molecule."""
+    for smiles, words in (("C[C@H](F)Cl", "stereocentre"), ("C/C=C/F", "double bond")):
+        scene = scene_from_smiles(smiles)
+        other = scene.positions_nm * [1.0, 1.0, -1.0] if "@" in smiles else _half_turn(scene)
+        found = changed_stereo(scene, np.array([scene.positions_nm, other, scene.positions_nm * 1.02]))
+        assert found[0] == found[2] == "" and words in found[1], found
+        with pytest.raises(PreparationError, match=f"becomes another molecule .*{words}"):
+            refuse_rearranged(scene, other)
+        refuse_rearranged(scene, scene.positions_nm)
+    assert changed_stereo(scene_from_smiles("CC(=O)NC"), _half_turn(scene_from_smiles("CC(=O)NC"), 1, 3)[None]) == [""]
+    with Teacher(scene, workers=1) as teacher:
+        found_labels = teacher.label(np.array([scene.positions_nm, other]))
+    assert len(found_labels.positions_nm) == 1 and found_labels.rearranged == 1
+
+
+def _half_turn(scene: Scene, i: int = 1, j: int = 2) -> FloatArray:
+    """The scene with what hangs on j turned about i - j by 180°."""
+    graph = bonded_graph(scene)
+    quad = (next(k for k in graph[i] if k != j), i, j, next(k for k in graph[j] if k != i))
+    return np.asarray(turned(scene.positions_nm, quad, np.pi, graph))

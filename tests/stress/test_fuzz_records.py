@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 
 from md_reference.campaign.campaign_file import read_campaign
 from md_reference.campaign.manifest import campaign_trajectories, read_manifest, write_manifest
-from md_reference.campaign.planned_manifest import check_same_campaign, new_manifest
-from md_reference.campaign.start_scene import PreparedScene, load_prepared
+from md_reference.campaign.scheduler import check_same_campaign, new_manifest
+from md_reference.campaign.worker import PreparedScene, load_prepared
 from md_reference.forces.forcefield import ForceFieldSpec, build_system
 from md_reference.run.platforms import PlatformChoice
 from md_reference.run.simulate import MDConfig, simulate
@@ -130,7 +130,7 @@ def prepared_kind(folder: Path, scene: Scene) -> Kind:
 
     def read() -> None:
         found = load_prepared(path)
-        found.account()
+        found.summary()
         build_system(found.scene, found.force)
 
     return Kind(record, lambda altered: path.write_text(json.dumps(altered)), read)

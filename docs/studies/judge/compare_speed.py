@@ -85,7 +85,7 @@ def pose(scene: Scene, torsions_rad: FloatArray, rng: np.random.Generator) -> np
     from systems.chemistry.geometry import torsion
     from systems.chemistry.graph import backbone_torsions, bonded_graph
 
-    quads, graph = backbone_torsions(scene), bonded_graph(scene)
+    quads, graph = backbone_torsions(scene), bonded_graph(scene).copy()
     frames = np.repeat(np.asarray(scene.positions_nm, dtype=np.float64)[None], len(torsions_rad), axis=0)
     for column, name in enumerate(("phi", "psi")):
         quad = np.asarray(quads[name][0])

@@ -38,9 +38,8 @@ def make_trajectories(
     at a friction of 0.1/ps the bath alone moves a carbon by 0.08 Å in the 100 fs that are to be predicted. Finished
     files stay and interrupted ones go on. Raises InputError for files of other settings.
     """
-    from md_reference.campaign.run_options import to_config
     from md_reference.forces.forcefield import resolve
-    from md_reference.run.defaults import settle
+    from md_reference.run.defaults import settle, to_config
     from md_reference.run.simulate import simulate
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -30,11 +30,11 @@ from n_body_views import ParticleView, WindowView
 from particle_flow import ParticleFlow, ParticleFlowConfig
 from particle_flow_training import sample_ahead
 from particle_sets import ParticleSet, read_set
-from torch import Tensor
+from torch import Tensor, nn
 
 from md_reference.run.machine import machine_name
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.codes.atom_code import AtomCode
+from surrogate.models.lam_slide.autoencoder import Decoded
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.losses import (
     FlowWindows,
@@ -183,7 +183,7 @@ def _of_a_set(
     )
     view, model = WindowView.of(train, weights), LamSlide(config)
     if change.exact:
-        model.autoencoder = ExactCode(config.autoencoder.n_latents)
+        model.autoencoder = ExactCode()
 
     def seen(data: ParticleSet) -> tuple[Tensor, Tensor]:
         x = view.to_model(data.positions_nm)
@@ -252,12 +252,14 @@ def _of_particles(change: Change, train: ParticleSet, weights: Array | None) -> 
     return model, loss, forecast
 
 
-class ExactCode(AtomCode):
+class ExactCode(nn.Module):
     """Particles' coordinates as they are, each a latent: what stage two could do if stage one lost nothing."""
 
-    def __init__(self, n_particles: int) -> None:
-        super().__init__()
-        self.n_latents = n_particles
+    def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor) -> Tensor:
+        return x
+
+    def decode(self, latents: Tensor, identifiers: Tensor) -> Decoded:
+        return Decoded(latents, None)
 
 
 def _code(model: LamSlide, draw: DrawWindows, batch: int, state: Path) -> None:

@@ -25,7 +25,7 @@ PACKAGES = tuple(str(ROOT / name) for name in ("systems", "md_reference", "surro
 # By name: the classes lie in other modules in other checkouts.
 VALUES = {
     "reference": ("Scene",),
-    "train": ("TrainingFrames", "PartOfFrames", "FrameSets", "MoleculeWindows"),
+    "train": ("TrainingFrames", "FrameSets", "MoleculeWindows"),
     "compare": ("Ensemble", "StoredFrames", "Opened", "Probes"),
 }
 

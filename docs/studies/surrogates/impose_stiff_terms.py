@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.data.features.stiff_terms import drawn_terms
+from surrogate.data.frames import collect_frames
 from surrogate.data.shipped import weights_path
+from surrogate.data.weights import load_weights, save_weights
 from systems.chemistry.validity import BOND_20_PERCENT, INVALID, Geometry, check_frames
 from systems.errors import InputError
 from systems.trajectory.codec import open_trajectory
-
-sys.path.append(str(Path(__file__).parents[1] / "training"))
-from alanine_dipeptide import ship
 
 if TYPE_CHECKING:
     from surrogate.models.stiff import StiffTerms
@@ -129,7 +129,10 @@ def main() -> None:
     if args.references:
         if args.out is None:
             parser.error("say with -o where to write the weights")
-        path = ship(path, args.out, args.references)
+        weights, frames = load_weights(path), collect_frames(args.references)
+        provenance = {**weights.provenance, "stiff_terms": frames.origin}
+        save_weights(args.out, weights.model, weights.domain, provenance, stiff=drawn_terms(frames), half=True)
+        path = args.out
     if args.check is None:
         return
     sys.stdout.write("             bonds / Å  angles / °  energy, median  99 %  off by / kJ/mol  valid / %\n")

@@ -28,8 +28,6 @@ from surrogate.data.weights import load_weights
 from systems.library import named_scenes
 from systems.trajectory.codec import open_trajectory, open_writer
 
-# Scenes beside the one that is in the weights, by their name.
-_SCENES = {"alkanes-alcohols-ethers": ("smiles:CCO", "smiles:CCCO")}
 _FITTED = ("resampling", "normal-modes", "frozen")
 
 
@@ -39,16 +37,15 @@ def hashes_of_frames(folder: Path) -> dict[str, str]:
     for name, path in shipped_weights().items():
         weights = load_weights(path)
         time_ps = 2 * weights.model.n_new * weights.domain.lag_ps
-        for scene in (weights.domain.scene, *_SCENES.get(name, ())):
-            for precision in ("fp32", "bf16"):
-                outs = api.rollout(scene, name, folder / "r.h5", time_ps=time_ps, replicas=2, seed=3, guard="flag",
-                                   precision=precision, overwrite=True, quiet=True)  # fmt: skip
-                digest = hashlib.sha256()
-                for out in outs:
-                    with open_trajectory(out) as reader:
-                        digest.update(np.ascontiguousarray(reader.read()).tobytes())
-                label = scene if isinstance(scene, str) else scene.name
-                found[f"{name} {weights.hash[:12]} {label} {precision}"] = digest.hexdigest()[:16]
+        scene = weights.domain.scene
+        for precision in ("fp32", "bf16"):
+            outs = api.rollout(scene, name, folder / "r.h5", time_ps=time_ps, replicas=2, seed=3, guard="flag",
+                               precision=precision, overwrite=True, quiet=True)  # fmt: skip
+            digest = hashlib.sha256()
+            for out in outs:
+                with open_trajectory(out) as reader:
+                    digest.update(np.ascontiguousarray(reader.read()).tobytes())
+            found[f"{name} {weights.hash[:12]} {scene.name} {precision}"] = digest.hexdigest()[:16]
     return found
 
 

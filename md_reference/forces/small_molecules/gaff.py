@@ -6,14 +6,17 @@ Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import networkx as nx
 
 from md_reference.forces.small_molecules import parameter_cache
 from md_reference.forces.small_molecules.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
-from md_reference.forces.small_molecules.charge_cost import announced, expected_s
 from md_reference.forces.small_molecules.parameter_cache import Entry
 from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
 from md_reference.forces.small_molecules.programs import scratch_folder
@@ -27,12 +30,18 @@ from systems.units import format_wall
 METHOD = "gaff2-am1bcc"
 ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
 _ATOMIC_NUMBERS = {"H": 1, "C": 6, "N": 7, "O": 8, "F": 9, "P": 15, "S": 16, "Cl": 17, "Br": 35, "I": 53}
-# `charge_cost` says how SQM's cost grows: hours from here on.
+# `expected_s` says how SQM's cost grows: hours from here on.
 LARGEST = 250
 _CHARGE_TOLERANCE_E = 0.01
 # The angle of hydrogen cyanide in gaff2.dat; `_run_parmchk2` says what it is for.
 _CANARY = "ha-c1-n1"
 _PARMCHK2_RUNS = 100
+# SECONDS_AT_30_ATOMS (atoms / 30)^POWER, measured by docs/studies/preparation/charge_cost.py: AmberTools 26.0,
+# processor seconds on a core of an AMD EPYC, ten molecules of 21 to 72 atoms, none off by more than a factor of 2.3.
+SECONDS_AT_30_ATOMS = 7.3
+POWER = 3.3
+_WORTH_SAYING_S = 2.0
+_log = logging.getLogger("surromd.charges")
 
 
 def parameters(scene: Scene, *, cached: bool = True) -> str:
@@ -278,3 +287,41 @@ def _sdf(scene: Scene) -> str:
         row = charged[start : start + 8]
         lines.append(f"M  CHG{len(row):3d}" + "".join(f"{i:4d}{q:4d}" for i, q in row))
     return "\n".join([*lines, "M  END", "$$$$", ""])
+
+
+def expected_s(n_atoms: int) -> float:
+    """Return about how many seconds AM1-BCC charges of a molecule of so many atoms take on one idle core."""
+    return SECONDS_AT_30_ATOMS * (n_atoms / 30.0) ** POWER
+
+
+@contextmanager
+def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
+    """Say before and after a molecule's charges are computed how long that takes, where it is worth saying.
+
+    Yields what `programs.run_program` calls while it waits: on a terminal it keeps a line with the seconds so far. The
+    lines are warnings of the logger 'surromd.charges': on stderr unless a program that uses this package decides else.
+    """
+    expected = expected_s(scene.n_atoms)
+    if expected < _WORTH_SAYING_S:
+        yield None
+        return
+    about = format_wall(float(f"{expected:.1g}"))
+    _log.warning(
+        "%s: AM1-BCC charges of %d atoms, about %s on an idle core, once: they are kept in the cache",
+        scene.name,
+        scene.n_atoms,
+        about,
+    )
+    on_terminal = sys.stderr.isatty() and _log.isEnabledFor(logging.WARNING)
+    started = time.monotonic()
+
+    def waiting(_: float) -> None:
+        sys.stderr.write(f"\r{scene.name}: {format_wall(time.monotonic() - started)} of about {about} \x1b[K")
+        sys.stderr.flush()
+
+    try:
+        yield waiting if on_terminal else None
+    finally:
+        if on_terminal:
+            sys.stderr.write("\r\x1b[K")
+    _log.warning("%s: charges computed in %s", scene.name, format_wall(time.monotonic() - started))

@@ -148,7 +148,7 @@ def _colour(solver: str | None) -> str:
 
 def _varies(rows: list[dict[str, Any]]) -> list[str]:
     """What of the weights differs between rows, and is worth a column."""
-    keys = ("weights", "atoms", "clean_conditioning")
+    keys = ("weights", "clean_conditioning")
     return [key for key in keys if len({row.get(key) for row in rows}) > 1]
 
 

@@ -147,7 +147,6 @@ def measure_setting(
         "weights_hash": weights.hash,
         **asdict(setting),
         "label": setting.label,
-        "atoms": "heavy, hydrogens placed" if getattr(model.config, "hydrogens", "") == "placed" else "all",
         "clean_conditioning": bool(getattr(getattr(model.config, "approximator", None), "clean_conditioning", False)),
     }
     try:

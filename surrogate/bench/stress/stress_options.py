@@ -25,5 +25,7 @@ class StressOptions(Seeded, Quiet):
         None,
         words=("section",),
     )
-    scene: str | None = option("Scene to test, for weights that cover many, such as smiles:CCO.", None)
+    scene: str | None = option(
+        "Scene to test, for weights of several peptides, such as sequence:ACE-LEU-SER-NME.", None
+    )
     quick: bool = option("Short runs: a minute or two.", False)

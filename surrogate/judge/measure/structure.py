@@ -51,7 +51,8 @@ class Features(InSegments):
     `phi` `(n, n_phi)` and `psi` `(n, n_psi)` rad, `bonds_nm` `(n, n_bonds)`, `flags` `(n,)`; all NaN-carrying where a
     frame is not finite. `chunk_idx` and `changed` `(n,)` or None; `energy_kj` `(n,)` kJ/mol, NaN where none was
     computed, or None; `moved_nm` `(n,)` how far atoms are, root mean square, from where they were in the frame before
-    (NaN for the first), centres of both laid together, or None. `series` holds the further families `(n, k)` that
+    (NaN for the first), centres of both laid together, or None; `grid_nm` what coordinates were rounded to, 0 for
+    nothing. `series` holds the further families `(n, k)` that
     `probes` names (see `surrogate.judge.measure.probes.Probes`), empty where nothing was asked for.
     """
 
@@ -67,6 +68,7 @@ class Features(InSegments):
     changed: Sequence[npt.NDArray[np.bool_]] | None = None
     energy_kj: Sequence[npt.NDArray[np.float64]] | None = None
     moved_nm: Sequence[Series] | None = None
+    grid_nm: float = 0.0
 
     @property
     def segment_lengths(self) -> list[int]:
@@ -200,6 +202,7 @@ class Yardstick:
             probes=probes,
             changed=ensemble.changed,
             moved_nm=moved,
+            grid_nm=ensemble.grid_nm,
         )
 
 

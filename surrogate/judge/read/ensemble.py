@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, unseen_notes
 from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
+from surrogate.judge.read.rounding import grid_of, rounded, rounding_note
 from surrogate.judge.read.stored_frames import StoredFrames
 from surrogate.judge.read.truth_asked import reweighting_notes
 from systems.errors import InputError, listed
@@ -79,7 +80,8 @@ class Ensemble(InSegments):
     by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
     `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
     segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
-    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading.
+    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading;
+    `grids_nm`: what the coordinates of each segment are rounded to, 0 for nothing (none given: nothing).
     Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
     """
 
@@ -96,6 +98,7 @@ class Ensemble(InSegments):
     notes: tuple[str, ...] = ()
     kept: IntArray | None = None
     changed: Sequence[npt.NDArray[np.bool_]] | None = None
+    grids_nm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
@@ -114,6 +117,11 @@ class Ensemble(InSegments):
     @property
     def segment_lengths(self) -> list[int]:
         return [len(s) for s in self.segments]
+
+    @property
+    def grid_nm(self) -> float:
+        """The coarsest rounding of any segment's coordinates, nm, 0 for none."""
+        return max(self.grids_nm, default=0.0)
 
     def sample(self, n_frames: int) -> npt.NDArray[np.float32]:
         """Return about `n_frames` finite frames `(n, n_atoms, 3)` nm, spread evenly (fewer of very large scenes)."""
@@ -135,6 +143,17 @@ class Ensemble(InSegments):
             lag_ps=self.lag_ps * stride,
             notes=(*self.notes, f"{self.label}: one frame in {stride} is used, for equal save intervals."),
         )
+
+    def on_grid(self, grid_nm: float) -> Ensemble:
+        """Return the same frames with coordinates rounded to `grid_nm`, where they are not as coarse already."""
+        own = self.grids_nm or (0.0,) * len(self.segments)
+        if min(own) >= grid_nm:
+            return self
+        segments = [
+            s if g >= grid_nm else s.on_grid(grid_nm) if isinstance(s, StoredFrames) else rounded(s, grid_nm)
+            for s, g in zip(self.segments, own, strict=True)
+        ]
+        return replace(self, segments=segments, grids_nm=tuple(max(g, grid_nm) for g in own))
 
     def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
         """Return the same frames with `atoms` `(k,)` only, which are those of `scene`."""
@@ -175,6 +194,7 @@ def load_ensemble(
     lags: list[float] = []
     notes: list[str] = []
     kept: list[IntArray] = []
+    grids: list[float] = []
     stopped: list[str] = []
     for path in paths:
         opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
@@ -186,6 +206,7 @@ def load_ensemble(
         notes += note
         lags.append(lag)
         frames = opened.frames
+        grids += [grid_of(reader)] * (len(cuts) + 1)
         size = 12 * len(frames) * reader.n_atoms
         if size <= in_memory_bytes:
             in_memory_bytes -= size
@@ -227,12 +248,13 @@ def load_ensemble(
         stated_lag_ps=lag_ps,
         notes=tuple(notes),
         kept=part,
+        grids_nm=tuple(grids),
     )
 
 
 def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
     """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
-    interval; and which of the first's atoms these are (None: all).
+    interval, rounded to the coarsest grid of any; and which of the first's atoms these are (None: all).
 
     The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
     are left, or when no common interval leaves 10 frames of each.
@@ -253,7 +275,13 @@ def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | Non
             f"Save intervals have no common multiple short enough to compare at ({intervals}); "
             "save again at a multiple of one another, or state the interval with `dt_ps`."
         )
-    return [e.strided(stride) for e, stride in zip(out, strides, strict=True)], common
+    out = [e.strided(stride) for e, stride in zip(out, strides, strict=True)]
+    grid = max(e.grid_nm for e in out)
+    if grid > 0:
+        note = rounding_note([e.label for e in out if e.grid_nm == grid], grid)
+        out = [e.on_grid(grid) for e in out]
+        out[0] = replace(out[0], notes=(*out[0].notes, note))
+    return out, common
 
 
 def _common_atoms(every: IntArray, kept: Sequence[IntArray | None]) -> IntArray | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.judge.read.rounding import rounded
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader
 
@@ -83,9 +84,9 @@ def make_whole(frames_nm: Frames, cells_nm: npt.NDArray[np.floating], tree: Bond
 class StoredFrames:
     """Frames of one open file, an array `(n, n_atoms, 3)` float32 nm to whoever slices it.
 
-    Atoms are those of `order` (all where None), molecules made whole with `tree` (not where None). Slices read from the
-    file; `thinned` and `restricted` do not. The file is open for as long as anybody
-    refers to it.
+    Atoms are those of `order` (all where None), molecules made whole with `tree` (not where None), coordinates rounded
+    to `grid_nm` (not where 0). Slices read from the file; `thinned`, `restricted` and `on_grid` do not. The file is
+    open for as long as anybody refers to it.
     """
 
     def __init__(
@@ -94,8 +95,9 @@ class StoredFrames:
         span: range | None = None,
         order: IntArray | None = None,
         tree: BondTree | None = None,
+        grid_nm: float = 0.0,
     ) -> None:
-        self._reader, self._order, self._tree = reader, order, tree
+        self._reader, self._order, self._tree, self._grid_nm = reader, order, tree, grid_nm
         self._span = range(reader.n_frames) if span is None else span
         n_atoms = reader.n_atoms if order is None else len(order)
         self.shape = (len(self._span), n_atoms, 3)
@@ -119,22 +121,26 @@ class StoredFrames:
                 if cells is not None:
                     frames = make_whole(frames, cells, self._tree)
             out[start : start + len(piece)] = frames if self._order is None else frames[:, self._order]
-        return out
+        return rounded(out, self._grid_nm) if self._grid_nm else out
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         return self[:].astype(dtype or np.float32, copy=False)
 
     def thinned(self, stride: int) -> StoredFrames:
         """Return every `stride`-th frame, unread."""
-        return StoredFrames(self._reader, self._span[::stride], self._order, self._tree)
+        return StoredFrames(self._reader, self._span[::stride], self._order, self._tree, self._grid_nm)
 
     def restricted(self, atoms: IntArray) -> StoredFrames:
         """Return some of the atoms `(k,)` of every frame, unread."""
         order = atoms if self._order is None else self._order[atoms]
-        return StoredFrames(self._reader, self._span, order, self._tree)
+        return StoredFrames(self._reader, self._span, order, self._tree, self._grid_nm)
+
+    def on_grid(self, grid_nm: float) -> StoredFrames:
+        """Return the same frames rounded to `grid_nm`, unread."""
+        return StoredFrames(self._reader, self._span, self._order, self._tree, grid_nm)
 
     def split(self, cuts: Sequence[int]) -> list[StoredFrames]:
         """Return the stretches that begin at frame 0 and at each of `cuts`, unread."""
         edges = [0, *cuts, len(self)]
-        return [StoredFrames(self._reader, self._span[a:b], self._order, self._tree)
+        return [StoredFrames(self._reader, self._span[a:b], self._order, self._tree, self._grid_nm)
                 for a, b in itertools.pairwise(edges)]  # fmt: skip

@@ -1,12 +1,12 @@
-"""LaM-SLidE in the registry: the general model of one molecule or many."""
+"""LaM-SLidE in the registry: the general model of one molecule."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from surrogate.models.architecture import Architecture, Suitability, Survey
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.heavy_atoms import lam_slide_model
+from surrogate.models.lam_slide.config import of_weights
+from surrogate.models.lam_slide.model import LamSlide
 
 if TYPE_CHECKING:
     from surrogate.training.trainer import Trainer
@@ -18,8 +18,8 @@ def _trainer() -> Trainer:
     return LamSlideTrainer()
 
 
-def _suits(survey: Survey) -> Suitability:
-    return Suitability(0, "one molecule" if survey.one_molecule else "several molecules")
+def _suits(survey: Survey) -> Suitability | None:
+    return Suitability(0, "one molecule") if survey.one_molecule else None
 
 
-LAM_SLIDE = Architecture("lam-slide", LamSlideConfig.from_dict, lam_slide_model, _trainer, _suits)
+LAM_SLIDE = Architecture("lam-slide", of_weights, LamSlide, _trainer, _suits)

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from surrogate.data.features.hydrogen_shapes import hydrogen_sites
-from surrogate.data.features.residue_layout import residue_layout
-from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds
 from surrogate.data.references import References
-from surrogate.data.weights import Weights, load_weights, read_header
+from surrogate.data.weights import load_weights, read_header
 from surrogate.models.architecture import Survey
-from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.config import AutoencoderConfig, LamSlideConfig, of_weights
 from surrogate.models.lam_slide.trainer import STAGE_ONE_SHARE, TrainingConfig, train_lam_slide
 from surrogate.training.trainer import AdvanceFn, Choice, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
-from systems.scene import Scene
-from systems.selection import part_of
 
 # Frames from which on rare states are weighted in a further training: fewer do not tell how often they come.
 _FRAMES_FOR_RARE = 50_000
-# The batch and the share of rare draws that the recipes use whose results the manual states.
-_MANY_BATCH = 32
 _RARE_DRAWS = 0.3
 _SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
@@ -46,40 +38,23 @@ class LamSlideTrainer(Trainer):
         if request.start_from is not None:
             found = _rare_states(references, survey, self.settings(request).model)
         else:
-            many = bool(request.model.get("graph", not survey.one_molecule))
-            lags = request.longest_lag_ps or request.training.get("longest_lag_ps")
-            if many:
-                found += [
-                    Choice("model.graph", True, f"{_names(survey)}: atoms are known by their bonds"),
-                    Choice("training.stage_two_batch", _MANY_BATCH, "as measured for many molecules"),
-                ]
-            else:
-                found += _entities(survey.scenes[0], request, placed=not lags)
-            if (many or lags) and survey.equilibrium:
+            default = AutoencoderConfig.identifier_pool
+            pool = request.model.get("autoencoder", {}).get("identifier_pool", default)
+            if (n := survey.scenes[0].n_atoms) > pool:
+                found.append(Choice("model.autoencoder.identifier_pool", n, f"{n} atoms, more than {pool} identifiers"))
+            if (request.longest_lag_ps or request.training.get("longest_lag_ps")) and survey.equilibrium:
                 found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
         return tuple(choice for choice in found if not _is_set(choice.key, request))
-
-    def stabler(self, weights: Weights) -> Choice | None:
-        """Return that hydrogens be placed, where they are learned as atoms and could be."""
-        config: LamSlideConfig = weights.model.config
-        scene = weights.domain.scene
-        if config.graph or config.on_heavy_atoms or "from" in weights.provenance or "H" not in scene.elements:
-            return None
-        if not _works(hydrogen_sites, scene):
-            return None
-        return Choice("model.hydrogens", "placed", "hydrogens placed about the heavy atoms instead of learned")
 
     def settings(self, request: TrainingRequest) -> Settings:
         """See `Trainer.settings`."""
         if request.start_from is not None:
-            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
-        elif request.model.get("graph"):
-            model = LamSlideConfig.of_many(request.model)
+            model = of_weights(read_header(request.start_from).config)
         else:
             model = LamSlideConfig.from_dict(request.model)
         steps, first = request.steps, None
         if steps is not None:
-            first = 0 if _alone(request, model) else max(1, round(steps * STAGE_ONE_SHARE))
+            first = 0 if request.start_from is not None else max(1, round(steps * STAGE_ONE_SHARE))
         asked: dict[str, Any] = {
             "budget_s": request.budget_s,
             "stage_one_steps": first,
@@ -96,29 +71,20 @@ class LamSlideTrainer(Trainer):
         settings = self.settings(request)
         model: LamSlideConfig = settings.model
         start = None if request.start_from is None else load_weights(request.start_from)
-        if model.graph:
-            sets = references.sets()
-        else:
-            sets = FrameSets((references.frames(canonical=model.canonical),))
-        for frames in sets.trained:  # too short a reference is refused before the first stage has been trained
-            for validation in (False, True):
-                frames.window_starts(model.approximator.chunk_frames, validation=validation)
-        share_one = 0.0 if _alone(request, model) else STAGE_ONE_SHARE
+        frames = references.frames(canonical=model.canonical)
+        for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+            frames.window_starts(model.approximator.chunk_frames, validation=validation)
+        share_one = 0.0 if start is not None else STAGE_ONE_SHARE
 
         def run(advance: AdvanceFn) -> Path:
             def report(stage: str, share: float, metrics: dict[str, float]) -> None:
                 advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
 
             return train_lam_slide(
-                sets, request.out, model, settings.training, start=start, resume=request.resume, progress=report
+                frames, request.out, model, settings.training, start=start, resume=request.resume, progress=report
             )
 
-        return Prepared(sets.names, run)
-
-
-def _alone(request: TrainingRequest, model: LamSlideConfig) -> bool:
-    """Return whether stage two is all that is trained."""
-    return request.start_from is not None or model.latents_are_atoms
+        return Prepared(frames.scene.name, run)
 
 
 def _is_set(key: str, request: TrainingRequest) -> bool:
@@ -131,40 +97,10 @@ def _is_set(key: str, request: TrainingRequest) -> bool:
     return True
 
 
-def _names(survey: Survey) -> str:
-    n = len(survey.scenes) + len(survey.unseen)
-    return f"{n} molecule{'s' if n > 1 else ''}"
-
-
-def _entities(scene: Scene, request: TrainingRequest, *, placed: bool) -> list[Choice]:
-    """Return what an identifier stands for, where there are more atoms than identifiers."""
-    given = request.model.get("autoencoder", {})
-    pool = given.get("identifier_pool", asdict(AutoencoderConfig())["identifier_pool"])
-    told = {"hydrogens", "entities"} & request.model.keys()
-    if scene.n_atoms <= pool or told:
-        return []
-    many = f"{scene.n_atoms} atoms, more than {pool} identifiers"
-    heavy = len(scene.heavy_idx)
-    if placed and _works(hydrogen_sites, scene):
-        if _works(residue_layout, part_of(scene, scene.heavy_idx)) and len(scene.residue_names) <= pool:
-            return [Choice("model.entities", "residue", f"{many}; a peptide: residues, with hydrogens placed")]
-        if heavy <= pool:
-            return [Choice("model.hydrogens", "placed", f"{many}; {heavy} heavy ones, hydrogens placed about them")]
-    return [Choice("model.autoencoder.identifier_pool", scene.n_atoms, many)]
-
-
-def _works(find: Any, scene: Scene) -> bool:
-    try:
-        find(scene)
-    except InputError:
-        return False
-    return True
-
-
 def _rare_states(references: References, survey: Survey, model: LamSlideConfig) -> list[Choice]:
     """Return how rare states are weighted in a further training of one molecule at one lag, where it shows any."""
     told = model.approximator
-    if model.graph or told.lag_range_ps or survey.n_frames < _FRAMES_FOR_RARE or not survey.one_molecule:
+    if told.lag_range_ps or survey.n_frames < _FRAMES_FOR_RARE or not survey.one_molecule:
         return []
     try:
         n = len(rare_kinds(references.frames(canonical=model.canonical), told.chunk_frames))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 # Where the pair of numbers stands that seeds each use.
-REDRAWS, HYDROGENS, STATES = 1, 3, 5
+REDRAWS, STATES = 1, 5
 
 
 def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Generator]:

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.codes.atom_tags import Atoms, Told
-from surrogate.models.lam_slide.codes.autoencoder import draw_identifiers, reconstruction_losses
+from surrogate.models.lam_slide.autoencoder import draw_identifiers, reconstruction_losses
 from surrogate.models.lam_slide.model import LamSlide
 
 # The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
@@ -29,35 +28,27 @@ def random_rotations(n: int, generator: torch.Generator) -> Tensor:
 
 
 def autoencoder_loss(
-    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator, atoms: Atoms | None = None
+    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1, or,
-    where a model knows atoms by their bonds, their tags, and displacements from the template."""
+    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1."""
     c = model.config.autoencoder
     batch, n_atoms, _ = frames_nm.shape
     x = frames_nm / model.config.position_scale_nm
-    identifiers, rest = model.identifiers(n_atoms).expand(batch, -1), torch.zeros((), device=x.device)
-    if atoms is not None:
-        each = atoms.spread(x.shape[:1])
-        identifiers, rest = each.tags, each.template
-    elif c.random_identifiers > 0:
+    identifiers = model.identifiers(n_atoms).expand(batch, -1)
+    if c.random_identifiers > 0:
         drawn = draw_identifiers(identifiers.shape[1], c.identifier_pool, batch, generator).to(x.device)
         pick = torch.rand(batch, 1, generator=generator).to(x.device) < c.random_identifiers
         identifiers = torch.where(pick, drawn, identifiers)
     numbers = elements.expand(batch, n_atoms)
-    latents = model.autoencoder.encode(x - rest, numbers, identifiers)
+    latents = model.autoencoder.encode(x, numbers, identifiers)
     noise = torch.randn(latents.shape, generator=generator).to(x.device)
     decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_types=c.type_weight > 0)
-    position, distance = reconstruction_losses(x, decoded.positions + rest)
+    position, distance = reconstruction_losses(x, decoded.positions)
     loss = c.position_weight * position + c.distance_weight * distance
     terms = {"position": position, "distance": distance}
     if decoded.type_logits is not None:
-        types = model.autoencoder.types(numbers)
-        terms["type"] = F.cross_entropy(decoded.type_logits.flatten(0, 1), types.flatten())
+        terms["type"] = F.cross_entropy(decoded.type_logits.flatten(0, 1), numbers.flatten())
         loss = loss + c.type_weight * terms["type"]
-    for name, (share, term) in model.autoencoder.stage_one_terms(x, decoded.positions).items():
-        terms[name] = term
-        loss = loss + share * term
     return loss, {k: v.detach() for k, v in terms.items()}
 
 
@@ -74,15 +65,14 @@ def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> 
 class FlowWindows:
     """A batch of windows of one molecule as stage two sees them: clean `latents (b, T, L, dim)` of `n_atoms` atoms.
 
-    `atoms` and `told`: see `LamSlide.atoms_of` and `LamSlide.told`. `importance (b,)`: what each window counts
-    (data.rarity); None is one each. With the `kind (b,)` of each window it counts in the cross entropy of the kinds
-    alone: the network is told the kind, and within a kind draws are plain.
+    `lag`: see `LamSlide.embedded_lag`. `importance (b,)`: what each window counts (data.rarity); None is one each. With
+    the `kind (b,)` of each window it counts in the cross entropy of the kinds alone: the network is told the kind, and
+    within a kind draws are plain.
     """
 
     latents: Tensor
     n_atoms: int
-    atoms: Atoms | None = None
-    told: Told | None = None
+    lag: Tensor | None = None
     importance: Tensor | None = None
     kind: Tensor | None = None
 
@@ -104,7 +94,7 @@ def flow_loss(
     alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
     noisy = alpha * latents + sigma * noise
     first = 0 if c.loss_on_given else c.n_conditioning
-    prediction = model.approximator(noisy, tau, known, kind=kind, told=windows.told)[:, first:]
+    prediction = model.approximator(noisy, tau, known, kind=kind, lag=windows.lag)[:, first:]
     target = latents[:, first:]
     weight = torch.ones_like(tau)
     if c.precondition:
@@ -120,9 +110,9 @@ def flow_loss(
     if c.auxiliary_frames and (c.position_weight or c.distance_weight):
         pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
         scale = model.config.position_scale_nm
-        decoded = model.decode(prediction[:, pick], windows.n_atoms, windows.atoms) / scale
+        decoded = model.decode(prediction[:, pick], windows.n_atoms) / scale
         with torch.no_grad():
-            clean = model.decode(target[:, pick], windows.n_atoms, windows.atoms) / scale
+            clean = model.decode(target[:, pick], windows.n_atoms) / scale
         w = weight.reshape(-1, 1, 1, 1).sqrt()
         position = ((decoded - clean) * w).square().sum(-1).mean()
         i, j = torch.triu_indices(windows.n_atoms, windows.n_atoms, 1)
@@ -130,6 +120,4 @@ def flow_loss(
         distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
         loss = loss + c.position_weight * position + c.distance_weight * distance
         terms |= {"position": position.detach(), "distance": distance.detach()}
-        if (frame := model.autoencoder.frame_loss(clean, decoded, w)) is not None:
-            loss, terms["frame"] = loss + c.frame_weight * frame, frame.detach()
     return loss, terms

@@ -13,7 +13,6 @@ from torch import Tensor
 from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
 from surrogate.models.interface import Molecule
-from surrogate.models.lam_slide.codes.atom_tags import Atoms
 from surrogate.models.lam_slide.losses import random_rotations
 from surrogate.models.lam_slide.model import LamSlide
 
@@ -40,30 +39,27 @@ class Subject:
 
     def poses(self, model: LamSlide, rows: int, generator: torch.Generator) -> Tensor | None:
         """Return a rotation `(rows, 3, 3)` for each window, uniform; None where poses stay as they are."""
-        turned = model.config.atoms.turn if model.config.graph else not model.canonical
-        return random_rotations(rows, generator) if turned else None
+        return None if model.canonical else random_rotations(rows, generator)
 
-    def seen(self, model: LamSlide, x: Tensor, turns: Tensor | None) -> tuple[Tensor, Atoms | None]:
-        """Return frames `(b, ..., n_atoms, 3)` turned, on the model's device, and atoms in the same poses."""
-        device = self.molecule.elements.device
+    def seen(self, x: Tensor, turns: Tensor | None) -> Tensor:
+        """Return frames `(b, ..., n_atoms, 3)` turned, on the model's device."""
         if turns is not None:
             x = torch.einsum("bij,b...nj->b...ni", turns, x)
-            turns = turns.to(device)
-        return x.to(device), model.atoms_of(self.molecule, turns)
+        return x.to(self.molecule.elements.device)
 
     @torch.no_grad()
     def reconstruction_error_nm(self, model: LamSlide) -> float:
         """Return the root mean square error of held-out frames that went through the autoencoder."""
         held = self.frames.spread_starts(_HELD_FRAMES, validation=True)
-        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(held)), None)
-        error = model.decode(model.encode(x, self.molecule.elements, atoms), self.n_atoms, atoms) - x
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(held)), None)
+        error = model.decode(model.encode(x, self.molecule.elements), self.n_atoms) - x
         return float(error.square().sum(-1).mean().sqrt())
 
     @torch.no_grad()
     def encode(self, model: LamSlide, idx: npt.NDArray[np.int64]) -> Tensor:
         """Return the latents `(len(idx), n_latents, dim)` of frames `(n,)` as they are posed."""
-        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(idx)), None)
-        return model.encode(x, self.molecule.elements, atoms)
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx)), None)
+        return model.encode(x, self.molecule.elements)
 
     def keep_latents(self, model: LamSlide) -> None:
         """Encode every frame once and keep the latents."""
@@ -73,15 +69,14 @@ class Subject:
         ]
         self.latents = torch.cat(parts).to(self.molecule.elements.device)
 
-    def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> tuple[Tensor, Atoms | None]:
-        """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), and what else the flow is told
-        of the molecule, in each window's pose."""
+    def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), each window in its own pose."""
         if self.latents is not None:
-            return self.latents[idx.to(self.latents.device)], model.atoms_of(self.molecule)
+            return self.latents[idx.to(self.latents.device)]
         turns = self.poses(model, len(idx), generator)
-        x, atoms = self.seen(model, torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
         with torch.no_grad():
-            return model.encode(x, self.molecule.elements, atoms), atoms
+            return model.encode(x, self.molecule.elements)
 
 
 def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
@@ -92,20 +87,12 @@ def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
 
 
 @torch.no_grad()
-def normalise_latents(model: LamSlide, subjects: Sequence[Subject], seed: int, n_frames: int = 20_000) -> None:
-    """Measure the latents' means and common scale on training frames, as many of each molecule, and set them. Latents
-    that are atoms have no mean: the template is there already."""
+def normalise_latents(model: LamSlide, subject: Subject, seed: int, n_frames: int = 20_000) -> None:
+    """Measure the latents' means and common scale on training frames and set them."""
     model.latent_mean.zero_()
     model.latent_scale.fill_(1.0)
-    rng, found = np.random.default_rng(seed), []
-    for subject in subjects:
-        starts = subject.frames.window_starts(1, validation=False)
-        idx = rng.choice(len(starts), size=min(n_frames // len(subjects), len(starts)), replace=False)
-        found.append(subject.encode(model, starts[np.sort(idx)]))
-    if model.config.latents_are_atoms:
-        z = torch.cat([latents.flatten() for latents in found])
-        model.latent_scale.copy_(z.square().mean().sqrt())
-        return
-    z = torch.cat(found)
+    starts = subject.frames.window_starts(1, validation=False)
+    idx = np.random.default_rng(seed).choice(len(starts), size=min(n_frames, len(starts)), replace=False)
+    z = subject.encode(model, starts[np.sort(idx)])
     model.latent_mean.copy_(z.mean(0))
     model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())

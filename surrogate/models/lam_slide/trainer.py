@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,19 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from surrogate.data.features.stiff_terms import LOOKED_AT, drawn_terms, holds_hydrogens, rigid_terms
+from surrogate.data.features.stiff_terms import LOOKED_AT, drawn_terms, rigid_terms
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.molecules import FrameSets
 from surrogate.data.rarity import rare_kinds, window_kinds, window_sampler
 from surrogate.data.strides import StrideSampler, strides_up_to
 from surrogate.data.weights import Weights, save_weights
 from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.heavy_trainer import on_heavy_atoms
 from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.subjects import Subject, normalise_latents, pick
+from surrogate.models.lam_slide.subjects import Subject, normalise_latents
 from surrogate.models.precision import bf16_pays
 from surrogate.models.stiff import StiffTerms
 from surrogate.training.devices import is_first_process, wait_for_all
@@ -68,7 +65,7 @@ class TrainingConfig:
     # Windows are drawn with strides up to this lag, each as likely, and the network is told which.
     longest_lag_ps: float | None = None
     # What rollouts take from the reference (models.stiff): 'held', the bonds that it holds rigid; 'drawn', the width of
-    # its other bonds and of its angles too; 'modelled', nothing. A model of many molecules holds them by itself.
+    # its other bonds and of its angles too; 'modelled', nothing.
     stiff: str = "held"
 
     def __post_init__(self) -> None:
@@ -94,7 +91,7 @@ def is_trained(out: Path) -> bool:
 
 
 def train_lam_slide(
-    frames: TrainingFrames | FrameSets,
+    frames: TrainingFrames,
     out: str | Path,
     model_config: LamSlideConfig,
     config: TrainingConfig,
@@ -105,65 +102,45 @@ def train_lam_slide(
 ) -> Path:
     """Train on `frames` and write `out` (.safetensors); beside it a CSV of the curves and, until done, resume states.
 
-    Frames of several molecules (`data.molecules`) need a configuration with `graph`; each step is shown one of them.
     With `start`, stage two goes on from those weights for the whole budget, and stage one is taken over as it is.
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
-    heavy = None
-    stiff = None
-    if not model_config.graph:
-        stiff = _stiff_terms(frames.trained[0] if isinstance(frames, FrameSets) else frames, config, start)
-    elif config.stiff == "drawn":
-        raise InputError("training.stiff = 'drawn' is for one molecule; leave it out where model.graph = true.")
-    if model_config.on_heavy_atoms:
-        heavy = on_heavy_atoms(frames, model_config, start, several_lags=config.longest_lag_ps is not None)
-        frames, model_config, start = heavy.frames, heavy.config, heavy.start
-    sets = frames if isinstance(frames, FrameSets) else FrameSets((frames,))
-    first = sets.trained[0]
-    model_config = _settle(sets, model_config, config)
-    held = model_config.graph and all(holds_hydrogens(f.scene, f.some_nm(LOOKED_AT)) for f in sets.trained)
-    if held and start is None:
-        model_config = replace(model_config, atoms=replace(model_config.atoms, rigid_hydrogens=True))
+    stiff = _stiff_terms(frames, config, start)
+    model_config = _settle(frames, model_config, config)
     length = model_config.approximator.chunk_frames
     told_of = model_config.approximator.rare_kinds
-    kinds = window_kinds(first, told_of, length) if told_of else None
-    strides = _strides(sets, model_config)
+    kinds = window_kinds(frames, told_of, length) if told_of else None
+    strides = _strides(frames, model_config)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
-    subjects, unseen = ([Subject.of(f, model) for f in some] for some in (sets.trained, sets.unseen))
+    subject = Subject.of(frames, model)
     log_path = out.with_suffix(".csv")
     states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
     if not resume and is_first_process():
         for path in (*states, log_path):
             path.unlink(missing_ok=True)
     places = [StagePlace(state, log_path, device, resume) for state in states]
-    shown = _Shown(model, subjects, unseen, kinds, strides)
+    shown = _Shown(model, subject, kinds, strides)
+    one, two = config.stages(with_autoencoder=start is None)
+    spent_one = 0.0
     if start is None:
-        one, two = config.stages(with_autoencoder=model.first_stage is not None)
-        spent_one = 0.0
-        if model.first_stage is not None:
-            spent_one = _stage_one(shown, model.first_stage, one, places[0], progress)
-        normalise_latents(model, subjects, config.seed)
+        spent_one = _stage_one(shown, one, places[0], progress)
+        normalise_latents(model, subject, config.seed)
     else:
-        _check_start(start, first, model_config)
-        two = config.stages(with_autoencoder=False)[1]
-        spent_one = 0.0
+        _check_start(start, frames, model_config)
         _take_over(model, start)
     if kinds is not None and (start is None or not start.model.config.approximator.rare_kinds):
-        own = first.window_starts(length, validation=False)
+        own = frames.window_starts(length, validation=False)
         model.approximator.set_odds(np.bincount(kinds[own], minlength=len(told_of) + 1) / len(own))
 
-    domains = [training_domain(f, strides=strides if len(strides) > 1 else ()) for f in sets.trained]
-    domain = replace(domains[0], further=tuple(domains[1:]), transferable=model_config.graph)
-
-    origin, told = sets.origin, _told(config, [frames.scene.name for frames in sets.unseen])
+    domain = training_domain(frames, strides=strides if len(strides) > 1 else ())
+    origin = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
 
     def write(spent_s: float) -> None:
-        whole, of = (model, domain) if heavy is None else heavy.dressed(model)
-        settings = told | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
-        save_weights(out, whole, of, provenance_of(origin, settings, start), stiff=stiff)
+        settings = _told(config) | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
+        save_weights(out, model, domain, provenance_of(origin, settings, start), stiff=stiff)
 
     spent_two = _stage_two(shown, config, two, places[1], progress, write)
     if is_first_process():
@@ -174,29 +151,20 @@ def train_lam_slide(
     return out
 
 
-def _settle(sets: FrameSets, model_config: LamSlideConfig, config: TrainingConfig) -> LamSlideConfig:
+def _settle(frames: TrainingFrames, model_config: LamSlideConfig, config: TrainingConfig) -> LamSlideConfig:
     """Return the configuration with what the frames decide. Raises InputError where the two do not fit."""
-    first = sets.trained[0]
-    if any(f.canonical != model_config.canonical for f in (*sets.trained, *sets.unseen)):
+    if frames.canonical != model_config.canonical:
         raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
-    if not model_config.graph:
-        if len(sets.trained) > 1 or sets.unseen:
-            raise InputError(
-                f"{sets.names}: a model of several molecules knows atoms by their bonds; set model.graph = true."
-            )
-        residues = model_config.residues
-        n, what = (first.scene.n_atoms, "atoms") if residues is None else (len(residues.types), "residues")
-        if n > model_config.autoencoder.identifier_pool:
-            raise InputError(
-                f"{n} {what} need autoencoder.identifier_pool >= {n}, not {model_config.autoencoder.identifier_pool}."
-            )
+    n, pool = frames.scene.n_atoms, model_config.autoencoder.identifier_pool
+    if n > pool:
+        raise InputError(f"{n} atoms need autoencoder.identifier_pool >= {n}, not {pool}.")
     told = model_config.approximator
     if config.longest_lag_ps is not None:
-        told = replace(told, lag_range_ps=(first.lag_ps, config.longest_lag_ps))
-    if (model_config.graph or told.lag_range_ps) and (config.rare_draws or config.rare_kinds or told.rare_kinds):
+        told = replace(told, lag_range_ps=(frames.lag_ps, config.longest_lag_ps))
+    if told.lag_range_ps and (config.rare_draws or config.rare_kinds or told.rare_kinds):
         raise InputError("rare windows are told of one molecule at one lag; leave rare_draws and rare_kinds out.")
     if config.rare_kinds and not told.rare_kinds:
-        told = replace(told, rare_kinds=rare_kinds(first, told.chunk_frames))
+        told = replace(told, rare_kinds=rare_kinds(frames, told.chunk_frames))
     return replace(model_config, approximator=told)
 
 
@@ -208,9 +176,9 @@ def _stiff_terms(frames: TrainingFrames, config: TrainingConfig, start: Weights 
     return rigid_terms(frames.scene, frames.some_nm(LOOKED_AT)) if config.stiff == "held" else None
 
 
-def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
+def _strides(frames: TrainingFrames, model_config: LamSlideConfig) -> tuple[int, ...]:
     """Return the strides that windows are drawn with. Raises InputError for lags that the frames do not have."""
-    frames, lags = sets.trained[0], model_config.approximator.lag_range_ps
+    lags = model_config.approximator.lag_range_ps
     if lags is None:
         return (1,)
     if not np.isclose(lags[0], frames.lag_ps, rtol=1e-4):
@@ -220,47 +188,36 @@ def _strides(sets: FrameSets, model_config: LamSlideConfig) -> tuple[int, ...]:
     if longest < 2:
         raise InputError("the longest lag must be at least twice the frames' spacing; leave it out for one lag alone.")
     strides = strides_up_to(longest)
-    for each in sets.trained:  # too short a reference is refused before the first stage has been trained
-        StrideSampler.of(each, model_config.approximator.chunk_frames, strides)
+    # Too short a reference is refused before the first stage has been trained.
+    StrideSampler.of(frames, model_config.approximator.chunk_frames, strides)
     return strides
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """What both stages are shown: molecules to learn from, and those held out whole. `kinds` (n_frames,) of the windows
-    from each frame on (data.rarity), where the network is told; `strides` that windows are drawn with."""
+    """What both stages are shown. `kinds` (n_frames,) of the windows from each frame on (data.rarity), where the
+    network is told; `strides` that windows are drawn with."""
 
     model: LamSlide
-    subjects: list[Subject]
-    unseen: list[Subject]
+    subject: Subject
     kinds: npt.NDArray[np.int64] | None
     strides: tuple[int, ...]
 
 
-def _stage_one(
-    shown: _Shown, trained: nn.Module, stage: StageConfig, place: StagePlace, progress: ProgressFn | None
-) -> float:
-    model, subjects, unseen = shown.model, shown.subjects, shown.unseen
-    starts = [subject.frames.window_starts(1, validation=False) for subject in subjects]
+def _stage_one(shown: _Shown, stage: StageConfig, place: StagePlace, progress: ProgressFn | None) -> float:
+    model, subject = shown.model, shown.subject
+    own = subject.frames.window_starts(1, validation=False)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        k = pick(subjects, generator)
-        subject, own = subjects[k], starts[k]
         idx = own[torch.randint(len(own), (stage.batch,), generator=generator).numpy()]
         x = torch.from_numpy(subject.frames.positions_nm(idx))
-        x, atoms = subject.seen(model, x, subject.poses(model, len(x), generator))
-        return autoencoder_loss(model, x, subject.molecule.elements, generator, atoms)
+        x = subject.seen(x, subject.poses(model, len(x), generator))
+        return autoencoder_loss(model, x, subject.molecule.elements, generator)
 
-    @torch.no_grad()
     def validate() -> dict[str, float]:
-        found = {"validation_rmsd_nm": subjects, "unseen_rmsd_nm": unseen}
-        return {
-            name: float(np.mean([subject.reconstruction_error_nm(model) for subject in some]))
-            for name, some in found.items()
-            if some
-        }
+        return {"validation_rmsd_nm": subject.reconstruction_error_nm(model)}
 
-    return run_stage(trained, stage, loss_fn, validate, place, progress=progress)
+    return run_stage(model.autoencoder, stage, loss_fn, validate, place, progress=progress)
 
 
 def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
@@ -279,62 +236,49 @@ def _stage_two(
     shown: _Shown, config: TrainingConfig, stage: StageConfig, place: StagePlace, progress: ProgressFn | None,
     write: Callable[[float], None],
 ) -> float:  # fmt: skip
-    model, subjects, unseen, kinds, strides = shown.model, shown.subjects, shown.unseen, shown.kinds, shown.strides
+    model, subject, kinds, strides = shown.model, shown.subject, shown.kinds, shown.strides
     length, device = model.config.approximator.chunk_frames, model.latent_mean.device
     if len(strides) > 1:
-        wide = [StrideSampler.of(subject.frames, length, strides) for subject in subjects]
+        wide = StrideSampler.of(subject.frames, length, strides)
     else:
-        plain = [window_sampler(subject.frames, length, config.rare_draws, kinds) for subject in subjects]
-    if model.first_stage is not None:
-        model.first_stage.requires_grad_(False)
+        plain = window_sampler(subject.frames, length, config.rare_draws, kinds)
+    model.autoencoder.requires_grad_(False)
     if config.compile:
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
-    turned = model.config.graph and model.config.atoms.turn
-    numbers = sum(subject.frames.n_frames * math.prod(model.noise_shape(subject.n_atoms)) for subject in subjects)
-    if model.canonical and not turned and 4 * numbers // length <= LATENT_CACHE_BYTES:
-        for subject in subjects:
-            subject.keep_latents(model)
+    c = model.config.autoencoder
+    if model.canonical and 4 * subject.frames.n_frames * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
+        subject.keep_latents(model)
 
-    def loss_of(subject: Subject, idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator,
+    def loss_of(idx: Tensor, stride: Tensor | None, tau: Tensor, generator: torch.Generator,
                 **more: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        latents, atoms = subject.windows(model, idx, generator)
-        lags = None if stride is None else (stride * subject.frames.lag_ps).to(device)
-        told = model.told(atoms, lags, len(idx))
-        return flow_loss(model, FlowWindows(latents, subject.n_atoms, atoms, told, **more), tau, generator)
+        latents = subject.windows(model, idx, generator)
+        lag = model.embedded_lag(None if stride is None else (stride * subject.frames.lag_ps).to(device), len(idx))
+        return flow_loss(model, FlowWindows(latents, subject.n_atoms, lag, **more), tau, generator)
 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        k = pick(subjects, generator)
         importance = kind = stride = None
         if len(strides) > 1:
-            first, stride = wide[k].draw(stage.batch, generator)
+            first, stride = wide.draw(stage.batch, generator)
         else:
-            first, importance, kind = plain[k].draw(stage.batch, generator)
+            first, importance, kind = plain.draw(stage.batch, generator)
         tau = draw_flow_times(model, stage.batch, generator).to(device)
         idx = window_frames(first, length, generator, time_reversal=config.time_reversal, stride=stride)
         weight = None if importance is None else importance.to(device)
-        return loss_of(subjects[k], idx, stride, tau, generator, importance=weight,
-                       kind=None if kind is None else kind.to(device))  # fmt: skip
+        return loss_of(idx, stride, tau, generator, importance=weight, kind=None if kind is None else kind.to(device))
 
-    held = {name: [_held_windows(subject, length, strides, kinds) for subject in some]
-            for name, some in (("validation", subjects), ("unseen", unseen)) if some}  # fmt: skip
-
+    held, held_stride, held_kind = _held_windows(subject, length, strides, kinds)
     with_bf16 = stage.bf16 and bf16_pays(device.type)
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
-        found: dict[str, list[float]] = {}
-        for name, windows in held.items():
-            for subject, idx, stride, kind in windows:
-                # The same noise and flow times each time, so that the curve shows the model and not the draw.
-                generator = torch.Generator().manual_seed(0)
-                tau = draw_flow_times(model, len(idx), generator).to(device)
-                with torch.autocast(device.type, dtype=torch.bfloat16, enabled=with_bf16):
-                    _, terms = loss_of(subject, idx, stride, tau, generator,
-                                       kind=None if kind is None else kind.to(device))  # fmt: skip
-                for key, value in terms.items():
-                    found.setdefault(f"{name}_{key}", []).append(float(value))
-        return {key: float(np.mean(values)) for key, values in found.items()}
+        # The same noise and flow times each time, so that the curve shows the model and not the draw.
+        generator = torch.Generator().manual_seed(0)
+        tau = draw_flow_times(model, len(held), generator).to(device)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=with_bf16):
+            _, terms = loss_of(held, held_stride, tau, generator,
+                               kind=None if held_kind is None else held_kind.to(device))  # fmt: skip
+        return {f"validation_{key}": float(value) for key, value in terms.items()}
 
     next_snapshot = [config.snapshot_every_s or float("inf")]
 
@@ -345,20 +289,20 @@ def _stage_two(
             shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
             next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
 
-    return run_stage(model.second_stage, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
+    return run_stage(model.approximator, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
 
 
 def _held_windows(
     subject: Subject, length: int, strides: tuple[int, ...], kinds: npt.NDArray[np.int64] | None
-) -> tuple[Subject, Tensor, Tensor | None, Tensor | None]:
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Return up to 256 held-out windows, evenly spaced, as frames `(b, length)`, their strides and kinds."""
     if len(strides) > 1:
         sampler = StrideSampler.of(subject.frames, length, strides, validation=True)
         first, stride = sampler.draw(256, torch.Generator().manual_seed(0))
-        return subject, first[:, None] + torch.arange(length) * stride[:, None], stride, None
+        return first[:, None] + torch.arange(length) * stride[:, None], stride, None
     held = torch.from_numpy(subject.frames.window_starts(length, validation=True))
     held = held[torch.linspace(0, len(held) - 1, min(256, len(held))).long()]
-    return subject, held[:, None] + torch.arange(length), None, None if kinds is None else torch.from_numpy(kinds)[held]
+    return held[:, None] + torch.arange(length), None, None if kinds is None else torch.from_numpy(kinds)[held]
 
 
 def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideConfig) -> None:
@@ -369,7 +313,7 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
     same = replace(start.model.config, approximator=replace(start.model.config.approximator, rare_kinds=told))
     if same != model_config:
         raise InputError(f"{name} has another configuration; a training goes on with the one it began with.")
-    if not model_config.graph and of.scene.topology_hash != frames.scene.topology_hash:
+    if of.scene.topology_hash != frames.scene.topology_hash:
         raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
     if not np.isclose(of.lag_ps, frames.lag_ps, rtol=1e-4):
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
@@ -381,12 +325,11 @@ def _take_over(model: LamSlide, start: Weights) -> None:
     assert not surplus and all(name.startswith(("approximator.embed_kind", "approximator.odds")) for name in missing)
 
 
-def _told(config: TrainingConfig, held_out: list[str]) -> dict[str, Any]:
+def _told(config: TrainingConfig) -> dict[str, Any]:
     """Return what the weights' provenance says of the settings."""
-    settings: dict[str, Any] = {
+    return {
         "seed": config.seed,
         "time_reversal": config.time_reversal,
         "rare_draws": config.rare_draws,
         "rare_kinds": config.rare_kinds,
     }
-    return settings | ({"held_out_molecules": held_out} if held_out else {})

@@ -186,6 +186,10 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
             return "rollout", (speeds, rates.coverage)
         return "md", (f"{speeds}: no surrogate pays", rates.coverage)
     none = f"no weights: {rates.coverage}"
+    if rates.dear and rates.in_water:
+        if way == "surrogate":
+            raise InputError("a potential learns forces in vacuum; leave `solvent` out, or take `way='md'`.")
+        return "md", ("a potential learns forces in vacuum: MD for a molecule in ALPB water", none)
     if rates.dear:
         if budget_s >= LEAST_TRAINING_S or way == "surrogate":
             force_ms = 1e3 * rates.step_s

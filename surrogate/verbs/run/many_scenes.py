@@ -20,9 +20,7 @@ from md_reference.campaign.campaign_file import (
     name_of,
     read_campaign,
 )
-from md_reference.campaign.cluster import open_client
-from md_reference.campaign.scheduler import result_of
-from md_reference.campaign.worker import guarded, poll, stop
+from md_reference.campaign.cluster import guarded, open_client, poll, result_of, stop
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import LEAST_BUDGET_S

@@ -46,7 +46,7 @@ class Rates:
     of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
     on this `platform`, `at_once` replicas on each core; `md`: in words; `dear`: it is quantum mechanics. `rolls`: of
     weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run
-    by SIMD, where it might have been.
+    by SIMD, where it might have been; `in_water`: in ALPB water, in which no potential learns.
     """
 
     n_atoms: int
@@ -63,6 +63,7 @@ class Rates:
     at_once: int = 1
     without_simd: str = ""
     alone: float = 1.0
+    in_water: bool = False
 
     @property
     def replicas(self) -> int:
@@ -81,7 +82,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
 
     Raises OutOfDomainError where weights are named and do not cover the scene, and what MD of it raises.
     """
-    from md_reference.forces.spec import QUANTUM
+    from md_reference.forces.spec import QUANTUM, QUANTUM_SOLVENTS
     from md_reference.run.config import SIMD
     from md_reference.run.machine import available_cores
     from md_reference.run.plan import make_plan
@@ -97,6 +98,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         cores=cores,
         stretch=stretch,
         dear=config.force.force_field == QUANTUM,
+        in_water=config.force.solvent in QUANTUM_SOLVENTS,
         md=plan.line,
         step_s=plan.us_per_step * 1e-6,
         timestep_ps=config.timestep_ps,

@@ -13,6 +13,7 @@ from surrogate.judge.measure import distributions
 from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, equal_rows, evenly, group_labels, over_groups
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, mean_estimate
 from surrogate.judge.measure.structure import CONSTRAINED_BELOW_NM, bond_label
+from surrogate.judge.read.rounding import length_error_nm
 from surrogate.judge.rows.curves import BondLength
 from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, truth_of
 from systems.chemistry.validity import Geometry
@@ -35,7 +36,9 @@ def bond_rows(trio: Trio) -> tuple[list[Row], list[BondLength]]:
     table = [
         BondLength(labels[b], *(float(x) for m in moments for x in (m.mean[b], m.std[b]))) for b in range(len(labels))
     ]
-    rigid = ~(moments[0].std > 10 * CONSTRAINED_BELOW_NM)
+    # What rounding alone may do counts as no vibration.
+    least_nm = math.hypot(CONSTRAINED_BELOW_NM, 1.1 * length_error_nm(trio.reference.features.grid_nm))
+    rigid = ~(moments[0].std > 10 * least_nm)
     classes = (
         trio.reference.features.probes.classes if trio.reference.features.probes else np.arange(trio.scene.n_atoms)
     )

@@ -41,7 +41,7 @@ def test_a_slurm_job_asks_for_what_the_file_says(tmp_path: Path) -> None:
         assert not cluster.workers, "no job before there is work"
     assert {"#SBATCH -p cpu", "#SBATCH -A chem", "#SBATCH -t 12:00:00", "#SBATCH --exclude=node7"} <= set(lines)
     assert "#SBATCH --cpus-per-task=8" in lines
-    worker = next(line for line in lines if "--preload md_reference.campaign.worker" in line)
+    worker = next(line for line in lines if "--preload md_reference.campaign.cluster" in line)
     assert "--nworkers 8" in worker
     assert "--nthreads 1" in worker
     before = lines[: lines.index(worker)]

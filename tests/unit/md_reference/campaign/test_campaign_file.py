@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from md_reference.campaign.campaign_file import Campaign, first_seed, read_campaign
-from md_reference.campaign.run_options import flat_settings
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import flat_settings
 from md_reference.run.simulate import MDConfig
 from systems.errors import InputError
 

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from library_runs import run_scene
 
-from md_reference.campaign.run_options import to_config
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
-from md_reference.run.defaults import defaults, settle
+from md_reference.run.defaults import defaults, settle, to_config
 from md_reference.run.engine import Engine
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import check_frames, geometry_from_scene

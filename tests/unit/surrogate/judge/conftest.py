@@ -21,7 +21,7 @@ def downstream(scene: Scene, fixed: int, moving: int) -> np.ndarray:
     """Atoms that turn when the bond fixed-moving is turned, `moving` included."""
     import networkx as nx
 
-    graph = bonded_graph(scene)
+    graph = bonded_graph(scene).copy()
     graph.remove_edge(fixed, moving)
     return np.array(sorted(nx.node_connected_component(graph, moving)))
 

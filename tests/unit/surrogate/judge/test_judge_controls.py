@@ -108,7 +108,7 @@ def test_three_percent_longer_bonds_are_named(trio: Trio, alanine_dipeptide: Sce
     frames = frames_of(trio)
     quad = backbone_torsions(alanine_dipeptide)["phi"][0]
     carbon, nitrogen = int(quad[0]), int(quad[1])
-    graph = bonded_graph(alanine_dipeptide)
+    graph = bonded_graph(alanine_dipeptide).copy()
     graph.remove_edge(carbon, nitrogen)
     far = sorted(nx.node_connected_component(graph, nitrogen))
     frames[:, far] += 0.03 * (frames[:, nitrogen] - frames[:, carbon])[:, None]

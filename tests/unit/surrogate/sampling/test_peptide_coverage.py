@@ -13,8 +13,9 @@ from surrogate import api
 from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.features.standard_peptide import standard_peptide
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.shipped import weights_path
 from surrogate.data.splits import Split
-from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.data.weights import Weights, load_weights, read_header, save_weights
 from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
 from surrogate.models.peptides.peptide_subjects import PeptideSubject
 from surrogate.models.peptides.trainer import normalise, with_scale
@@ -136,3 +137,10 @@ def test_an_unseen_peptide_rolls_in_the_order_of_its_file(weights: Weights, tmp_
     start = np.linalg.norm(scene.positions_nm[i] - scene.positions_nm[j], axis=-1)
     assert np.abs(lengths - start).max() < 0.03
     assert np.abs(lengths - np.roll(start, 1)).max() > 0.03, "bonds of another order would be seen"
+
+
+def test_without_its_model_a_domain_of_peptides_covers_those_trained_on_alone() -> None:
+    header = read_header(weights_path("peptides"))
+    assert find_deviations(build_peptide("ACE-ALA-NME"), header.domain) == ()
+    unseen = find_deviations(build_peptide("ACE-LEU-SER-NME"), header.domain)
+    assert [(d.what, d.forcible) for d in unseen] == [("connectivity", False)]

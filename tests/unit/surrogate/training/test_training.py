@@ -13,7 +13,7 @@ import torch
 
 from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
 from surrogate.data.weights import Weights, load_weights, read_header, save_weights
-from surrogate.models.lam_slide.codes.autoencoder import draw_identifiers
+from surrogate.models.lam_slide.autoencoder import draw_identifiers
 from surrogate.models.lam_slide.config import LamSlideConfig
 from surrogate.models.lam_slide.losses import FlowWindows, flow_loss
 from surrogate.models.lam_slide.model import LamSlide

@@ -56,6 +56,16 @@ def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
     assert decide(UNCOVERED, 600.0, "surrogate").way == "trained"
 
 
+def test_no_potential_learns_in_alpb_water() -> None:
+    """It would learn the forces of the vacuum and be judged by MD in water."""
+    dear = replace(UNCOVERED, dear=True)
+    assert decide(dear, 3600.0).way == "potential"
+    found = decide(replace(dear, in_water=True), 3600.0)
+    assert found.way == "md" and "learns forces in vacuum" in found.why[0]
+    with pytest.raises(InputError, match="leave `solvent` out"):
+        decide(replace(dear, in_water=True), 3600.0, "surrogate")
+
+
 def test_md_in_lanes_is_a_rival_of_the_surrogate() -> None:
     simd = replace(COVERED, platform="simd", at_once=16, md_ps_per_s=3200.0)
     found = decide(simd, 600.0)

@@ -62,12 +62,6 @@ def peptides(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [write(folder, build_peptide(s), 200, lag_ps=2.0) for s in ("ACE-ALA-NME", "ACE-SER-NME")]
 
 
-@pytest.fixture(scope="module")
-def molecules(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("molecules")
-    return [write(folder, prepare(f"smiles:{smiles}"), 200) for smiles in ("CCO", "CCC")]
-
-
 def test_one_molecule_keeps_every_default(alanine: Path) -> None:
     record, lines = explained([alanine])
     assert lines == ["arch = lam-slide: one molecule"]
@@ -89,28 +83,13 @@ def test_one_molecule_is_trained_as_by_the_defaults_bit_for_bit(alanine: Path, t
     assert one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
 
 
-@pytest.mark.parametrize("record", [MD, {}])
-def test_many_molecules_are_known_by_their_bonds(tmp_path: Path, record: dict[str, object]) -> None:
-    references = [write(tmp_path, prepare(f"smiles:{smiles}"), record=record) for smiles in ("CCO", "CCC")]
-    found, lines = explained(references)
-    said = chosen(lines)
-    assert (said["arch"], said["model.graph"], said["training.stage_two_batch"]) == ("lam-slide", "true", "32")
-    # What nobody says is MD at constant temperature is not taken for it.
-    assert ("training.time_reversal" in said) == found["training"]["time_reversal"] == bool(record)
-    assert LamSlideConfig.from_dict(found["model"]) == LamSlideConfig.of_many({})
-    one, _ = explained(references[:1], validation=references[1:])
-    assert one["model"]["graph"], "a molecule held out whole is another molecule too"
-
-
-def test_several_peptides_are_known_by_their_residues(peptides: list[Path], tmp_path: Path) -> None:
+def test_several_peptides_are_known_by_their_residues(peptides: list[Path]) -> None:
     record, lines = explained(peptides)
     assert lines[0].startswith("arch = lam-slide-peptides: 2 peptides")
     assert chosen(lines) == {"arch": "lam-slide-peptides", "model.shortest_ps": "2.0", "model.longest_ps": "360.0",
                              "training.time_reversal": "true"}  # fmt: skip
     assert PeptideConfig.from_dict(record["model"]) == PeptideConfig(shortest_ps=2.0, longest_ps=360.0)
     assert PeptideTraining(**record["training"]) == PeptideTraining(time_reversal=True)
-    mixed, _ = explained([*peptides, write(tmp_path, prepare("smiles:CCO"), lag_ps=2.0)])
-    assert mixed["arch"] == "lam-slide", "one that is no peptide"
     alone, _ = explained(peptides[:1])
     assert alone["arch"] == "lam-slide"
 
@@ -160,30 +139,10 @@ def test_several_lags_are_learned_where_they_are_asked_for(alanine: Path) -> Non
     assert LamSlideConfig.from_dict(record["model"]) == LamSlideConfig()
 
 
-def test_more_atoms_than_identifiers_are_coded_as_residues_or_without_hydrogens(tmp_path: Path) -> None:
-    large = write(tmp_path, build_peptide("ACE-ALA-SER-NME"))
-    assert chosen(explained([large])[1])["model.entities"] == "residue"
-    chain = write(tmp_path, prepare("smiles:CCCCCCCCCCC"))
-    record, lines = explained([chain])
-    assert chosen(lines)["model.hydrogens"] == record["model"]["hydrogens"] == "placed"
-    assert "35 atoms, more than 32 identifiers; 11 heavy ones" in lines[1]
-    # Hydrogens are placed at one lag alone.
-    assert chosen(explained([chain], longest_lag_ps=5)[1])["model.autoencoder.identifier_pool"] == "35"
-
-
-def test_what_the_user_sets_stays(molecules: list[Path], tmp_path: Path) -> None:
-    config = tmp_path / "mine.toml"
-    config.write_text('[model.atoms]\nlatents = "set"\n[training]\nstage_two_batch = 7\ntime_reversal = false\n')
-    record, lines = explained(molecules, config=config)
-    assert set(chosen(lines)) == {"arch", "model.graph"}
-    assert record["training"]["stage_two_batch"] == 7 and record["training"]["time_reversal"] is False
-    assert record["model"]["atoms"]["latents"] == "set"
-
-
-def test_the_explained_file_gives_the_same_training(molecules: list[Path], tmp_path: Path) -> None:
+def test_the_explained_file_gives_the_same_training(alanine: Path, tmp_path: Path) -> None:
     small, filled = tmp_path / "small.toml", tmp_path / "filled.toml"
-    small.write_text(SMALL_LAM_SLIDE + "[model.atoms]\nwidth = 24\nn_rounds = 1\n")
-    names = [str(path) for path in molecules]
+    small.write_text(SMALL_LAM_SLIDE)
+    names = [str(alanine)]
     shown = run("train", *names, "--config", str(small), "--longest-lag", "4ps", "--explain")
     assert shown.exit_code == 0, shown.stderr
     filled.write_text(shown.stdout)
@@ -209,6 +168,24 @@ def test_rare_states_are_weighted_in_a_further_training_that_shows_them(
     monkeypatch.setattr(choices, "rare_kinds", lambda frames, length: ("kind",))
     found = {choice.key: choice.value for choice in trainer.choose(references, request)}
     assert found == {"training.rare_kinds": True, "training.rare_draws": 0.3}
+
+
+def test_more_atoms_than_identifiers_get_more_of_these(tmp_path: Path) -> None:
+    chain = write(tmp_path, prepare("smiles:CCCCCCCCCCC"))
+    record, lines = explained([chain])
+    assert record["model"]["autoencoder"]["identifier_pool"] == 35
+    assert lines[1].endswith("35 atoms, more than 32 identifiers")
+    config = tmp_path / "mine.toml"
+    config.write_text("[model.autoencoder]\nidentifier_pool = 40\n")
+    record, lines = explained([chain], config=config)
+    assert record["model"]["autoencoder"]["identifier_pool"] == 40 and len(lines) == 1, "what the user sets stays"
+
+
+def test_molecules_that_are_no_peptides_are_refused_together(tmp_path: Path, peptides: list[Path]) -> None:
+    two = [write(tmp_path, prepare(f"smiles:{smiles}"), lag_ps=2.0) for smiles in ("CCO", "CCC")]
+    for references, validation in ((two, []), ([*peptides, two[0]], []), (two[:1], two[1:])):
+        with pytest.raises(InputError, match="no installed architecture suits"):
+            explained(references, validation=validation)
 
 
 def test_files_that_cannot_be_meant_are_refused_in_one_line(alanine: Path, tmp_path: Path) -> None:

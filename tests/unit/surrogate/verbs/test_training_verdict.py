@@ -59,7 +59,7 @@ def test_too_short_a_training_is_called_unusable_and_told_what_would_help(
     assert "autoencoder 2 steps, flow 8 steps; validation error" in said and "not usable as it is" in said
     advice = " ".join(verdict["advice"])
     assert "start_from='alanine-dipeptide'" in advice, "shipped weights know this molecule under these conditions"
-    assert 'hydrogens = "placed"' in advice and "more minutes" in advice and "800 frames are few" in advice
+    assert "more minutes" in advice and "800 frames are few" in advice
     assert out.exists() and not list(tmp_path.glob("*.h5"))
 
 

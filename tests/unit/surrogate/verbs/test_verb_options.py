@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import surrogate
-from md_reference.campaign.run_options import key_of, read_settings
+from md_reference.campaign.campaign_file import key_of, read_settings
 from md_reference.run.defaults import defaults
 from surrogate import api
 from surrogate.cli import main

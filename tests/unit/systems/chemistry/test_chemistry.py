@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from small_scenes import n_unpaired_electrons
+from systems.chemistry import symmetry
 from systems.chemistry.bond_orders import ValenceError, perceive
 from systems.chemistry.geometry import signed_volumes, superpose, torsion
 from systems.chemistry.graph import (
@@ -390,3 +391,22 @@ def test_torsions_are_turned_in_every_second_state_with_bonds_as_they_were() -> 
     still = np.zeros((2, 3, 3))  # water has no torsion
     turn_torsions(scene_from_smiles("O"), still, 2, np.random.default_rng(0))
     assert not still.any()
+
+
+def test_what_follows_from_a_scene_is_worked_out_once_and_shared_read_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = ALA2.with_positions(ALA2.positions_nm)
+    asked: list[Scene] = []
+    find = symmetry._double_bonds
+    monkeypatch.setattr(symmetry, "_double_bonds", lambda scene: asked.append(scene) or find(scene))
+    assert molecule_key(scene) == molecule_key(ALA2)
+    atom_classes(scene), stereocentres(scene), molecule_key(scene)
+    assert asked.count(scene) == 1
+    assert bonded_graph(scene) is bonded_graph(scene)
+    with pytest.raises(nx.NetworkXError, match="Frozen"):
+        bonded_graph(scene).remove_node(0)
+    with pytest.raises(ValueError, match="read-only"):
+        atom_classes(scene)[0] = 0
+    # Another object, of other handedness, gets its own.
+    mirrored = scene.with_positions(scene.positions_nm * [1, 1, -1])
+    assert molecule_key(mirrored) != molecule_key(scene)
+    assert asked.count(mirrored) == 1

@@ -164,7 +164,7 @@ def turned(scene: Scene, i: int, j: int, degrees: float) -> np.ndarray:
     """The scene's positions with everything beyond j turned about the bond i-j."""
     import networkx as nx
 
-    graph = bonded_graph(scene)
+    graph = bonded_graph(scene).copy()
     graph.remove_edge(i, j)
     atoms = sorted(nx.node_connected_component(graph, j))
     x = scene.positions_nm.copy()

@@ -32,7 +32,7 @@ def coiled(scene: Scene) -> npt.NDArray[np.float64]:
     from systems.chemistry.geometry import torsion
     from systems.chemistry.graph import backbone_torsions, bonded_graph
 
-    x, graph = np.array(scene.positions_nm, dtype=np.float64), bonded_graph(scene)
+    x, graph = np.array(scene.positions_nm, dtype=np.float64), bonded_graph(scene).copy()
     for name, quads in ((k, v) for k, v in backbone_torsions(scene).items() if k in ALPHA_DEG):
         for quad in quads:
             _, start, end, _ = (int(i) for i in quad)

@@ -66,7 +66,7 @@ def frames_of(ensembles: tuple[Ensemble, Ensemble, Ensemble]) -> np.ndarray:
 def beyond(scene: Scene, fixed: int, moving: int) -> np.ndarray:
     import networkx as nx
 
-    graph = bonded_graph(scene)
+    graph = bonded_graph(scene).copy()
     graph.remove_edge(fixed, moving)
     return np.array(sorted(nx.node_connected_component(graph, moving)))
 

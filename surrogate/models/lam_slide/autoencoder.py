@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.lam_slide.codes.base import Code, Decoded
 from surrogate.models.lam_slide.config import AutoencoderConfig
 from surrogate.models.layers import CrossAttentionBlock, fourier_features
 
@@ -21,7 +22,15 @@ def draw_identifiers(n_atoms: int, pool: int, batch: int, generator: torch.Gener
     return torch.rand(batch, pool, generator=generator, device=device).argsort(dim=1)[:, :n_atoms]
 
 
-class Autoencoder(Code):
+@dataclass(frozen=True)
+class Decoded:
+    """Positions `(b, n_atoms, 3)` in scaled units and, when asked for, logits `(b, n_atoms, types)` of the elements."""
+
+    positions: Tensor
+    type_logits: Tensor | None
+
+
+class Autoencoder(nn.Module):
     """Encoder [x, m, u] -> Z (Algorithm 2) and decoder Z, u -> x, m (Algorithm 3)."""
 
     def __init__(self, config: AutoencoderConfig) -> None:
@@ -50,23 +59,9 @@ class Autoencoder(Code):
         self.to_position = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, 3))
         self.to_element = nn.Sequential(nn.LayerNorm(c.width), nn.Linear(c.width, MAX_ATOMIC_NUMBER + 1))
 
-    def tags(self, identifiers: Tensor) -> Tensor:
-        """Identifiers `(b, n)` -> what tells atoms apart, `(b, n, identifier_dim)`; such tags given stay as they are
-        (codes.atom_tags makes them of the covalent graph)."""
-        tags: Tensor = identifiers if identifiers.is_floating_point() else self.identifiers(identifiers)
-        return tags
-
-    def n_entities(self, n_atoms: int) -> int:
-        """Return how many identifiers so many atoms take: one each."""
-        return n_atoms
-
-    def types(self, elements: Tensor) -> Tensor:
-        """Return what the type logits are to name, given elements `(b, n_atoms)`: these themselves."""
-        return elements
-
     def encode(self, x: Tensor, elements: Tensor, identifiers: Tensor, mask: Tensor | None = None) -> Tensor:
         """Positions `(b, n, 3)` (scaled), atomic numbers and identifiers `(b, n)` -> latents `(b, n_latents, dim)`."""
-        entity = self.embed_entity(torch.cat([self.elements(elements), self.tags(identifiers)], dim=-1))
+        entity = self.embed_entity(torch.cat([self.elements(elements), self.identifiers(identifiers)], dim=-1))
         scale, shift = entity.chunk(2, dim=-1)
         tokens = self.embed_coordinates(fourier_features(x, self.config.n_octaves)) * scale + shift
         tokens = tokens + self.embed(tokens)
@@ -80,7 +75,7 @@ class Autoencoder(Code):
         """Latents `(b, n_latents, dim)`, identifiers `(b, n)` -> positions `(b, n, 3)` (scaled), element logits."""
         context = F.layer_norm(latents, (self.config.latent_dim,))
         # The residual stream and the last layer stay in float32: bf16 would round positions to 0.001 nm.
-        h = self.query(self.tags(identifiers)).float()
+        h = self.query(self.identifiers(identifiers)).float()
         for block in self.decoder:
             h = block(h, context)
         logits = self.to_element(h).float() if with_types else None
