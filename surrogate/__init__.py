@@ -2,7 +2,8 @@
 
 `import surrogate as sm; sm.rollout(scene, weights, out, time_ps=...)`: the verbs of `surrogate.api`, loaded on use
 (PEP 562), so that importing the package costs nothing. Beside them `sm.Simulation`, a surrogate that OpenMM's reporters
-take for `openmm.app.Simulation`, and `sm.to_mdtraj` and `sm.to_mdanalysis`, trajectories as these libraries' objects.
+take for `openmm.app.Simulation`, `sm.to_mdtraj` and `sm.to_mdanalysis`, trajectories as these libraries' objects, and
+`sm.frame_weights`, the weights that MD's answer gives to frames.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ if TYPE_CHECKING:
     from surrogate.sampling.openmm.simulation import Simulation as Simulation
     from systems.trajectory.converted import to_mdanalysis as to_mdanalysis
     from systems.trajectory.converted import to_mdtraj as to_mdtraj
+    from systems.trajectory.frame_weights import frame_weights as frame_weights
 
 __version__ = "0.1.0"
 
 _ELSEWHERE = {
     "Simulation": "surrogate.sampling.openmm.simulation",
+    "frame_weights": "systems.trajectory.frame_weights",
     "to_mdanalysis": "systems.trajectory.converted",
     "to_mdtraj": "systems.trajectory.converted",
 }

@@ -6,7 +6,6 @@ Times are in ps, temperatures in K, frictions in 1/ps, masses in dalton; a text 
 message is one line.
 """
 
-from surrogate.verbs.bursts import bursts
 from surrogate.verbs.campaign import campaign
 from surrogate.verbs.compare import compare
 from surrogate.verbs.demo import demo
@@ -19,7 +18,6 @@ from surrogate.verbs.train import explain_training, train
 from surrogate.verbs.windows import windows
 
 __all__ = [
-    "bursts",
     "campaign",
     "compare",
     "demo",

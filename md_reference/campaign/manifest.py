@@ -42,6 +42,7 @@ class SceneEntry:
     platform: str | None = None
     force: dict[str, Any] = field(default_factory=dict)
     repairs: tuple[str, ...] = ()
+    starts: str = ""
 
 
 @dataclass(frozen=True)

@@ -284,7 +284,9 @@ class _Job:
         own: tuple[Any, ...]
         if isinstance(task, SceneSpec):
             seed = first_seed(self._campaign.seed, task.name, 0.0)
-            work, own = "prepare_scene", (task, self._runs[task.name][0].config, seed)
+            runs = self._runs[task.name]
+            replicas = 1 + max(run.replica for run in runs)
+            work, own = "prepare_scene", (task, runs[0].config, seed, replicas)
             priority = 1 << 62
         else:
             expected = self.manifest.runs[task.name].frames_sha256

@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from md_reference.campaign.campaign_file import Run, SceneSpec
 from md_reference.campaign.cluster import LEASE_S, guarded, session_of
 from md_reference.campaign.manifest import MANIFEST_NAME, file_sha256, frames_sha256
@@ -23,6 +25,7 @@ from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from md_reference.run.platforms import PlatformChoice, measured_platform
 from md_reference.run.simulate import simulate
+from md_reference.run.starts import many_starts
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
@@ -41,11 +44,23 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """What replicas share: the scene, the force field resolved for it, and the platform they run on."""
+    """What replicas share: the scene, the force field resolved for it, and the platform they run on; where each begins,
+    `(n_atoms, 3)` nm, as far as that is known, how it was found, and the seed of that."""
 
     scene: Scene
     force: ForceFieldSpec
     platform: PlatformChoice
+    starts_nm: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    started: str = ""
+    seed: int = 0
+
+    def start_of(self, replica: int, config: MDConfig) -> Scene:
+        """Return what a replica starts from; that of one by which the campaign has grown is drawn now."""
+        if replica < len(self.starts_nm):
+            return replace(self.scene, positions_nm=np.array(self.starts_nm[replica]))
+        if replica == 0 or config.starts != "many":
+            return self.scene
+        return many_starts(self.scene, replace(config, force=self.force, seed=self.seed), replica + 1).scenes[-1]
 
     def summary(self) -> dict[str, Any]:
         """Return what the manifest says of it."""
@@ -57,6 +72,7 @@ class PreparedScene:
             "molecule_key": molecule_key(self.scene),
             "platform": self.platform.name,
             "force": asdict(self.force),
+            "starts": self.started,
             "repairs": tuple(map(str, repairs)) if isinstance(repairs, list | tuple) else (),
         }
 
@@ -66,22 +82,25 @@ def scene_path(folder: Path, name: str) -> Path:
     return folder / "scenes" / f"{name}.json"
 
 
-def prepare_scene(token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int) -> dict[str, Any]:
+def prepare_scene(
+    token: str, folder: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int = 1
+) -> dict[str, Any]:
     """Prepare a scene, or take the one that lies in `scenes/NAME.json`, and return its summary.
 
-    `config`: of any of its runs, which share all but temperature and seed; `seed`: of the water around it.
+    `config`: of any of its runs, which share all but temperature and seed; `seed`: of the water around it;
+    `replicas`: how many begin apart.
     """
 
     def work() -> dict[str, Any]:
         path = scene_path(folder, spec.name)
-        return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed)).summary()
+        return (load_prepared(path) if path.is_file() else _prepare(path, spec, config, seed, replicas)).summary()
 
     return guarded(token, folder / MANIFEST_NAME, work)
 
 
-def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> PreparedScene:
-    """Write and return the scene, solvated where the solvent is made of molecules, its platform chosen; its forces are
-    built, so that replicas find parameters that take long in the cache."""
+def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int, replicas: int) -> PreparedScene:
+    """Write and return the scene, solvated where the solvent is made of molecules, its platform chosen, starts of its
+    replicas drawn; its forces are built, so that replicas find parameters that take long in the cache."""
     scene = prepare(spec.source, options=_chosen(Preparation, spec))
     force = resolve(scene, config.force)
     if spec.preparation.get("keep_water"):
@@ -90,8 +109,19 @@ def _prepare(path: Path, spec: SceneSpec, config: MDConfig, seed: int) -> Prepar
         scene = solvate(scene, force, _chosen(WaterBox, spec), seed=seed, temperature_k=config.temperature_k)
     system = build_system(scene, force)
     choice = measured_platform(scene, replace(config, force=force), system=lambda: system)
-    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(choice, timings=()))
-    record = {"scene": prepared.scene.to_dict(), "force": asdict(force), "platform": asdict(prepared.platform)}
+    prepared = PreparedScene(replace(scene, name=spec.name), force, replace(choice, timings=()), seed=seed)
+    if replicas > 1 and config.starts == "many":
+        starts = many_starts(prepared.scene, replace(config, force=force, seed=seed), replicas)
+        frames = tuple(s.positions_nm.tolist() for s in starts.scenes)
+        prepared = replace(prepared, starts_nm=frames, started=starts.how)
+    record = {
+        "scene": prepared.scene.to_dict(),
+        "force": asdict(force),
+        "platform": asdict(prepared.platform),
+        "starts_nm": prepared.starts_nm,
+        "started": prepared.started,
+        "seed": seed,
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     create_whole(path, json.dumps(record))
     return prepared
@@ -142,7 +172,7 @@ def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, exp
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
     Claim(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
     simulate(
-        prepared.scene,
+        prepared.start_of(run.replica, run.config),
         replace(run.config, force=prepared.force),
         out,
         resume=True,

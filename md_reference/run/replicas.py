@@ -11,12 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from md_reference.run.batch import simulate_batch
 from md_reference.run.config import SIMD, MDConfig, check_run
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import plan_line
 from md_reference.run.platforms import measured_platform, simd_choice
 from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
+from md_reference.run.starts import many_starts
 from md_reference.simd.force_field import n_replicas
 from systems.errors import SimulationError, SurromdError
 from systems.interrupts import deferred_interrupt
@@ -34,7 +37,7 @@ class _Board:
 
 
 def simulate_replicas(
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     config: MDConfig,
     outs: Sequence[Path],
     *,
@@ -46,6 +49,8 @@ def simulate_replicas(
 ) -> list[Path]:
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
+    `scene`: what they start from, each from a state of its own unless `config.starts` is one (`starts.many_starts`); or
+    a start for each replica.
     Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
     small scenes the fastest use of them. On platform simd up to sixteen replicas share a process. The platform is
     measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
@@ -54,6 +59,8 @@ def simulate_replicas(
     by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
     stay on disk.
     """
+    given = None if isinstance(scene, Scene) else list(scene)
+    scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
         config = check_run(scene, config, out)
     configs = [replace(config, seed=config.seed + k) for k in range(len(outs))]
@@ -72,9 +79,16 @@ def simulate_replicas(
         choice = measured_platform(scene, config, max_threads=max(1, available_cores() // width), side_by_side=width)
         if announce is not None:
             announce(plan_line(scene, config, choice, replicas=len(outs)))
+    scenes = [scene] * len(outs) if given is None else given
+    if fresh and given is None and config.starts == "many" and len(outs) > 1:
+        tell_preparing(progress, 0.0)
+        starts = many_starts(scene, config, len(outs))
+        scenes = list(starts.scenes)
+        if announce is not None:
+            announce(starts.how)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "choice": choice}
     if len(jobs) == 1:
-        _run(scene, [configs[k] for k in jobs[0]], list(outs), how, progress)
+        _run([scenes[k] for k in jobs[0]], [configs[k] for k in jobs[0]], list(outs), how, progress)
         return list(outs)
     context = multiprocessing.get_context("spawn")
     # Without a lock, which a killed process would never give back: each number has one writer.
@@ -90,7 +104,8 @@ def simulate_replicas(
                 while waiting and len(running) < width:
                     k = waiting.pop(0)
                     of_job = [configs[i] for i in jobs[k]], [outs[i] for i in jobs[k]]
-                    args = (scene.to_dict(), *of_job, how, board, k)
+                    once = {id(scenes[i]): scenes[i].to_dict() for i in jobs[k]}
+                    args = ([once[id(scenes[i])] for i in jobs[k]], *of_job, how, board, k)
                     running[k] = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
                     running[k].start()
                 time.sleep(0.1)
@@ -136,17 +151,25 @@ def _collect(errors: Any, reasons: dict[int, str], wanted: int) -> None:
 
 
 def _run(
-    scene: Scene, configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], progress: ProgressFn | None
-) -> None:
+    scenes: Sequence[Scene], configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any],
+    progress: ProgressFn | None,
+) -> None:  # fmt: skip
     """Run one replica, or on platform simd a batch of them; `how`: what else `simulate` takes."""
     if configs[0].platform == SIMD:
-        simulate_batch(scene, configs[0], outs, resume=how["resume"], overwrite=how["overwrite"], progress=progress)
+        starts = None if all(s is scenes[0] for s in scenes[1:]) else np.stack([s.positions_nm for s in scenes])
+        of_files = {"resume": how["resume"], "overwrite": how["overwrite"], "progress": progress}
+        simulate_batch(scenes[0], configs[0], outs, starts_nm=starts, **of_files)
     else:
-        simulate(scene, configs[0], outs[0], progress=progress, **how)
+        simulate(scenes[0], configs[0], outs[0], progress=progress, **how)
 
 
 def _replicas(
-    scene: dict[str, Any], configs: Sequence[MDConfig], outs: Sequence[Path], how: dict[str, Any], board: _Board, k: int
+    scenes: Sequence[dict[str, Any]],
+    configs: Sequence[MDConfig],
+    outs: Sequence[Path],
+    how: dict[str, Any],
+    board: _Board,
+    k: int,
 ) -> None:
     """Run the k-th job in a process of its own."""
     end_with_parent()
@@ -159,7 +182,8 @@ def _replicas(
             board.equilibrated[k] = done / total
 
     try:
-        _run(Scene.from_dict(scene), configs, outs, how, report)
+        made = {id(s): Scene.from_dict(s) for s in scenes}  # those that are one stay one
+        _run([made[id(s)] for s in scenes], configs, outs, how, report)
     except SurromdError as error:
         board.errors.put((k, str(error)))
         raise SystemExit(1) from None

@@ -102,6 +102,7 @@ class MDSettings:
     ensemble: str | None = from_field(MDConfig, "ensemble", None)
     pressure_bar: float | None = from_field(MDConfig, "pressure_bar", None)
     platform: str = from_field(MDConfig, "platform")
+    starts: str = from_field(MDConfig, "starts")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,14 +167,6 @@ class CompareOptions(Overwriting):
     )
     labels: str | Sequence[str] | None = option("Names of the candidates in the report.", None, words=None)
     energies: bool = option("Also compare potential energies, by the reference's force field.", False)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BurstOptions(Seeded, Quiet):
-    """What `bursts` can be told."""
-
-    n_bursts: int = option("Number of short runs, spread evenly over the states.", 300, within=(2, 100_000))
-    burst_ps: float = option("Length of each.", 10.0)
 
 
 @dataclass(frozen=True, kw_only=True)

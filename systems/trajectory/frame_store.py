@@ -43,6 +43,8 @@ ENDS = "surromd/frame_ends"
 FRAMES, CELLS = "frames", "cells"
 _EXTRA = ("velocities", "forces", "cell_lengths", "cell_angles", EDGES)
 
+WEIGHTS = "surromd/weights"
+
 
 def program_version() -> str:
     """Return the installed version of surromd, or `0` when it runs from a source tree."""
@@ -377,6 +379,16 @@ class FrameStore:
             set_text(self.file["surromd"], "record", sealed(json_text(merged, "record")))
             self._commit()
             self.record = merged
+
+    def write_weights(self, weights: npt.NDArray[np.float64]) -> None:
+        """Write, or replace, a weight for every frame. Raises InputError for another number of them, StorageError."""
+        if weights.shape != (self.n_frames,):
+            raise InputError(f"{self.path} holds {self.n_frames} frames; weights of shape {weights.shape} do not fit.")
+        with self._as_far_as_it_can_be_read():
+            if WEIGHTS in self.file:
+                del self.file[WEIGHTS]
+            self.file.create_dataset(WEIGHTS, data=weights, dtype="<f8")
+            self._commit()
 
     def _commit(self) -> None:
         self.file.flush()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,40 +13,34 @@ from systems.errors import InputError
 from systems.units import format_time_ps, format_wall
 
 Way = Literal["md", "rollout", "potential", "trained"]
-Stage = Literal["training md", "train", "rollout", "md", "held-out md", "bursts", "report"]
+Stage = Literal["training md", "train", "rollout", "md", "held-out md", "report"]
 
 WAYS: dict[Way, str] = {
-    "md": "MD for the whole budget",
-    "rollout": "rollout with weights that cover the scene, checked by MD",
-    "potential": "a potential that learns from GFN2-xTB, checked by MD",
-    "trained": "weights trained on MD made here, checked by other MD",
+    "md": "MD for the whole budget, from many starts",
+    "rollout": "a rollout finds the states, MD from its frames weighs them",
+    "potential": "a potential that learns from GFN2-xTB finds the states, MD weighs them",
+    "trained": "weights trained on MD made here find the states, other MD weighs them",
 }
 # Shares of what is left when the report is paid for; MD that is held out comes last, and takes what others leave. MD
 # that judges itself is split by replicas, or by stages if there is one replica.
 _BY_STAGES: tuple[tuple[Stage, float], ...] = (("md", 0.5), ("held-out md", 0.5))
 _SHARES: dict[Way, tuple[tuple[Stage, float], ...]] = {
     "md": (("md", 1.0),),
-    "rollout": (("rollout", 0.3), ("bursts", 0.2), ("held-out md", 0.5)),
-    "potential": (("train", 0.6), ("rollout", 0.1), ("bursts", 0.05), ("held-out md", 0.25)),
-    "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("bursts", 0.05), ("held-out md", 0.15)),
+    "rollout": (("rollout", 0.15), ("held-out md", 0.85)),
+    "potential": (("train", 0.6), ("rollout", 0.1), ("held-out md", 0.3)),
+    "trained": (("training md", 0.3), ("train", 0.4), ("rollout", 0.1), ("held-out md", 0.2)),
 }
 LEAST_BUDGET_S = 20.0
 # Of a budget: what is planned with, for stages take a while to stop and estimates are none of the best.
 _AIM = 0.97
 # Processor seconds before the first step of a stage of MD: processes start, forces are built.
 _START_S = 4.0
-# In fewer a stage that goes on makes nothing more, and bursts begin in vain.
+# In fewer a stage that goes on makes nothing more.
 RESTART_S = 2.0
 # Of a run; no stage of MD spends more of its length on coming to equilibrium.
 _EQUILIBRATION_SHARE = 0.1
 # Below this a potential has no time to learn from as many states as it needs.
 LEAST_TRAINING_S = 240.0
-BURST_PS = 10.0
-MOST_BURSTS, _LEAST_BURSTS = 300, 60
-# Of a burst: relaxing the frame that it starts from, in steps of MD.
-_RELAXING_STEPS = 150
-# Of their share, what bursts are planned to take: their estimate is the least sure.
-_BURSTS_AIM = 0.7
 # The judge: processor seconds until its libraries are loaded (while the last MD runs), then at all, of an atom, and of
 # an atom in a frame; what it is meant to take of a budget, and may.
 _JUDGE_LOADING_S, _JUDGE_S, _JUDGE_ATOM_S, _JUDGE_ATOM_FRAME_S = 3.5, 3.0, 0.055, 7e-7
@@ -70,15 +65,13 @@ class PlannedStage:
 @dataclass(frozen=True)
 class Decision:
     """How a budget is spent. `why`: the reasons, a line each; `save_every_ps`: of all trajectories, `equilibrate_ps`
-    of MD at most; `n_bursts` of `burst_ps` each; `expected_md_ps`, `expected_rollout_ps`: what all stages come to."""
+    of MD at most; `expected_md_ps`, `expected_rollout_ps`: what all stages come to."""
 
     way: Way
     why: tuple[str, ...]
     stages: tuple[PlannedStage, ...]
     save_every_ps: float
     equilibrate_ps: float
-    n_bursts: int
-    burst_ps: float
     expected_md_ps: float
     expected_rollout_ps: float
 
@@ -164,23 +157,10 @@ def _divided(
     rates: Rates, way: Way, why: tuple[str, ...], shares: dict[Stage, float], budget_s: float, frames: int
 ) -> Decision:
     """Return the decision for a way: the budget divided by its `shares`, when so many frames are read at the end."""
-    shares = dict(shares)
     judge_s = min(_MOST_FOR_REPORT * budget_s, report_s(rates, frames, rates.stretch))
     left_s = budget_s - judge_s
-    n_bursts, burst_ps = 0, max(BURST_PS, rates.rolls.lag_ps if rates.rolls else 0.0)
-    if "bursts" in shares:
-        burst_s = (burst_ps / rates.timestep_ps + _RELAXING_STEPS) * rates.step_s * rates.stretch
-        n_bursts = min(MOST_BURSTS, int(_BURSTS_AIM * shares["bursts"] * left_s / burst_s))
-        if n_bursts < _LEAST_BURSTS:
-            why += (f"no bursts: one of {burst_ps:g} ps takes {format_wall(burst_s)}, and {_LEAST_BURSTS} are needed",)
-            n_bursts = 0
-            del shares["bursts"]
-        else:
-            shares["bursts"] = n_bursts * burst_s / _BURSTS_AIM / left_s
-    scale = (1.0 - shares.get("bursts", 0.0)) / sum(share for name, share in shares.items() if name != "bursts")
-    stages = [PlannedStage(name, left_s * share * (1.0 if name == "bursts" else scale))
-              for name, share in shares.items()]  # fmt: skip
-    found = Decision(way, why, (*stages, PlannedStage("report", judge_s)), 0.0, 0.0, n_bursts, burst_ps, 0.0, 0.0)
+    stages = [PlannedStage(name, left_s * share) for name, share in shares.items()]
+    found = Decision(way, why, (*stages, PlannedStage("report", judge_s)), 0.0, 0.0, 0.0, 0.0)
     expected_ps = {name: md_ps(rates, found, name) for name in shares if name in MD_STAGES}
     return replace(
         found,
@@ -235,6 +215,30 @@ def _interval(rates: Rates, way: Way, least_ps: float) -> float:
     return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
 
 
+def expected_errors(rates: Rates, decision: Decision, relaxation_ps: float, model_error: float) -> dict[str, float]:
+    """Return the error to expect of the population of a state that is there half of the time, at the end of a budget.
+
+    Of all MD together `sqrt(relaxation / length) / sqrt(2)` (independent samples are two relaxation times apart:
+    Müller-Krumbhaar and Binder, J. Stat. Phys. 8, 1 (1973)). Replicas from one start have their mean bias beside that,
+    half of `(1 - exp(-t)) / t` with t their length over the relaxation time; those from many are weighted by their
+    transitions and have none. A rollout has its `model_error`.
+    """
+    seconds = sum(stage.seconds for stage in decision.stages if stage.name != "report")
+
+    def sampling(total_ps: float) -> float:
+        return min(0.5, math.sqrt(0.5 * relaxation_ps / max(total_ps, 1e-9)))
+
+    all_md_ps = rates.md_ps_per_s * seconds
+    lengths = max(all_md_ps / rates.replicas / max(relaxation_ps, 1e-9), 1e-9)
+    bias = 0.5 * -math.expm1(-lengths) / lengths
+    found = {"MD from one start": math.hypot(sampling(all_md_ps), bias), "MD from many": sampling(all_md_ps)}
+    if rates.rolls is not None and decision.way != "md":
+        own_ps = rates.md_ps_per_s * decision.seconds("held-out md")
+        found["the rollout alone"] = math.hypot(sampling(rates.rolls.ps_per_s * seconds), model_error)
+        found["rollout and MD"] = sampling(own_ps)
+    return found
+
+
 def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, str]]:
     """Return the decision and what it rests on, as lines of a name and a text."""
 
@@ -267,4 +271,4 @@ def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
         return f", about {format_time_ps(md_ps(rates, decision, name), 2)}"
     if name == "rollout" and decision.expected_rollout_ps:
         return f", about {format_time_ps(decision.expected_rollout_ps, 2)}"
-    return f", {decision.n_bursts} of {decision.burst_ps:g} ps" if name == "bursts" else ""
+    return ""

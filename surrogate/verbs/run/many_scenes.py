@@ -258,5 +258,4 @@ def _result(spec: SceneSpec, folder: Path, failed: str) -> dict[str, Any]:
     line |= {"formula": record["formula"], "way": decision["way"] if decision else "", "wall_s": record["spent_s"]}
     if outcome is None:
         return line | {"failed": failed or "not done"}
-    kept = ("headline", "status", "verdict", "held_out_ps", "rolled_ps", "worth", "gain", "bursts")
-    return line | {key: outcome[key] for key in kept}
+    return line | {key: value for key, value in outcome.items() if key != "notes"}

@@ -175,13 +175,10 @@ class _Run:
                 return math.inf
             return max(least_s, seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace))
 
-        if may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch:  # it would hardly have begun
-            if there is not None and (name != "md" or there.held_out):
-                self._ended(there, StageEntry(name, "out of time", 0.0))
-                return
-            if name == "bursts":
-                self._failed(name, "no time was left")
-                return
+        hardly_begins = may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch
+        if hardly_begins and there is not None and (name != "md" or there.held_out):
+            self._ended(there, StageEntry(name, "out of time", 0.0))
+            return
         self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES:
@@ -339,7 +336,7 @@ def _clear(folder: Path) -> None:
     """Remove what an earlier run wrote, its record last."""
     for name in ("reference", "trajectory"):
         shutil.rmtree(folder / name, ignore_errors=True)
-    for pattern in ("report.*", "weights.*", "bursts.json", LOG_NAME, RUN_NAME):
+    for pattern in ("report.*", "weights.*", "equilibrium.json", LOG_NAME, RUN_NAME):
         for path in folder.glob(pattern):
             with suppress(FileNotFoundError):
                 path.unlink()

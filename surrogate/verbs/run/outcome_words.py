@@ -1,4 +1,4 @@
-"""What came of a run, in words: held-out MD, worth against it, gain, and what the bursts say beyond that."""
+"""What came of a run, in words: MD's answer first, then the rollout beside it and what it saved."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison
+    from surrogate.judge.md_answer import Answer
     from surrogate.judge.worth import Worth
 
 
@@ -26,14 +27,22 @@ class Costs:
     budget_s: float
 
 
-def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", notes: tuple[str, ...] = ()) -> Outcome:
-    """Return what a comparison of a run's trajectory with its held-out MD comes to."""
+def outcome(
+    way: Way, comparison: Comparison, costs: Costs, answer: Answer | None = None, notes: tuple[str, ...] = ()
+) -> Outcome:
+    """Return what a run comes to: its MD's `answer`, and a comparison of its trajectory with its held-out MD.
+
+    Where replicas are too short to have forgotten their starts, no equivalent MD time is told.
+    """
     judged = comparison.judgements[0]
     held_ps = comparison.reference.total_ps
     if comparison.replicate is not None:
         held_ps += comparison.replicate.total_ps
     rolled_ps = judged.account.total_ps
-    worth = next((w for w in judged.worth if w.kind == "distribution"), None) if judged.worth_words else None
+    forgot = answer is None or answer.method == "plain averages"
+    worth = None
+    if judged.worth_words and forgot:
+        worth = next((w for w in judged.worth if w.kind == "distribution"), None)
     gain = _least_gain(worth, costs) if way != "md" else None
     held = f"{format_time_ps(held_ps, 2)} of held-out MD"
     if way == "md":
@@ -42,6 +51,11 @@ def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", no
         head = f"{format_time_ps(rolled_ps, 2)} of MD{each}, and {held} that judges it"
         head += f": worth {worth.in_words()} of MD by its {worth.measure}." if worth else f": {judged.status}."
         head += f" With the held-out half there are {format_time_ps(rolled_ps + held_ps, 2)} to use."
+    elif not forgot:
+        head = (
+            f"No equivalent MD time of the {format_time_ps(rolled_ps, 2)} of the surrogate: MD's replicas are too "
+            "short for averages of theirs, and begin where the surrogate was."
+        )
     elif worth is None:
         head = (
             f"{held} tell no worth of the {format_time_ps(rolled_ps, 2)} of the surrogate, which are {judged.status}."
@@ -56,10 +70,21 @@ def outcome(way: Way, comparison: Comparison, costs: Costs, bursts: str = "", no
         longer = format_wall(float(f"{costs.budget_s * LEAST_SAMPLES / n:.2g}"))
         head += f" Of the slowest motion {n:.2g} independent samples were seen, of {LEAST_SAMPLES} that it takes: "
         head += f"a budget of about {longer} would tell."
-    if bursts:
-        head += f" Beyond that, by bursts of MD, it {bursts}."
-    return Outcome(head, judged.status, judged.verdict, held_ps, rolled_ps, worth.in_words() if worth else "", gain,
-                   bursts, notes)  # fmt: skip
+    if answer is not None:
+        head = " ".join(filter(None, (answer.headline, answer.on_surrogate, head)))
+    return Outcome(
+        head,
+        judged.status,
+        judged.verdict,
+        held_ps,
+        rolled_ps,
+        worth.in_words() if worth else "",
+        gain,
+        answer.headline if answer else "",
+        answer.on_surrogate if answer else "",
+        answer.holds and not answer.missing if answer else False,
+        notes,
+    )
 
 
 def _least_ps(worth: Worth) -> float:

@@ -15,7 +15,7 @@ from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 
 RUN_NAME = "run.json"
-FORMAT = 2
+FORMAT = 3
 # What may change from one sitting to the next.
 _FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})
 
@@ -34,9 +34,10 @@ class StageEntry:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run. `headline`: the report's first line; `held_out_ps` of MD that judged, `rolled_ps` that was
-    judged; `worth` in words, `gain` over as much wall time of MD as a lower bound, None where it cannot be told;
-    `bursts`: their verdict."""
+    """What came of a run. `headline`: the report's first line; `answer`: what MD says of equilibrium, `on_surrogate`:
+    what that says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of MD that judged,
+    `rolled_ps` that was judged; `worth` in words, `gain` over as much wall time of MD as a lower bound, None where it
+    cannot be told."""
 
     headline: str
     status: str
@@ -45,7 +46,9 @@ class Outcome:
     rolled_ps: float
     worth: str = ""
     gain: float | None = None
-    bursts: str = ""
+    answer: str = ""
+    on_surrogate: str = ""
+    converged: bool = False
     notes: tuple[str, ...] = ()
 
 

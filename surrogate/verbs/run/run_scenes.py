@@ -23,9 +23,11 @@ def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOpt
     """Simulate a molecule in `budget_s` of wall time by whatever way pays best here, judge it, and return the record.
 
     What MD and the weights that cover the scene simulate is measured in the first seconds, and decides: weights that
-    cover it and outrun MD are rolled, and checked by MD that is held out and by bursts of MD from their frames; where
-    nothing covers it and MD is cheap, MD takes the whole budget, one half as the judge of the other; at
-    `level='gfn2-xtb'` a potential learns the molecule first. `way` overrides that. `dry_run`: the decision alone.
+    cover it and outrun MD are rolled for a short while to find the states, and MD runs from their frames; where nothing
+    covers it and MD is cheap, MD takes the whole budget, its replicas beginning in many states (`starts`); at
+    `level='gfn2-xtb'` a potential learns the molecule first. `way` overrides that. `dry_run`: the decision alone. The
+    answer is MD's: its transitions give populations, free energies and timescales with errors (`equilibrium.json`), and
+    each frame of MD a weight (`sm.frame_weights`); the surrogate is reported beside that.
 
     The folder `out` holds `report.html`, whose first line says what was achieved, the trajectory, `reference/`, the
     weights that were trained, `run.json` (the record that is returned: rates, decision, stages, seeds, versions) and

@@ -13,29 +13,30 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.bursts import bursts
 from surrogate.verbs.compare import compare
-from surrogate.verbs.options import BurstOptions, MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
+from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
 from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.run.decision import Decision, Stage, md_ps, table
+from surrogate.verbs.run.decision import Decision, Stage, expected_errors, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, outcome
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
-from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.preparation import Preparation
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
     from surrogate.judge.comparison import Comparison
+    from surrogate.judge.md_answer import Answer
     from systems.scene import Scene
 
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
 _AMPLE = 2.0
 _LEAST_FRAMES = 20
+# Of MD from frames of a rollout is left out so much: what is local has forgotten the model by then.
+_LEFT_OUT_PS = 20.0
 # Of a training's time what may go into steps, and must; processor seconds that do not: weights are tried out, frames
 # read and encoded (of an atom in a frame), which may take so large a share.
 _OPTIMISING, _LEAST_OPTIMISING = 0.95, 0.1
@@ -49,7 +50,7 @@ _LOADED_BEFORE: dict[Stage, tuple[str, ...]] = {
     "report": ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj"),
     "train": ("torch", "lightning_fabric", "matplotlib.backends.backend_svg", "surrogate.models.lam_slide.trainer"),
 }
-WEIGHTS_NAME, BURSTS_NAME, REPORT_NAME = "weights.safetensors", "bursts.json", "report.html"
+WEIGHTS_NAME, ANSWER_NAME, REPORT_NAME = "weights.safetensors", "equilibrium.json", "report.html"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,8 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
                 raise said
 
         with accounted_outputs(files):
-            simulate_replicas(site.scene, config, files, resume=True, announce=heard)
+            starts, config = _starts(site, record, config, files)
+            simulate_replicas(starts, config, files, resume=True, announce=heard)
         done = found(site, record)
         if done is None:
             raise InputError("MD wrote fewer than two frames, too few to judge.")
@@ -138,6 +140,36 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         return replace(record, trajectory=tuple(itertools.chain(*own)), held_out=tuple(itertools.chain(*held)))
 
     return StageOf(work, found)
+
+
+def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) -> tuple[Scene | list[Scene], MDConfig]:
+    """Return where replicas of MD begin, and their settings: at frames of the rollout, drawn over all its states, where
+    there is one, else at states of hot MD, which takes a small part of their time."""
+    from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
+    from surrogate.judge.md_answer import frames_over_states
+    from surrogate.judge.read.ensemble import load_ensemble
+    from systems.trajectory.checkpoint import checkpoint_path
+
+    rates, decision = _rates_and_decision(record)
+    if config.starts == "one" or len(files) < 2:
+        return site.scene, config
+    rolled = None
+    if decision.way != "md" and record.trajectory:
+        rolled = load_ensemble([site.folder / file for file in record.trajectory])
+        if rolled.scene.n_atoms != site.scene.n_atoms:  # water was not rolled
+            rolled = None
+    if rolled is not None:
+        left_out_ps = max(config.equilibrate_ps, min(_LEFT_OUT_PS, 2.5 * config.equilibrate_ps))
+        config = replace(config, starts="rollout", equilibrate_ps=left_out_ps)
+    if all(path.exists() or checkpoint_path(path).exists() for path in files):
+        return site.scene, config
+    if rolled is not None:
+        with suppress(SimulationError):
+            frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
+            return list(frames_as_starts(site.scene, config, frames, len(files)).scenes), config
+    # On one core, while the others wait.
+    hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)
+    return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps).scenes), config
 
 
 def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
@@ -256,15 +288,6 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
     return replace(record, trajectory=files) if files else None
 
 
-def _burst(site: Site, record: RunRecord) -> RunRecord:
-    _, decision = _rates_and_decision(record)
-    options = BurstOptions(n_bursts=decision.n_bursts, burst_ps=decision.burst_ps, seed=site.options.seed, quiet=True)
-    check = bursts([site.folder / file for file in record.trajectory], options=options)
-    text = json.dumps(check.to_dict(), indent=1, default=str)
-    create_whole(site.folder / BURSTS_NAME, text + "\n")
-    return record
-
-
 def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs:
     """Return what the trajectory that a comparison judges has cost, beside what `held_ps` of the run's own held-out MD
     did."""
@@ -284,6 +307,28 @@ def worth_saying(notes: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(note for note in notes if not note.startswith(STOPPED))
 
 
+def answer_of(site: Site, record: RunRecord) -> Answer | None:
+    """Return what all MD of a run says of equilibrium, written into its folder, each frame's weight into its file; None
+    where it tells nothing."""
+    from surrogate.judge.md_answer import md_answer
+    from surrogate.judge.read.ensemble import load_ensemble
+    from systems.trajectory.frame_weights import write_weights
+
+    is_md = _rates_and_decision(record)[1].way == "md"
+    files = [site.folder / file for file in (*(record.trajectory if is_md else ()), *record.held_out)]
+    rolled = None if is_md else load_ensemble([site.folder / file for file in record.trajectory])
+    md = load_ensemble(files, template=None if rolled is None else rolled.scene)
+    try:
+        answer = md_answer(md, site.config.temperature_k, surrogate=rolled, seed=site.options.seed)
+    except InputError:
+        return None
+    if len(answer.weights) == len(files):
+        for path, weights in zip(files, answer.weights, strict=True):
+            write_weights(path, weights)
+    create_whole(site.folder / ANSWER_NAME, json.dumps(answer.to_dict(), indent=1, allow_nan=False) + "\n")
+    return answer
+
+
 def _report(site: Site, record: RunRecord) -> RunRecord:
     from surrogate.judge.report.report import Foreword, write_report
 
@@ -291,23 +336,27 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     if not record.held_out or not record.trajectory:
         lacking = "the trajectory" if record.held_out else "MD to judge it by"
         raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
+    answer = answer_of(site, record)
     held = [site.folder / file for file in record.held_out]
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
     comparison = replace(comparison, notes=worth_saying(comparison.notes))
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
-    costs = costs_of(record, comparison, held_ps)
-    bursts_file = site.folder / BURSTS_NAME
-    said = parsed(bursts_file.read_text("utf-8"))["verdict"] if bursts_file.exists() else ""
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
-    found = outcome(decision.way, comparison, costs, said, notes)
-    lines = [*table(rates, decision, site.options.budget_s), *(("note", note) for note in notes)]
+    found = outcome(decision.way, comparison, costs_of(record, comparison, held_ps), answer, notes)
+    lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s)]
+    if answer is not None and answer.timescales_ps:
+        errors = expected_errors(rates, decision, answer.timescales_ps[0], answer.model_error)
+        said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
+        lines.append(("expected error", f"of a population, in this budget: {said}"))
     write_report(
         comparison,
         site.folder / REPORT_NAME,
         command=f"surromd run {record.scene!r} -o {site.folder.name}",
-        foreword=Foreword(found.headline, "How the budget was spent, and why", lines),
+        foreword=Foreword(
+            found.headline, "States by MD, and how the budget was spent", [*lines, *(("note", note) for note in notes)]
+        ),
     )
     return replace(record, outcome=found)
 
@@ -333,6 +382,5 @@ STAGES: dict[str, StageOf] = {
     "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),
     "rollout": StageOf(_roll, _rolled, may_fail=True),
-    "bursts": StageOf(_burst, _nothing, may_fail=True),
     "report": StageOf(_report, _nothing),
 }

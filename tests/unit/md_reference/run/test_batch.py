@@ -34,7 +34,7 @@ def _frames(path: Path) -> np.ndarray:
 
 def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
     outs = [tmp_path / f"a{k}.h5" for k in range(3)]
-    simulate_replicas(SCENE, CONFIG, outs)
+    simulate_replicas(SCENE, replace(CONFIG, starts="one"), outs)
     for k, out in enumerate(outs):
         with open_trajectory(out) as reader:
             assert reader.n_frames == 6 and np.allclose(reader.time_ps, np.arange(1, 7))

@@ -76,4 +76,4 @@ def test_work_that_only_looks_now_and_then_is_stopped_too() -> None:
             stop_if_asked()
             time.sleep(0.01)
 
-    assert clock().work("bursts", lambda _: 0.2, loop) is None
+    assert clock().work("train", lambda _: 0.2, loop) is None

@@ -36,7 +36,7 @@ def record() -> RunRecord:
     return RunRecord(
         "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
         RATES, decide(RATES, 600.0), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
-        outcome=Outcome("head", "close", "verdict", 10.0, 20.0, "at least 10 ns", None, "", ("a note",)),
+        outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
     )  # fmt: skip
 
 
@@ -98,21 +98,34 @@ def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth
                  lengths_ps=(1e3, 1e4, 1e5), errors=(3.0, 2.0, 1.0), errors_high=(), **given)  # fmt: skip
 
 
-def told(way: Way, found: Worth | None, costs: Costs = CHEAP, bursts: str = "") -> Outcome:
+def told(way: Way, found: Worth | None, costs: Costs = CHEAP, answer: Any = None) -> Outcome:
     account = SimpleNamespace(total_ps=50_000.0, n_segments=16)
     status, worths = ("close", (found,)) if found else ("undecided", ())
     judged = SimpleNamespace(account=account, worth=worths, worth_words="words" if found else "", status=status,
                              verdict="Close.", effective_samples=4.0)  # fmt: skip
     half = SimpleNamespace(total_ps=6_000.0)
     comparison: Any = SimpleNamespace(judgements=(judged,), reference=half, replicate=half)
-    return outcome(way, comparison, costs, bursts)
+    return outcome(way, comparison, costs, answer)
+
+
+def answer(method: str, **more: Any) -> Any:
+    given = {"headline": "Equilibrium from MD.", "on_surrogate": "It agrees.", "holds": True, "missing": ()} | more
+    return SimpleNamespace(method=method, **given)
 
 
 def test_the_headline_says_held_out_worth_and_least_gain() -> None:
-    found = told("rollout", worth(), bursts="moves as the truth does")
+    found = told("rollout", worth())
     assert found.headline.startswith("12 ns of held-out MD; the 50 ns of the surrogate are worth 10 ns [8 ns, 12 ns]")
     assert found.gain == pytest.approx(8_000.0 / (200.0 * 10.0)) and "gain at least 4:" in found.headline
-    assert found.headline.endswith("Beyond that, by bursts of MD, it moves as the truth does.")
+
+
+def test_md_s_answer_comes_first_and_short_replicas_tell_no_equivalent_time() -> None:
+    long = told("rollout", worth(), answer=answer("plain averages"))
+    assert long.headline.startswith("Equilibrium from MD. It agrees. 12 ns of held-out MD") and long.gain
+    assert long.converged and long.answer == "Equilibrium from MD." and long.on_surrogate == "It agrees."
+    short = told("rollout", worth(), answer=answer("Markov model"))
+    assert "No equivalent MD time" in short.headline and short.gain is None and not short.worth
+    assert not told("rollout", worth(), answer=answer("Markov model", missing=("ALA 2 β",))).converged
 
 
 def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:

@@ -26,7 +26,7 @@ from surrogate.verbs.run.stages import Site, StageOf
 from systems.errors import InputError, SimulationError
 from systems.trajectory.codec import open_trajectory
 
-# As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock, and bursts are too dear.
+# As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock.
 RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("alanine-dipeptide", 1.0, 0.25))
 BUDGET_S = 400.0
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=16, md_ps_per_s=0.8)
@@ -54,8 +54,9 @@ class Killed(BaseException):
     """Nobody catches it: what is on disk is what a kill leaves."""
 
 
-def run(folder: Path, asked: str, *, resume: bool = False) -> dict[str, Any]:
-    return api.run("alanine-dipeptide", folder, budget_s=BUDGET_S, way=asked, resume=resume, quiet=True)
+def run(folder: Path, asked: str, *, resume: bool = False, starts: str = "many") -> dict[str, Any]:
+    options: dict[str, Any] = {"budget_s": BUDGET_S, "way": asked, "resume": resume, "starts": starts}
+    return api.run("alanine-dipeptide", folder, quiet=True, **options)
 
 
 def frames(folder: Path) -> dict[str, Any]:
@@ -137,6 +138,25 @@ def test_kills_before_and_after_each_stage_change_nothing(
 
 
 @needs_compiler
+def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
+    monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    one, two = tmp_path / "one", tmp_path / "two"
+    run(one, "surrogate")
+    with monkeypatch.context() as patch:
+        patch.setitem(stages.STAGES, "held-out md", disturbed(stages.STAGES["held-out md"], after=kill))
+        with pytest.raises(Killed):
+            run(two, "surrogate")
+    run(two, "surrogate", resume=True)
+    with open_trajectory(one / "reference" / "held_out_r3.h5") as reader:
+        assert reader.record["starts"] == "rollout"
+    first, second = frames(one), frames(two)
+    assert len(first) == REPLICAS + 16 and first.keys() == second.keys()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@needs_compiler
 @pytest.mark.parametrize("good_frames", [0, 5])
 def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -152,7 +172,7 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     monkeypatch.setattr(SimdReplicas, "step", fails)
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
-    found = run(tmp_path / "run", "md")
+    found = run(tmp_path / "run", "md", starts="one")
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
     assert "MD by SIMD replicas failed (" in (tmp_path / "run" / "log.txt").read_text("utf-8")
@@ -162,7 +182,7 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
     judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
     assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]
-    assert run(tmp_path / "run", "md", resume=True)["outcome"] == found["outcome"]
+    assert run(tmp_path / "run", "md", resume=True, starts="one")["outcome"] == found["outcome"]
 
 
 @pytest.mark.parametrize(
@@ -197,18 +217,6 @@ def spend_until_no_time_for(name: str, folder: Path) -> None:
     order = [stage.name for stage in record.decision.stages]
     left_s = sum(stage.seconds for stage in record.decision.stages[order.index(name) + 1 :]) + one_scene.RESTART_S - 0.5
     write_run(folder, replace(record, spent_s=BUDGET_S - left_s))
-
-
-def test_bursts_without_time_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, step_s=25e-6))
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
-    monkeypatch.setitem(stages.STAGES, "bursts", disturbed(stages.STAGES["bursts"], before=kill))
-    with pytest.raises(Killed):  # where there is time
-        run(tmp_path, "surrogate")
-    spend_until_no_time_for("bursts", tmp_path)
-    found = run(tmp_path, "surrogate", resume=True)
-    assert ended(found)[:2] == [("rollout", "done"), ("bursts", "failed")] and ended(found)[-1] == ("report", "done")
-    assert found["stages"][1]["note"] == "no time was left"
 
 
 def test_files_of_one_frame_are_not_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.converted import to_mdanalysis, to_mdtraj
+from systems.trajectory.frame_weights import frame_weights, write_weights
 from systems.trajectory.topology_file import pdb_text
 
 
@@ -90,3 +91,25 @@ def test_uneven_times_are_refused_where_they_would_be_lost(tmp_path: Path, alani
     assert to_mdanalysis(path, stop=2).trajectory.n_frames == 2
     with pytest.raises(TrajectoryError):
         to_mdtraj(tmp_path / "none.h5")
+
+
+@pytest.mark.parametrize("suffix", ["h5", "dcd"])
+def test_weights_are_read_by_one_call(tmp_path: Path, alanine_dipeptide: Scene, suffix: str) -> None:
+    import mdtraj
+
+    path = tmp_path / f"a.{suffix}"
+    write(path, alanine_dipeptide, 1.0 + np.arange(6))
+    assert frame_weights(path).tolist() == [1.0] * 6
+    for weights in (np.array([0.0, 1, 2, 1, 1, 1]), np.array([1.0, 0, 2, 1, 2, 0])):
+        write_weights(path, weights)
+        assert frame_weights(path).tolist() == weights.tolist()
+    with pytest.raises(InputError, match="do not fit"):
+        write_weights(path, np.ones(5))
+    # Other readers, and ours, read on as before.
+    assert to_mdtraj(path).n_frames == 6
+    if suffix == "h5":
+        assert mdtraj.load(str(path)).n_frames == 6
+    with open_writer(path, alanine_dipeptide, {}, append=True) as writer:
+        writer.append(alanine_dipeptide.positions_nm[None], np.array([7.0]))
+    with pytest.raises(TrajectoryError, match="has grown"):
+        frame_weights(path)

@@ -1,0 +1,215 @@
+"""Where replicas begin: each in a state of its own, so that together they do not remember one structure.
+
+The first is the scene itself; the others were hot for a while and have cooled down. Handedness, peptide and double
+bonds are those of the scene. All is a function of scene, forces, number and seed: what resumes begins where it began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.mixture import solute_of
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
+from md_reference.run.config import Conditions
+from md_reference.run.engine import Engine
+from md_reference.run.frame_relaxation import Relaxer
+from md_reference.simd.force_field import SimdReplicas, n_replicas
+from md_reference.simd.system_terms import SimdUnavailableError
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import rotatable_torsions
+from systems.chemistry.validity import CHIRALITY, NOT_FINITE, OMEGA, RING, check_frames, geometry_from_scene
+from systems.errors import PreparationError, SimulationError
+from systems.interrupts import stop_if_asked
+from systems.scene import FloatArray, IntArray, Scene
+from systems.selection import part_of
+
+HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
+# Of the time it was hot.
+_COOLING = 0.2
+# By OpenMM, one after the other: so far apart, of that time.
+_APART = 0.2
+_TURNED_PS, _STIFFNESS_KJ_MOL = 20.0, 300.0
+_PIECE = 500
+_KEPT = NOT_FINITE | CHIRALITY | OMEGA | RING
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """A scene for each replica, and how they were found, in a few words."""
+
+    scenes: tuple[Scene, ...]
+    how: str
+
+
+def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float = HOT_PS) -> Starts:
+    """Return `n` starts of a scene in different states, drawn with the seed of `conditions`.
+
+    They come from `hot_ps` at 500 K and a fifth of that at the bath's temperature, by SIMD replicas where these run the
+    scene, else by OpenMM; at quantum level by GAFF2. In explicit water the solute is turned to the torsions that its
+    dry self then has. Where nothing turns, or nothing can turn it, or hot MD fails, all begin in the scene's own
+    structure, and `how` says so. Raises KeyboardInterrupt.
+    """
+
+    def one(why: str) -> Starts:
+        return Starts((scene,) * n, f"all from one structure: {why}")
+
+    if n == 1 or scene.interactions is not None:
+        return one("one replica" if n == 1 else "a model system")
+    solute = solute_of(scene) if scene.cell_nm is not None else np.arange(scene.n_atoms)
+    dry = scene if len(solute) == scene.n_atoms and scene.cell_nm is None else part_of(scene, solute)
+    if not len(rotatable_torsions(dry)):
+        return one("no torsion turns")
+    if scene.cell_nm is not None:
+        dry = replace(dry, cell_nm=None)
+    try:
+        spec = _hot_forces(dry, conditions.force)
+        frames, by = _hot(dry, replace(conditions, force=spec, ensemble="nvt"), n, hot_ps)
+        if scene.cell_nm is not None:
+            frames = _in_water(
+                scene, conditions, dry, np.asarray(torsion(frames, rotatable_torsions(dry)), dtype=np.float64)
+            )
+    except (PreparationError, SimulationError) as error:
+        return one(str(error).rstrip("."))
+    how = f"{n} starts: the structure given and, {by}, states after {hot_ps:.3g} ps at {HOT_K:g} K"
+    return Starts(_scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water"))
+
+
+def frames_as_starts(scene: Scene, conditions: Conditions, frames_nm: npt.NDArray[np.floating], n: int) -> Starts:
+    """Return starts from frames `(k, n_atoms, 3)` nm, k at least `n`: the first `n` that are the scene's molecule when
+    they are relaxed near where they are; fewer where fewer are, each then taken several times.
+
+    Raises SimulationError where none is.
+    """
+    found: list[FloatArray] = []
+    geometry = geometry_from_scene(scene)
+    system = build_system(scene, conditions.force)
+    with Relaxer(scene, system, born=conditions.force.is_born) as relaxer:
+        for frame in frames_nm:
+            stop_if_asked()
+            try:
+                relaxed = relaxer.relax(np.asarray(frame, dtype=np.float64)).positions_nm
+            except SimulationError:
+                continue
+            if not check_frames(relaxed, geometry)[0] & _KEPT:
+                found.append(relaxed)
+            if len(found) == n:
+                break
+    if not found:
+        raise SimulationError(f"none of {len(frames_nm)} frames of the rollout can be a start of MD")
+    scenes = _scenes(scene, np.stack(found))
+    return Starts(
+        tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} starts: frames of the rollout, relaxed"
+    )
+
+
+def _scenes(scene: Scene, frames_nm: FloatArray) -> tuple[Scene, ...]:
+    return tuple(replace(scene, positions_nm=frame) for frame in frames_nm)
+
+
+def _hot_forces(dry: Scene, force: ForceFieldSpec) -> ForceFieldSpec:
+    """Return the forces of hot MD: the run's own without its water, GAFF2 at quantum level."""
+    if force.force_field == QUANTUM:
+        return ForceFieldSpec("gaff2", "vacuum", force.hydrogen_mass_da)
+    if force.is_explicit:
+        return replace(force, solvent="obc2" if force.force_field != "gaff2" else "vacuum")
+    return force
+
+
+def _hot(dry: Scene, conditions: Conditions, n: int, hot_ps: float) -> tuple[FloatArray, str]:
+    """Return frames `(n, n_atoms, 3)`, the first as given and minimised, the others from hot MD; and by what."""
+    system = build_system(dry, conditions.force)
+    on_cpu = replace(conditions, platform="Reference" if dry.n_atoms < 300 else "CPU")
+    with Engine(dry, on_cpu, threads=1, system=system) as engine:
+        engine.minimise()
+        start = engine.positions()
+    geometry = geometry_from_scene(dry)
+    try:
+        batches, by = _by_simd(system, conditions, start, hot_ps), "by SIMD replicas"
+        first = next(batches)
+    except SimdUnavailableError:
+        batches, by = _by_openmm(dry, system, on_cpu, start, hot_ps), "by OpenMM"
+        first = next(batches)
+    found = [start]
+    batch = first
+    for _ in range(2 + 4 * n // n_replicas()):
+        found += [x for x in batch if not check_frames(x, geometry)[0] & _KEPT]
+        if len(found) >= n:
+            break
+        batch = next(batches)
+    # Where heat turns peptide bonds over, what is left is taken again, with other velocities.
+    return np.stack([found[k % len(found)] for k in range(n)]), by
+
+
+def _by_simd(system: Any, conditions: Conditions, start: FloatArray, hot_ps: float) -> Iterator[FloatArray]:
+    """Yield batches of sixteen states that were hot and have cooled down."""
+    how: dict[str, Any] = {"friction_per_ps": FRICTION_PER_PS, "timestep_ps": conditions.timestep_ps}
+    at = start[None]
+    seed = conditions.seed
+    while True:
+        for temperature_k, time_ps in ((HOT_K, hot_ps), (conditions.temperature_k, _COOLING * hot_ps)):
+            run = SimdReplicas(system, temperature_k=temperature_k, seed=seed % 2**31, **how)
+            run.set_positions(np.repeat(start[None], run.n_replicas, axis=0) if len(at) == 1 else at)
+            run.thermalise()
+            _steps(run, time_ps)
+            at, seed = run.positions_nm.astype(np.float64), seed + 7919
+        yield at
+        # The next batch goes on from here: it has been hot for longer.
+
+
+def _by_openmm(
+    scene: Scene, system: Any, conditions: Conditions, start: FloatArray, hot_ps: float
+) -> Iterator[FloatArray]:
+    """Yield states of one hot run, each minimised, which cooling would do."""
+    hot = replace(conditions, temperature_k=HOT_K, friction_per_ps=FRICTION_PER_PS)
+    with Engine(scene, hot, threads=1, system=system) as engine:
+        engine.set_positions(start)
+        engine.thermalise()
+        while True:
+            stop_if_asked()
+            engine.step(max(1, round(_APART * hot_ps / hot.timestep_ps)))
+            kept = engine.positions()
+            engine.minimise(max_iterations=200)
+            yield engine.positions()[None]
+            engine.set_positions(kept)
+            engine.thermalise()
+
+
+def _in_water(wet: Scene, conditions: Conditions, dry: Scene, angles: FloatArray) -> FloatArray:
+    """Return positions `(n, n_atoms, 3)` in water whose solute was turned to these torsions `(n, k)`."""
+    solute = solute_of(wet)
+    quads: IntArray = np.asarray(solute)[rotatable_torsions(dry)]
+    system = build_system(wet, conditions.force)
+    with Engine(wet, replace(conditions, platform="CPU"), threads=1, system=system) as engine:
+        engine.minimise()
+        start = engine.positions()
+    out = np.empty((len(angles), wet.n_atoms, 3))
+    for first in range(0, len(angles), n_replicas()):
+        run = SimdReplicas(
+            system, temperature_k=conditions.temperature_k, friction_per_ps=FRICTION_PER_PS, timestep_ps=0.002,
+            seed=conditions.seed + first, biased=quads.tolist(),
+        )  # fmt: skip
+        run.set_positions(np.repeat(start[None], run.n_replicas, axis=0))
+        run.thermalise()
+        own = angles[np.minimum(first + np.arange(run.n_replicas), len(angles) - 1)]
+        for share in (0.1, 0.3, 1.0):
+            for place in range(len(quads)):
+                run.set_bias(place, own[:, place], share * _STIFFNESS_KJ_MOL)
+            _steps(run, _TURNED_PS / 3)
+        last = min(n_replicas(), len(angles) - first)
+        out[first : first + last] = run.positions_nm[:last]
+    flags = check_frames(out[:, np.asarray(solute)], geometry_from_scene(dry)) & _KEPT
+    out[flags != 0] = start
+    return out
+
+
+def _steps(run: SimdReplicas, time_ps: float) -> None:
+    n_steps = round(time_ps / run.timestep_ps)
+    for done in range(0, n_steps, _PIECE):
+        stop_if_asked()
+        run.step(min(_PIECE, n_steps - done))

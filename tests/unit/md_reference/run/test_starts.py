@@ -1,0 +1,100 @@
+"""Replicas begin in states of their own, of the molecule that was given, and do so again for the same seed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import md_reference.run.starts as starts
+from md_reference.forces.forcefield import resolve
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions, MDConfig
+from md_reference.run.replicas import simulate_replicas
+from md_reference.run.starts import frames_as_starts, many_starts
+from md_reference.simd.system_terms import SimdUnavailableError
+from systems.chemistry.geometry import torsion
+from systems.chemistry.graph import backbone_torsions, rotatable_torsions
+from systems.chemistry.validity import CHIRALITY, OMEGA, check_frames, geometry_from_scene
+from systems.errors import SimulationError
+from systems.library.named_scenes import load
+from systems.scene import Scene
+from systems.trajectory.codec import open_trajectory
+
+SCENE = load("alanine-dipeptide")
+
+
+def conditions(scene: Scene = SCENE, **more: object) -> Conditions:
+    return Conditions(resolve(scene, ForceFieldSpec("auto", "auto")), seed=3, **more)  # type: ignore[arg-type]
+
+
+def angles(scenes: tuple[Scene, ...]) -> np.ndarray:
+    return torsion(np.stack([s.positions_nm for s in scenes]), rotatable_torsions(scenes[0]))
+
+
+def test_starts_are_many_states_of_the_same_molecule() -> None:
+    found = many_starts(SCENE, conditions(), 20)
+    positions = np.stack([s.positions_nm for s in found.scenes])
+    assert len(found.scenes) == 20 and "20 starts" in found.how
+    assert not (check_frames(positions, geometry_from_scene(SCENE)) & (CHIRALITY | OMEGA)).any()
+    psi = np.degrees(torsion(positions, np.asarray(backbone_torsions(SCENE)["psi"])))[:, 0]
+    helical = (psi > -120) & (psi < 80)
+    assert 0 < helical.sum() < 20
+    assert {s.topology_hash for s in found.scenes} == {SCENE.topology_hash}
+
+
+def test_a_start_is_a_function_of_its_place_and_the_seed() -> None:
+    few, many = many_starts(SCENE, conditions(), 4), many_starts(SCENE, conditions(), 18)
+    for one, other in zip(few.scenes, many.scenes, strict=False):
+        np.testing.assert_array_equal(one.positions_nm, other.positions_nm)
+    again = many_starts(SCENE, replace(conditions(), seed=4), 4)
+    assert np.abs(angles(again.scenes)[1:] - angles(few.scenes)[1:]).max() > 0.1
+
+
+def test_without_simd_openmm_heats(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unavailable(*_: object, **__: object) -> object:
+        raise SimdUnavailableError("no compiler")
+
+    monkeypatch.setattr(starts, "SimdReplicas", unavailable)
+    found = many_starts(SCENE, conditions(), 3)
+    assert "OpenMM" in found.how
+    assert np.abs(angles(found.scenes)[1:] - angles(found.scenes)[0]).max() > 0.1
+
+
+def test_what_cannot_turn_begins_in_one_structure() -> None:
+    from systems.source import prepare
+
+    methane = prepare("smiles:C")
+    found = many_starts(methane, conditions(methane), 3)
+    assert "one structure" in found.how and "no torsion" in found.how
+    assert all(s is methane for s in found.scenes)
+
+
+def test_frames_that_are_another_molecule_are_no_starts() -> None:
+    mirrored = SCENE.positions_nm * np.array([-1.0, 1.0, 1.0])
+    frames = np.stack([mirrored, SCENE.positions_nm, np.full_like(mirrored, np.nan)])
+    found = frames_as_starts(SCENE, conditions(), frames, 4)
+    assert found.how.startswith("1 starts") and len(found.scenes) == 4
+    with pytest.raises(SimulationError, match="none of 1"):
+        frames_as_starts(SCENE, conditions(), mirrored[None], 1)
+
+
+@pytest.mark.parametrize("platform", ["simd", "Reference"])
+def test_replicas_begin_apart_unless_one_is_asked_for(tmp_path: Path, platform: str) -> None:
+    config = MDConfig(force=conditions().force, time_ps=0.4, save_every_ps=0.2, equilibrate_ps=0.1, platform=platform)
+    told: list[str] = []
+
+    def spread(starts: str) -> float:
+        outs = [tmp_path / f"{starts}{k}.h5" for k in range(3)]
+        simulate_replicas(SCENE, replace(config, starts=starts), outs, announce=lambda said: told.append(str(said)))
+        firsts = []
+        for out in outs:
+            with open_trajectory(out) as reader:
+                firsts.append(reader.read(0, 1)[0])
+                assert reader.record["starts"] == starts
+        return float(np.cos(torsion(np.array(firsts), rotatable_torsions(SCENE))).std(axis=0).max())
+
+    assert spread("many") > 2 * spread("one")
+    assert sum("starts" in line for line in told) == 1
