@@ -11,7 +11,6 @@ from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
 from systems.options import option
-from systems.trajectory.codec import refuse_columns
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
@@ -147,5 +146,7 @@ def check_run(scene: Scene, config: MDConfig, out: Path) -> MDConfig:
     config = resolved(scene, config)
     kept = config.kept_atoms(scene)
     check_disk(out, config.n_frames, scene.n_atoms if kept is None else len(kept))
+    from systems.trajectory.codec import refuse_columns  # which is slow to import
+
     refuse_columns(out, config.columns)
     return config

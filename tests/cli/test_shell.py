@@ -46,13 +46,13 @@ def test_a_shell_completes(words: str, said: list[str]) -> None:
     ("words", "said"),
     [
         ("rollout", "rollout needs SCENE: Library name"),
-        ("rollout ethanol", "rollout needs --out: Trajectory to write"),
+        ("rollout ethanol", "rollout needs --out: Output trajectory"),
         ("rollout ethanol -o x.h5", "rollout needs --time: Simulated time"),
         ("reference ethanol -o x.h5", "reference needs --time: Simulated time"),
         ("train ref.h5", "train needs --out: Weights to write"),
-        ("windows ref.h5", "windows needs --out: File to write"),
-        ("compare ref.h5", "compare needs TRAJ...: Candidates"),
-        ("bench cost-error", "cost-error needs REFERENCE: Held-out run"),
+        ("windows ref.h5", "windows needs --out: Output file"),
+        ("compare ref.h5", "compare needs TRAJ...: Candidate trajectories"),
+        ("bench cost-error", "cost-error needs REFERENCE: Held-out reference"),
     ],
 )
 def test_what_is_missing_is_named(words: str, said: str) -> None:

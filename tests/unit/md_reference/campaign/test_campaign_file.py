@@ -159,7 +159,7 @@ def test_names_of_scenes_serve_as_files(tmp_path: Path) -> None:
         (SMALL + "constrain_hydrogens = 'yes'", "constrain_hydrogens = .yes. must be true or false"),
         (SMALL + "solvent = 'obc3'", "unknown solvent"),
         (SMALL + "ph = true", "ph = True must be a finite number"),
-        (SMALL + "format = 'xtc'", "format = 'xtc' must be one of h5, dcd"),
+        (SMALL + "format = 'trr'", "format = 'trr' must be one of h5, dcd, xtc"),
         (SMALL + "time = ", "cannot be read as TOML"),
     ],
 )

@@ -42,6 +42,7 @@ TYPED = {
     "drop_ligand": (None, True),
     "drop_water": (None, True),
     "cap_breaks": (None, True),
+    "starts": ("one", "one"),
     "keep_water": (None, True),
 }
 
@@ -134,7 +135,11 @@ def test_help_shows_the_defaults() -> None:
     """In brackets, which the library that prints help takes for markup and swallows unless they are escaped."""
     wide = {"COLUMNS": "200", "TERM": "dumb"}
     shown = " ".join(CliRunner().invoke(main.app, ["reference", "--help"], env=wide).output.split())
-    for text in ("Integration step. [default: 4fs]", "Of the bath. [default: 300K]", "saved frames. [default: 1ps]"):
+    for text in (
+        "Integration time step. [default: 4fs]",
+        "Thermostat temperature. [default: 300K]",
+        "saved frames. [default: 1ps]",
+    ):
         assert text in shown
     assert "\\[" not in shown
 

@@ -81,14 +81,15 @@ def test_phi_shifted_against_psi_is_seen_within_the_basins(runs: list[Ensemble])
 
 def _within(reference: Ensemble, measured: list[Features], candidate: Features) -> dict[str, str]:
     from surrogate.judge import comparison, verdict
+    from surrogate.judge.convergence import convergence_of
     from surrogate.judge.measure import structure
     from surrogate.judge.rows.motion.within_rows import within_rows
 
     yardstick = structure.Yardstick.of(reference, probing=False)
     account = account_of(reference)
-    setting = comparison._Setting(
-        reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account, {}
-    )
+    found = convergence_of([measured[0], measured[2]], yardstick.torsions)
+    common = reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account
+    setting = comparison._Setting(*common, {}, (measured[0], measured[2]), found)
     trio = comparison._equal_terms(setting, candidate)[0]
     return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
 
