@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from systems.errors import InputError
-from systems.library import named_scenes
 from systems.preparation import Preparation
 from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mol_file import SUFFIXES
@@ -44,8 +43,8 @@ def prepare(spec: str, options: Preparation) -> Scene:
 
         return scene_from_smiles(rest)
     path = Path(text).expanduser()
-    if text in named_scenes.names():
-        return named_scenes.load(text)
+    if text in names():
+        return load(text)
     suffix = suffix_of(path)
     if suffix in SUFFIXES and not (suffix == ".mol2" and is_peptide_mol2(path)):
         from systems.prepare.molecule import scene_from_mol_file
@@ -55,4 +54,4 @@ def prepare(spec: str, options: Preparation) -> Scene:
         raise InputError(f"{path}: {suffix} files are not read as scenes; convert it to PDB, mmCIF or SDF.")
     if suffix in (*_FILE_SUFFIXES, ".mol2") or path.exists() or "/" in text:
         return prepare_file(path, options)
-    return named_scenes.load(text)
+    return load(text)

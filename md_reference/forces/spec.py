@@ -1,4 +1,6 @@
-"""Specification of the forces: force field, solvent, hydrogen masses and constraints, and which combinations exist."""
+"""Specification of the forces: force field, solvent, hydrogen masses and constraints, and which combinations exist;
+OpenMM's files of residue templates: which belong to a force field and a water, and which residues they know.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ import networkx as nx
 from systems.chemistry.residues import ResidueTemplate, template_for
 
 _ATOM = re.compile(r"([^:+]+?)(?::([A-Z][a-z]?))?([+-]\d+)?$")
-_BACKBONE = {"N", "CA", "C", "O"}
+_BACKBONE_ATOMS = {"N", "CA", "C", "O"}
 _PHOSPHATE = {"P", "OP1", "OP2", "OP3"}
 _ANOMERIC = {"SIA": "O2", "SLB": "O2"}
 # pKa of groups as in a peptide in water, rounded: enough to tell what is charged at a given pH.
@@ -62,7 +62,7 @@ class Component:
         for _, parent in hydrogens_of(self, set(self.heavy), {}, ph=PH_OF_FEWEST):
             least[parent] = least.get(parent, 0) + 1
         heavy = tuple(a for a in self.heavy if a != "OXT")
-        links = self.kind == "peptide" and set(heavy) >= _BACKBONE
+        links = self.kind == "peptide" and set(heavy) >= _BACKBONE_ATOMS
         return ResidueTemplate(
             self.name, heavy, bonds, least, self.optional - {"OXT"}, links, self.kind == "saccharide"
         )

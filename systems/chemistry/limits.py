@@ -20,8 +20,6 @@ from systems.errors import InputError
 from systems.files.schema import Recorded
 from systems.scene import Scene
 
-FloatArray = npt.NDArray[np.floating[Any]]
-IntArray = npt.NDArray[np.int64]
 
 # How much farther than in the reference counts as too far: a sample's extremes lie inside those of a longer one. For
 # Gaussian motion and 20,000 frames the limit stands at six standard deviations.

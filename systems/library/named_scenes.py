@@ -10,7 +10,6 @@ from typing import Any
 
 from systems.chemistry.residues import ONE_LETTER
 from systems.errors import UnknownNameError, nearest
-from systems.library import catalogue
 from systems.library.catalogue import ENTRIES, Entry
 from systems.library.model_systems import double_well, harmonic_oscillator
 from systems.scene import Scene
@@ -86,7 +85,7 @@ def _shipped(file: str) -> Scene:
 
 def _load(entry: Entry) -> Scene:
     provenance = {"source": "library", "library_name": entry.name, "repairs": []}
-    if entry.group == catalogue.ANALYTIC:
+    if entry.group == ANALYTIC:
         return {"harmonic-oscillator": harmonic_oscillator, "double-well": double_well}[entry.name]()
     if entry.name in ENTRIES:
         return replace(_shipped(entry.file or entry.name), name=entry.name, provenance=provenance)
@@ -137,9 +136,9 @@ def _find(name: str) -> Entry | None:
     if len(residues) == 4 and "ACE" not in residues and "NME" not in residues:
         return _tetrapeptide(sequence, sequence)
     title = f"{sequence}, built extended from its sequence"
-    return Entry(sequence, catalogue.PEPTIDES, title, sequence=sequence)
+    return Entry(sequence, PEPTIDES, title, sequence=sequence)
 
 
 def _tetrapeptide(name: str, sequence: str) -> Entry:
     title = f"{sequence}, a tetrapeptide with charged ends, built extended from its sequence"
-    return Entry(name, catalogue.PEPTIDES, title, protocols=("mdgen",), sequence=sequence)
+    return Entry(name, PEPTIDES, title, protocols=("mdgen",), sequence=sequence)

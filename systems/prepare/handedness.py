@@ -35,7 +35,7 @@ def handedness(residues: Iterable[tuple[ResidueKey, str, Mapping[str, AtomRecord
     return found
 
 
-def compare(before: Handedness, after: Handedness) -> None:
+def refuse_changed(before: Handedness, after: Handedness) -> None:
     """Raise PreparationError when a stereocentre changed, or one that was built anew is not the natural form."""
     for (key, centre), sign in after.items():
         expected = before.get((key, centre), 1)

@@ -18,7 +18,7 @@ from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.bonding import find_bonds, links_residues
 from systems.prepare.clashes import check_contacts
 from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
-from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
+from systems.prepare.handedness import Handedness, refuse_changed, handedness, heavy_of_records, say_inverted
 from systems.prepare.heterogens import agent_atoms, ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
 from systems.prepare.read.file_text import suffix_of
 from systems.prepare.read.mmcif_file import is_component
@@ -99,7 +99,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
         after = heavy_of_records(atoms)
         names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
         hands = handedness((key, names[key], heavy) for key, heavy in after.items() if key in names)
-        compare(before, hands)
+        refuse_changed(before, hands)
     else:
         hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)

@@ -13,7 +13,6 @@ from systems.trajectory.foreign_scenes import named_scene, scene_from_structure
 from systems.trajectory.frame_block import Float32Array, Float64Array
 from systems.trajectory.frame_orders import order_of
 
-_NM = 0.1
 
 
 class AseReader(TrajectoryReader):

@@ -12,7 +12,6 @@ from systems.files.atomic_file import journal_path
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
 from systems.trajectory.claim import Claim
-from systems.trajectory.format_table import XYZ_SUFFIXES
 from systems.trajectory.frame_block import FrameBlock
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
@@ -139,6 +138,8 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         from systems.trajectory.ase_file import AseReader
 
         return AseReader(path, top)
+    from systems.trajectory.format_table import XYZ_SUFFIXES
+
     if path.name.lower().endswith(XYZ_SUFFIXES):
         from systems.trajectory.xyz_file import XyzReader
 

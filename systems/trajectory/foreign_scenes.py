@@ -21,7 +21,7 @@ from systems.prepare.read.structure_text import read_structure
 from systems.scene import Scene
 from systems.trajectory.format_table import OTHER, format_of
 
-_NM = 0.1
+_NM_PER_ANGSTROM = 0.1
 
 
 def scene_from_mdtraj_topology(
@@ -145,7 +145,7 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
         raise InputError(f"{top} cannot be read as a topology: {first_line(error)}.") from error
     atoms = universe.atoms
     has_positions = hasattr(universe, "trajectory") and universe.trajectory.n_frames > 0
-    positions = np.asarray(atoms.positions, dtype=np.float64) * _NM if has_positions else np.zeros((len(atoms), 3))
+    positions = np.asarray(atoms.positions, dtype=np.float64) * _NM_PER_ANGSTROM if has_positions else np.zeros((len(atoms), 3))
     names = [str(x) for x in _values(atoms, "names", _values(atoms, "types", ["X"] * len(atoms)))]
     residues = [str(x) for x in _values(atoms.residues, "resnames", ["UNK"] * len(atoms.residues))]
     of_atom = np.asarray(atoms.resindices, dtype=np.int64)

@@ -50,7 +50,6 @@ from systems.trajectory.topology_file import refuse_other_topology, topology_byt
 _CHUNK_BYTES = 131_072
 _STRIDED_READ_FRAMES = 8192
 _BOND_TYPES = {1.0: "Single", 1.5: "Aromatic", 2.0: "Double", 3.0: "Triple"}
-_POSITION = "particles/trajectory/position"
 
 
 class Hdf5Writer(TrajectoryWriter):
