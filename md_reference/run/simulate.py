@@ -20,8 +20,7 @@ from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
-from systems.scene import FloatArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, Scene, part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,

@@ -13,22 +13,41 @@ import numpy as np
 from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError, listed
-from systems.preparation import Preparation
-from systems.prepare.bonded_residues import Bonding, Residue
+from systems.options import Preparation
 from systems.prepare.bonding import find_bonds, links_residues
-from systems.prepare.clashes import check_contacts
-from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
-from systems.prepare.handedness import Handedness, refuse_changed, handedness, heavy_of_records, say_inverted
-from systems.prepare.heterogens import agent_atoms, ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
-from systems.prepare.read.file_text import suffix_of
+from systems.prepare.checks import (
+    Handedness,
+    caps_of,
+    check_contacts,
+    find_gaps,
+    handedness,
+    heavy_of_records,
+    made_whole,
+    refuse_changed,
+    refuse_gaps,
+    say_inverted,
+)
+from systems.prepare.heterogens import (
+    agent_atoms,
+    complete_waters,
+    ligand_atoms,
+    refuse_bare_ligands,
+    settle_ligands,
+    settle_solvent,
+)
 from systems.prepare.read.mmcif_file import is_component
-from systems.prepare.read.modified_residues import describe_residue, standardise
-from systems.prepare.read.peptide_mol2 import read_peptide_mol2
-from systems.prepare.read.records import AtomRecord, StructureFile
+from systems.prepare.read.mol2_file import read_peptide_mol2
+from systems.prepare.read.records import (
+    AtomRecord,
+    Bonding,
+    Residue,
+    StructureFile,
+    describe_residue,
+    standardise,
+    suffix_of,
+)
 from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
 from systems.prepare.structure import scene_from_records
-from systems.prepare.waters import complete_waters
-from systems.prepare.whole import made_whole
 from systems.scene import Scene
 
 # Of a standard residue's atoms in any protonation, bonds to hydrogen among them.
@@ -37,9 +56,9 @@ _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
 def prepare_file(path: Path, options: Preparation) -> Scene:
-    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `systems.source.prepare`."""
+    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues."""
     if is_mmcif(path) and is_component(text := structure_text(path)):
-        from systems.prepare.component_file import scene_from_component
+        from systems.prepare.molecule import scene_from_component
 
         return scene_from_component(text, path)
     try:

@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError
-from systems.files.checksums import packed, unpacked
 from systems.files.schema import built
-from systems.files.whole_file import create_whole, refuse_existing, storage_error
+from systems.files.whole_file import Claim, create_whole, packed, refuse_existing, storage_error, unpacked
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.claim import Claim
 from systems.trajectory.codec import companions, open_trajectory, open_writer
 
 _MAGIC = b"surromd checkpoint 3\n"

@@ -1,4 +1,4 @@
-"""Every format that `compare` reads, with files that other programs than its reader wrote (`format_table.tried`).
+"""Every format that `compare` reads, with files that other programs than its reader wrote (`Format.tried`).
 
 Files of GROMACS, LAMMPS, DL_POLY, GROMOS, HOOMD-blue, Tinker and others are MDAnalysisTests' (`pip install
 MDAnalysisTests gsd pytng pandas`; what is lacking is skipped); cpptraj and OpenMM write theirs here.
@@ -21,8 +21,8 @@ import pytest
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.format_table import FORMATS, format_of
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
+from systems.trajectory.foreign_scenes import FORMATS, format_of
 
 # Program, file, its name here, topology, frames, atoms, time between frames (ps; None: not stated), edge a of the cell
 # (nm; None: no cell).
