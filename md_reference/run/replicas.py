@@ -246,6 +246,10 @@ class _Batch:
 # ---- processes ------------------------------------------------------------------------------------------------------
 
 
+# The exit status of a process that would start replicas while it imports the script which has started it.
+_UNGUARDED = 79
+
+
 @dataclass(frozen=True)
 class _Board:
     """What processes write and their parent reads: frames done, shares equilibrated (both by process), last words."""
@@ -275,9 +279,11 @@ def simulate_replicas(
     measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
     run, which it may raise to end them too; `progress` counts the frames of all replicas.
     Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
-    by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
-    stay on disk.
+    by themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
+    with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(_UNGUARDED)  # this is one of the processes, which has not come further than the user's script
     given = None if isinstance(scene, Scene) else list(scene)
     scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
@@ -325,8 +331,9 @@ def simulate_replicas(
                     of_job = [configs[i] for i in jobs[k]], [outs[i] for i in jobs[k]]
                     once = {id(scenes[i]): scenes[i].to_dict() for i in jobs[k]}
                     args = ([once[id(scenes[i])] for i in jobs[k]], *of_job, how, board, k)
-                    running[k] = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
-                    running[k].start()
+                    process = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
+                    process.start()
+                    running[k] = process
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
@@ -338,6 +345,11 @@ def simulate_replicas(
                 for k in [k for k, process in running.items() if not process.is_alive()]:
                     process = running.pop(k)
                     process.join()
+                    if process.exitcode == _UNGUARDED:
+                        raise InputError(
+                            "each replica's process imports this script, which starts replicas again; put what starts "
+                            "them below `if __name__ == '__main__':`."
+                        )
                     if process.exitcode != 0:
                         _collect(board.errors, reasons, k)
                         failures[k] = reasons.get(k, f"exit code {process.exitcode}")

@@ -367,6 +367,12 @@ def already_complete(out: Path, config: MDConfig) -> None:
         record, n_frames = reader.record, reader.n_frames
     # The record names the platform that ran, which "auto" leaves open.
     check_same_run(record, config, out, ignoring=("platform",))
+    if record.get("completed") and n_frames < config.n_frames:
+        raise InputError(
+            f"{out} is a finished run of {n_frames} frames, and this one has {config.n_frames}: a run that is finished "
+            "cannot be made longer, as its last velocities are not kept; start a longer one under another name, or "
+            "more replicas with other seeds."
+        )
     if not record.get("completed") or n_frames != config.n_frames:
         raise InputError(
             f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
+import numpy.typing as npt
 
 from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import template_for
@@ -47,7 +48,7 @@ from systems.prepare.read.records import (
     suffix_of,
 )
 from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
-from systems.prepare.structure import scene_from_records
+from systems.prepare.structure import atom_label, scene_from_records
 from systems.scene import Scene
 
 # Of a standard residue's atoms in any protonation, bonds to hydrogen among them.
@@ -109,6 +110,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
     before = _handedness(bonding, atoms)
+    clashes = _clashing_hydrogens(atoms, bonds)
     if not bonding.is_complete:
         _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
@@ -122,6 +124,9 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     else:
         hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)
+    if clashes and _overfull(atoms, bonds):
+        raise clashes[0]
+    if bonding.is_complete:
         _refuse_surplus_hydrogens(bonding, atoms)
     say_inverted(hands, repairs)
     if ligands and stays:
@@ -274,6 +279,26 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
                 f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
                 f"standard residues alone: add all its heavy atoms{instead}."
             )
+
+
+def _overfull(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> set[int]:
+    """Return the atoms with more bonds than their element can have."""
+    n_bonds = np.bincount(bonds.ravel(), minlength=len(atoms)).tolist()
+    return {i for i, n in enumerate(n_bonds) if n > _MOST_BONDS.get(atoms[i].element, n)}
+
+
+def _clashing_hydrogens(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[PreparationError]:
+    """Say which hydrogens of one residue stand at an atom of another that has all it can have: to be raised where
+    placing hydrogens anew does not part them."""
+    found, overfull = [], _overfull(atoms, bonds)
+    for i, j in (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ():
+        if j in overfull and atoms[i].element == "H" and atoms[i].residue_key != atoms[j].residue_key:
+            gap = np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom))
+            found.append(PreparationError(
+                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart, and no bond can join them: "
+                "the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
+            ))  # fmt: skip
+    return found
 
 
 def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:

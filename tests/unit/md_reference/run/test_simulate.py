@@ -377,6 +377,15 @@ def test_a_run_without_its_checkpoint_is_not_resumed_blindly(alanine_dipeptide: 
         simulate(alanine_dipeptide, SHORT, out, resume=True)
 
 
+def test_a_finished_run_is_not_made_longer(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    out = simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
+    before = out.read_bytes()
+    simulate(alanine_dipeptide, SHORT, out, resume=True)
+    with pytest.raises(InputError, match=r"is a finished run of .* cannot be made longer.*under another name"):
+        simulate(alanine_dipeptide, replace(SHORT, time_ps=2 * SHORT.time_ps), out, resume=True)
+    assert out.read_bytes() == before
+
+
 # ---- blow-ups ------------------------------------------------------------------------------------------------------
 
 

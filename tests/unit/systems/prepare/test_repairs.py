@@ -347,3 +347,17 @@ def test_missing_atoms_are_added_although_their_hydrogens_are_there(tmp_path: Pa
            for line in lines]  # fmt: skip
     with pytest.raises(PreparationError, match="Hydrogen SER A2 HG is"):  # control: nothing is missing
         prepare(_write(tmp_path / "y.pdb", *far))
+
+
+def test_a_hydrogen_at_anothers_methyl_is_a_clash(tmp_path: Path) -> None:
+    names = list(zip((ALA2.residue_names[r] for r in ALA2.residue_of_atom), ALA2.atom_names, strict=True))
+    moved, methyl = names.index(("NME", "H1")), names.index(("ACE", "CH3"))
+    beside, own = ALA2.positions_nm[methyl], ALA2.positions_nm[names.index(("ACE", "C"))]
+    x = ALA2.positions_nm.copy()
+    x[moved] = beside + 0.1 * (beside - own) / np.linalg.norm(beside - own)
+    path = tmp_path / "clash.pdb"
+    path.write_text(pdb_text(ALA2.with_positions(x)))
+    with pytest.raises(PreparationError, match=r"NME A3 H1 and ACE A1 CH3 are 1\.00 Å apart.*the atoms clash"):
+        prepare(str(path))
+    path.write_text(pdb_text(ALA2))
+    assert prepare(str(path)).provenance["repairs"] == []
