@@ -44,11 +44,11 @@ from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     Checkpoint,
-    CheckpointFile,
     checkpoint_path,
     claimed_outputs,
-    last_supported,
     new_header,
+    supported_checkpoint,
+    write_checkpoint,
     writer_at,
 )
 from systems.units import format_time_ps
@@ -89,7 +89,7 @@ def simulate_batch(
             for out in outs:
                 already_complete(out, config)
             return
-        kept = last_supported(state_path, list(outs)) if resume and state_path.exists() else None
+        kept = supported_checkpoint(state_path, list(outs)) if resume and state_path.exists() else None
         batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
         batch.start(starts_nm, asked_to_stop, progress)
         record = record_of(scene, config, simd_choice())
@@ -117,7 +117,6 @@ class _Batch:
             check_same_run(self.stand.config, config, outs[0])
         self.began = time.monotonic()
         self.done = int(self.header["files"][0]["n_frames"])
-        self.file = CheckpointFile(checkpoint_path(outs[0]), kept)
         solute = config.kept_atoms(scene)
         self.atoms = np.arange(scene.n_atoms) if solute is None else solute
         self.written = scene if solute is None else part_of(scene, solute)
@@ -169,7 +168,7 @@ class _Batch:
     def save(self) -> None:
         said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": SIMD}
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
-        self.file.write(self.header, self.simd.checkpoint())
+        write_checkpoint(checkpoint_path(self.outs[0]), self.header, self.simd.checkpoint())
 
     def produce(
         self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None

@@ -25,11 +25,11 @@ from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
-    CheckpointFile,
     checkpoint_path,
     claimed_outputs,
-    last_supported,
     new_header,
+    supported_checkpoint,
+    write_checkpoint,
     writer_at,
 )
 from systems.trajectory.codec import open_trajectory
@@ -91,7 +91,7 @@ def simulate(
         if resume and out.exists() and not chk.exists():
             already_complete(out, config)
             return out
-        kept = last_supported(chk, [out]) if resume and chk.exists() else None
+        kept = supported_checkpoint(chk, [out]) if resume and chk.exists() else None
         run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
         run.asked_to_stop = asked_to_stop
         run.progress = progress
@@ -142,7 +142,6 @@ class _Run:
         self.stand = stand_of(self.header, out)
         if kept is not None:
             check_same_run(self.stand.config, config, out)
-        self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
         self.asked_to_stop: Callable[[], bool] = lambda: False
         self.progress: ProgressFn | None = None
         self.done = int(self.header["files"][0]["n_frames"])
@@ -241,7 +240,7 @@ class _Run:
             "threads": engine.threads,
         }
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
-        self.checkpoint.write(self.header, engine.checkpoint())
+        write_checkpoint(checkpoint_path(self.out), self.header, engine.checkpoint())
         self.saved_at = time.monotonic()
 
     def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:

@@ -453,10 +453,9 @@ class AtomicFile:
                 self._put_back(end, old)
                 os.ftruncate(self._journal_fd, 0)
             raise
-        # Should the power fail before this is on the medium, one transaction more is taken back: checkpoints allow it.
         os.ftruncate(self._journal_fd, 0)
+        os.fsync(self._journal_fd)  # what is complete must not be taken back: a checkpoint may count on it
         if self._size < end:  # what is cut off stands in no journal
-            os.fsync(self._journal_fd)
             os.ftruncate(self._fd, self._size)
         self._pending.clear()
         self._committed_size = self._size
@@ -479,7 +478,6 @@ class AtomicFile:
         if self._journal_fd >= 0:
             with suppress(OSError):
                 if not os.fstat(self._journal_fd).st_size:
-                    os.fsync(self._journal_fd)  # what is complete must not be taken back later
                     self._journal.unlink(missing_ok=True)
             os.close(self._journal_fd)
         if self._fd >= 0:

@@ -20,7 +20,7 @@ from md_reference.run.simulate import MDConfig, checkpoint_path
 from systems.errors import SimulationError, TrajectoryError
 from systems.files.whole_file import replica_paths
 from systems.scene import Scene
-from systems.trajectory.checkpoint import read_checkpoints
+from systems.trajectory.checkpoint import read_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 
 SHORT = MDConfig(time_ps=0.8, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
@@ -164,4 +164,4 @@ def test_replicas_end_with_their_parent_and_can_be_resumed(
         n_frames = frames_in(out)
         assert checkpoint_path(out).exists()
         # Stopped between two frames, with a checkpoint at the last one: nothing is lost on the way to a longer run.
-        assert read_checkpoints(checkpoint_path(out))[0][0]["files"][0]["n_frames"] == n_frames
+        assert read_checkpoint(checkpoint_path(out))[0]["files"][0]["n_frames"] == n_frames
