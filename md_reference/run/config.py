@@ -18,7 +18,6 @@ from systems.files.outside import check_disk
 from systems.library import named_scenes
 from systems.library.named_scenes import find_protocol
 from systems.options import option
-from systems.scene import Scene
 from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
