@@ -86,7 +86,7 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
 
 
 def print_run(record: dict[str, Any], *, as_json: bool) -> None:
-    """Print what came of a run: its first line, the verdict, where the report is; of a dry run the decision."""
+    """Print what came of a run: use it or not, for what, why, and where the report is; of a dry run the decision."""
     if as_json:
         print_json(record)
     elif "molecules" in record:
@@ -97,22 +97,24 @@ def print_run(record: dict[str, Any], *, as_json: bool) -> None:
     elif (outcome := record.get("outcome")) is None:
         print_pairs(record["decision_table"])
     else:
-        for line in (outcome["headline"], outcome["verdict"], *outcome["notes"]):
+        for line in (*outcome["in_short"], outcome["details"], *outcome["notes"]):
             _say(line)
         _say(f"report: {Path(record['file']) / 'report.html'}")
 
 
 def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: bool, show_all: bool = False) -> None:
-    """Print each candidate's verdict, what is wrong with it and what it is worth; with `show_all` every row between
-    reference and replicate."""
+    """Print each candidate's three lines (use it or not, for what, why) and its verdict, as its report has them; with
+    `show_all` what is wrong and every row between reference and replicate."""
     if as_json:
         print_json(result.to_dict())
         return
     for judgement in () if quiet else result.judgements:
-        _say(f"{judgement.account.label}: {judgement.verdict}")
-        for finding in judgement.findings:
-            _say(f"  - {finding}")
+        use, *more = judgement.in_short
+        for line in (f"{judgement.account.label}: {use}", *(f"  {x}" for x in (*more, judgement.verdict))):
+            _say(line)
         if show_all:
+            for finding in judgement.findings:
+                _say(f"  - {finding}")
             _print_rows(judgement)
         if judgement.speed_ratio is not None:
             _say(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")

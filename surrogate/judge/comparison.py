@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -46,6 +46,9 @@ from surrogate.judge.worth_measures import worths
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Frames whose bonds tell whether a topology fits.
 _FRAMES_FOR_BONDS = 20
@@ -152,6 +155,13 @@ class Comparison:
             f"{'<br>'.join(map(escape, j.in_short[1:]))}</p>"
             for j in self.judgements
         )
+
+    def plot(self) -> Figure:
+        """Return a matplotlib figure: free energy over φ and ψ of reference, replicate and each candidate, a row a
+        residue; where there is no backbone, its torsions' histograms."""
+        from surrogate.judge.report.overview import overview
+
+        return overview(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""

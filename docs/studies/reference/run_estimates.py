@@ -16,7 +16,7 @@ from typing import Any
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from surrogate.verbs.run.one_scene import describe_run
+from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.run_record import RUN_NAME
 from systems.units import format_time_ps, format_wall, parse_time_ps
 
@@ -40,7 +40,7 @@ def long_md(record: dict[str, Any], folder: Path, time_ps: float) -> list[Path]:
 
 def row(run: Path, long: list[Path]) -> list[str]:
     """Return a line of the table."""
-    record = describe_run(run)
+    record = RunResult.of(run)
     decision, outcome, settings = record["decision"], record["outcome"], record["settings"]
     made_ps = outcome["held_out_ps"] + outcome["rolled_ps"]
     planned_ps = decision["expected_md_ps"] + decision["expected_rollout_ps"]
@@ -71,7 +71,7 @@ def main() -> None:
     given = parser.parse_args()
     rows = []
     for run in sorted(path.parent for path in given.runs.glob(f"*/{RUN_NAME}")):
-        record = describe_run(run)
+        record = RunResult.of(run)
         if record["outcome"] is None:
             continue
         rows.append(row(run, long_md(record, given.long / run.name, given.time)))

@@ -16,7 +16,7 @@ from typing import Any
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
-from surrogate.verbs.run.one_scene import describe_run
+from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.run_record import RUN_NAME
 from systems.errors import SurromdError
 from systems.prepare.peptide import build_peptide
@@ -46,12 +46,12 @@ def judged(name: str, scene: str, folder: Path) -> dict[str, Any]:
     """Return the record of a scene's run, with `failed` where it came to nothing."""
     out = folder / name
     is_there = (out / RUN_NAME).is_file()
-    if is_there and (record := describe_run(out))["outcome"]:
+    if is_there and (record := RunResult.of(out))["outcome"]:
         return record
     try:
         return sm.run(scene, out, budget_s=BUDGET_S, quiet=True, resume=is_there)
     except SurromdError as error:
-        record = describe_run(out) if (out / RUN_NAME).is_file() else {}
+        record = RunResult.of(out) if (out / RUN_NAME).is_file() else {}
         return record | {"failed": str(error)}
 
 

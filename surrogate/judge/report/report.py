@@ -41,11 +41,12 @@ _SCRIPTS = ("viewer.js", "tables.js")
 
 class Foreword(NamedTuple):
     """What whoever had the trajectories made says of them: a `headline`, before everything else, and how they came
-    about, lines of a name and a text, under `title`."""
+    about, lines of a name and a text, under `title`; `pictures` of what the comparison does not draw."""
 
     headline: str
     title: str
     lines: Sequence[tuple[str, str]]
+    pictures: Sequence[figures.Figure] = ()
 
 
 class Written(NamedTuple):

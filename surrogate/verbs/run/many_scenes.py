@@ -24,9 +24,10 @@ from md_reference.campaign.cluster import guarded, open_client, poll, result_of,
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import LEAST_BUDGET_S
-from surrogate.verbs.run.one_scene import describe_run, run_scene
+from surrogate.verbs.run.one_scene import run_scene
 from surrogate.verbs.run.results_page import write_results
 from surrogate.verbs.run.run_record import RUN_NAME, read_run
+from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.telling import tell
 from systems.errors import InputError, PreparationError, SimulationError
 from systems.files.outside import content
@@ -253,7 +254,7 @@ def _result(spec: SceneSpec, folder: Path, failed: str) -> dict[str, Any]:
     line: dict[str, Any] = {"name": spec.name, "scene": spec.source, "failed": failed}
     if not (folder / RUN_NAME).is_file():
         return line | {"failed": failed or "not begun"}
-    record = describe_run(folder)
+    record = RunResult.of(folder)
     outcome, decision = record["outcome"], record["decision"]
     line |= {"formula": record["formula"], "way": decision["way"] if decision else "", "wall_s": record["spent_s"]}
     if outcome is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import sys
@@ -11,12 +10,13 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.reference import settle_run
 from surrogate.verbs.run.decision import (
+    LEAST_MD_S,
     MD_STAGES,
     RESTART_S,
     Decision,
@@ -24,7 +24,6 @@ from surrogate.verbs.run.decision import (
     Stage,
     decide,
     least_budget_s,
-    least_md_s,
     seconds_of_first,
 )
 from surrogate.verbs.run.rates import by_openmm, measure
@@ -36,13 +35,12 @@ from surrogate.verbs.run.run_record import (
     settings_of_run,
     write_run,
 )
-from surrogate.verbs.run.stage_clock import Clock, Pace
+from surrogate.verbs.run.stage_clock import Clock
 from surrogate.verbs.run.stages import STAGES, Site, load_beside, md_options
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.errors import InputError, SimulationError, SurromdError
 from systems.files.whole_file import Claim
-from systems.trajectory.checkpoint import frames_in
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -74,7 +72,14 @@ def run_scene(
     try:
         with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
             kept = _Kept(folder, before)
-            clock = Clock(options.budget_s, before.spent_s if before else 0.0, kept.beat, advance)
+            named, log = _named(scene), folder / LOG_NAME
+            clock = Clock(
+                options.budget_s,
+                before.spent_s if before else 0.0,
+                kept.beat,
+                advance,
+                lambda line: _say(log, named, line, quiet=options.quiet),
+            )
             molecule, config = _before_stages(clock, "preparing", lambda: _prepared(scene, options))
             if before is None:
                 record = _new_record(scene, molecule, options)
@@ -138,10 +143,7 @@ class _Run:
 
     def say(self, line: str) -> None:
         """Write a line into the log, and show it."""
-        with open(self.site.folder / LOG_NAME, "a", encoding="utf-8") as log:
-            log.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
-        if not self.site.options.quiet:
-            tell(self.site.scene.name, line)
+        _say(self.site.folder / LOG_NAME, self.site.scene.name, line, quiet=self.site.options.quiet)
 
     def to_the_end(self) -> RunRecord:
         """Do the stages that have not ended and return the record."""
@@ -160,33 +162,25 @@ class _Run:
 
     def _do(self, name: Stage) -> None:
         stage, record = STAGES[name], self.record
-        rates = record.rates
-        assert rates is not None
-        left_s, every_ps = self.clock.budget_s - self.clock.spent_s, self.decision.save_every_ps
-        frames = self._frames(name) if name in MD_STAGES else 0
+        assert record.rates is not None
+        left_s = self.clock.budget_s - self.clock.spent_s
         there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
-        # Where less is left than was planned: without MD to judge by all else was in vain.
-        is_late = left_s < sum(pending.seconds for pending in self._pending)
-        least_s = least_md_s(rates) if name in MD_STAGES and there is None and is_late else 0.0
-
-        def may_take(pace: Pace) -> float:
-            # The report is made however long it takes: without it all else was in vain.
-            if name == "report":
-                return math.inf
-            return max(least_s, seconds_of_first(self._pending, rates, every_ps, left_s, frames, pace))
-
-        hardly_begins = may_take(Pace(0.0, 0.0)) <= RESTART_S * rates.stretch
-        if hardly_begins and there is not None and (name != "md" or there.held_out):
+        may_take_s = seconds_of_first(self._pending, left_s)
+        if name in MD_STAGES and there is None:  # without MD to judge by all else was in vain
+            may_take_s = max(may_take_s, LEAST_MD_S)
+        if name == "report":  # it is made however long it takes, for the same reason
+            may_take_s = math.inf
+        if may_take_s <= RESTART_S * record.rates.stretch and there is not None and (name != "md" or there.held_out):
             self._ended(there, StageEntry(name, "out of time", 0.0))
             return
-        self.say(f"{name}: for {may_take(Pace(0.0, 0.0)):.0f} s" if name != "report" else name)
+        self.say(f"{name}: for {may_take_s:.0f} s" if name != "report" else name)
         self.kept.stage = name
         if name in MD_STAGES:
             load_beside(self._pending[1].name)
         try:
-            done = self.clock.work(name, may_take, lambda: stage.work(self.site, record))
+            done = self.clock.work(name, may_take_s, lambda: stage.work(self.site, record))
         except SurromdError as error:
-            if name in MD_STAGES and isinstance(error, SimulationError) and rates.at_once > 1:
+            if name in MD_STAGES and isinstance(error, SimulationError) and record.rates.at_once > 1:
                 self._by_openmm(name, str(error))
             elif stage.may_fail:
                 self._failed(name, str(error))
@@ -200,11 +194,6 @@ class _Run:
             self._failed(name, "nothing came of it in its time")
             return
         self._ended(found, StageEntry(name, "out of time" if done is None else "done", 0.0))
-
-    def _frames(self, name: Stage) -> int:
-        """Return how many frames there are to judge before a stage, its own among them where it goes on."""
-        record = STAGES[name].found(self.site, self.record) or self.record
-        return sum(frames_in(self.site.folder / file) for file in (*record.trajectory, *record.held_out))
 
     def _failed(self, name: str, reason: str) -> None:
         self.say(f"{name} failed: {reason}")
@@ -232,21 +221,19 @@ class _Run:
     def _by_md(self, why: str) -> None:
         """Spend what is left on MD."""
         assert self.record.rates is not None
-        left_s = max(self.clock.budget_s - self.clock.spent_s, least_budget_s(self.record.rates, "md"))
+        left_s = max(self.clock.budget_s - self.clock.spent_s, least_budget_s(self.record.rates))
         decision = decide(self.record.rates, left_s, "md", save_every_ps=self.decision.save_every_ps)
-        decision = _beside_training(self.record, replace(decision, why=(why,)))
         ended = {entry.name for entry in self.record.stages}
         stages = tuple(stage for stage in decision.stages if stage.name not in ended)
-        decision = replace(decision, stages=stages)
-        self.keep(replace(self.record, decision=decision, trajectory=self.record.training))
+        decision = replace(decision, why=(why,), stages=stages)
+        self.keep(replace(self.record, decision=decision, trajectory=()))
 
 
-def _beside_training(record: RunRecord, decision: Decision) -> Decision:
-    """Return the decision for MD where MD was made to train on: that is the trajectory, and what is made judges it."""
-    if not record.training:
-        return decision
-    judging = PlannedStage("held-out md", decision.seconds("md") + decision.seconds("held-out md"))
-    return replace(decision, stages=(judging, PlannedStage("report", decision.seconds("report"))))
+def _say(log: Path, name: str, line: str, *, quiet: bool) -> None:
+    with open(log, "a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
+    if not quiet:
+        tell(name, line)
 
 
 def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
@@ -260,14 +247,13 @@ def _taken_up(record: RunRecord, options: RunOptions) -> RunRecord:
     if longer.way != record.decision.way:  # a surrogate that failed
         return record
     decision = replace(longer, why=record.decision.why, equilibrate_ps=record.decision.equilibrate_ps)
-    decision = _beside_training(record, decision) if way == "md" else decision
     ended = tuple(entry for entry in record.stages if entry.status == "done" and entry.name != "report")
     return replace(record, decision=decision, stages=ended, outcome=None, settings=settings_of_run(options))
 
 
 def _before_stages(clock: Clock, doing: str, work: Callable[[], T]) -> T:
     """Return what comes of work that is done before there are stages. Raises InputError where the budget ends first."""
-    found = clock.work(doing, lambda _: clock.budget_s, work)
+    found = clock.work(doing, clock.budget_s, work)
     if found is None:
         raise InputError(f"the budget is spent while {doing}; give more `budget_s`.")
     return found
@@ -279,7 +265,7 @@ def _decide(
     """Return the record with rates and decision; `spent_s`: of the budget, when the rates are known."""
     rates = measure(scene, config, options.weights, options.cores)
     # On a machine so busy that measuring took what the stages need, they get it all the same.
-    least_s = min(options.budget_s, least_budget_s(rates, "md"))
+    least_s = min(options.budget_s, least_budget_s(rates))
     left_s = max(options.budget_s - spent_s(), least_s)
     decision = decide(rates, left_s, options.way, save_every_ps=options.save_every_ps, whole_s=options.budget_s)
     weights = rates.rolls.weights if decision.way == "rollout" and rates.rolls else ""
@@ -340,11 +326,3 @@ def _clear(folder: Path) -> None:
         for path in folder.glob(pattern):
             with suppress(FileNotFoundError):
                 path.unlink()
-
-
-def describe_run(folder: Path) -> dict[str, Any]:
-    """Return a JSON-able account of a run's folder; `summary` is one line."""
-    record = read_run(folder)
-    outcome = record.outcome
-    done = outcome.headline if outcome else f"not done; {len(record.stages)} stages have ended"
-    return {"file": str(folder), "type": "run", "summary": done, **json.loads(json.dumps(record.to_dict()))}

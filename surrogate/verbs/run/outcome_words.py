@@ -1,4 +1,4 @@
-"""What came of a run, in words: MD's answer first, then the rollout beside it and what it saved."""
+"""What came of a run, in words: MD's answer in three lines, then the rollout beside it and what it saved."""
 
 from __future__ import annotations
 
@@ -11,98 +11,140 @@ from surrogate.verbs.run.run_record import Outcome
 from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison
+    from surrogate.judge.comparison import Comparison, Judgement
     from surrogate.judge.md_answer import Answer
+    from surrogate.judge.rows.account import Account
     from surrogate.judge.worth import Worth
+
+Lines = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
 class Costs:
     """Wall seconds of a candidate: of rolling it, and of training its weights here; `md_ps_per_s`: what MD simulates in
-    such a second; `budget_s`: of all."""
+    such a second by the fastest way here, `by` which and in how many `replicas`; `budget_s`: of all."""
 
     rolling_s: float
     training_s: float
     md_ps_per_s: float
     budget_s: float
+    replicas: int = 1
+    by: str = "OpenMM"
 
 
 def outcome(
     way: Way, comparison: Comparison, costs: Costs, answer: Answer | None = None, notes: tuple[str, ...] = ()
 ) -> Outcome:
-    """Return what a run comes to: its MD's `answer`, and a comparison of its trajectory with its held-out MD.
-
-    Where replicas are too short to have forgotten their starts, no equivalent MD time is told.
-    """
+    """Return what a run comes to: its MD's `answer`, and a comparison of its trajectory with its held-out MD."""
     judged = comparison.judgements[0]
-    held_ps = comparison.reference.total_ps
-    if comparison.replicate is not None:
-        held_ps += comparison.replicate.total_ps
-    rolled_ps = judged.account.total_ps
-    forgot = answer is None or answer.method == "plain averages"
-    worth = None
-    if judged.worth_words and forgot:
-        worth = next((w for w in judged.worth if w.kind == "distribution"), None)
+    held = [comparison.reference, *([] if comparison.replicate is None else [comparison.replicate])]
+    worth = next((w for w in judged.worth if w.kind == "distribution"), None) if judged.worth_words else None
     gain = _least_gain(worth, costs) if way != "md" else None
-    held = f"{format_time_ps(held_ps, 2)} of held-out MD"
+    rolled = _length([judged.account])
     if way == "md":
-        replicas = judged.account.n_segments
-        each = f" in {replicas} replicas of {format_time_ps(rolled_ps / replicas, 2)}" if replicas > 1 else ""
-        head = f"{format_time_ps(rolled_ps, 2)} of MD{each}, and {held} that judges it"
-        head += f": worth {worth.in_words()} of MD by its {worth.measure}." if worth else f": {judged.status}."
-        head += f" With the held-out half there are {format_time_ps(rolled_ps + held_ps, 2)} to use."
-    elif not forgot:
-        head = (
-            f"No equivalent MD time of the {format_time_ps(rolled_ps, 2)} of the surrogate: MD's replicas are too "
-            "short for averages of theirs, and begin where the surrogate was."
-        )
+        said = f"{rolled} of MD, judged by {_length(held)}"
+        said += f": worth {worth.in_words()} of MD by its {worth.measure}." if worth else f": {judged.status}."
     elif worth is None:
-        head = (
-            f"{held} tell no worth of the {format_time_ps(rolled_ps, 2)} of the surrogate, which are {judged.status}."
-        )
+        said = f"No equivalent MD time is told of {rolled} of the surrogate, which are {judged.status}."
     else:
-        head = (
-            f"{held}; the {format_time_ps(rolled_ps, 2)} of the surrogate are worth {worth.in_words()} of MD by its "
-            f"{worth.measure}; {_gain_words(worth, gain, costs)}"
-        )
-    if judged.status == "undecided" and 0.0 < judged.effective_samples < LEAST_SAMPLES:
-        n = judged.effective_samples
-        longer = format_wall(float(f"{costs.budget_s * LEAST_SAMPLES / n:.2g}"))
-        head += f" Of the slowest motion {n:.2g} independent samples were seen, of {LEAST_SAMPLES} that it takes: "
-        head += f"a budget of about {longer} would tell."
-    if answer is not None:
-        head = " ".join(filter(None, (answer.headline, answer.on_surrogate, head)))
+        said = f"{rolled} of the surrogate are worth {worth.in_words()} of MD by its {worth.measure}; "
+        said += _gain_words(worth, gain, costs)
+    lines = judged.in_short if answer is None else answer_lines(answer)
+    on_surrogate = answer.on_surrogate if answer else ""
     return Outcome(
-        head,
-        judged.status,
-        judged.verdict,
-        held_ps,
-        rolled_ps,
-        worth.in_words() if worth else "",
-        gain,
-        answer.headline if answer else "",
-        answer.on_surrogate if answer else "",
-        answer.holds and not answer.missing if answer else False,
-        notes,
+        headline=" ".join(lines),
+        in_short=lines,
+        details=" ".join(filter(None, (on_surrogate, said, _remedy(comparison, costs)))),
+        status=judged.status,
+        verdict=judged.verdict,
+        held_out_ps=sum(a.total_ps for a in held),
+        rolled_ps=judged.account.total_ps,
+        worth=worth.in_words() if worth else "",
+        gain=gain,
+        answer=answer.headline if answer else "",
+        on_surrogate=on_surrogate,
+        converged=answer.holds and not answer.missing if answer else False,
+        notes=notes,
     )
 
 
-def _least_ps(worth: Worth) -> float:
-    """Return the least that a worth may be, in ps of MD."""
-    if worth.bound == "less than":
-        return 0.0
-    if worth.low_ps is not None:
-        return worth.low_ps
-    return worth.worth_ps if worth.bound == "at least" else 0.0
+def answer_lines(answer: Answer) -> Lines:
+    """Return whether to use MD's answer, for what, and why."""
+    told = [s for s in answer.states if not s.missing]
+    widest = max((s.error for s in told), default=0.0)
+    if not answer.holds:
+        use, for_what = "Do not use MD's populations yet.", f"They show which states there are: {len(answer.states)}."
+    else:
+        use = "Use MD's answer" + (", but for what it did not connect." if answer.missing else ".")
+        for_what = f"For populations and free energies of {len(told)} states, each to {100 * widest:.2g} % or better"
+        for_what += " (one standard error)" + (", and relaxation times." if answer.timescales_ps else ".")
+    missing = f" Missing: {'; '.join(answer.missing)}." if answer.missing else ""
+    length = f"{answer.n_replicas} replicas of {format_time_ps(answer.replica_ps, 2)}"
+    slow = ""
+    if answer.timescales_ps:
+        error = f" ± {format_time_ps(answer.timescale_errors_ps[0], 2)}" if answer.timescale_errors_ps else ""
+        slow = f"; the slowest process takes {format_time_ps(answer.timescales_ps[0], 2)}{error}"
+    not_yet = "" if answer.holds else " and has not converged"
+    return use, for_what + missing, f"Why: MD is {length}, weighed by {answer.tests}{not_yet}{slow}."
+
+
+def lines_of(way: Way, judged: Judgement, answer: Answer | None) -> Lines:
+    """Return the three lines on top of the report, which say of the trajectory what MD's answer says: a comparison
+    counts all frames of MD alike, and MD's transitions weigh them."""
+    if answer is None or judged.status == "broken":
+        return judged.in_short
+    if way == "md":
+        return answer_lines(answer)
+    told = [s for s in answer.states if s.surrogate is not None and not s.missing]
+    off = [s for s in told if s.differs]
+    if not answer.holds or not told:
+        use, for_what = "Not known yet whether the surrogate can be used.", "It found the states that MD began in."
+        return use, for_what, "Why: MD that judges it has not converged."
+    right = f"Right: populations of {len(told) - len(off)} of {len(told)} states."
+    if off:
+        wrong = ", ".join(f"{s.torsion} {s.state}" for s in off[:3]) + (", and more" if len(off) > 3 else "")
+        return "Use MD's populations, not the surrogate's.", f"{right} Wrong: {wrong}.", f"Why: {answer.on_surrogate}"
+    if answer.method == "plain averages" or judged.status in ("agrees", "close"):
+        return judged.in_short
+    return "Use the surrogate for populations.", right, f"Why: {answer.on_surrogate}"
+
+
+def _length(accounts: list[Account]) -> str:
+    """Return such as '32 replicas of 3.8 ns', which is no length of one run."""
+    n = sum(a.n_segments for a in accounts)
+    each = format_time_ps(sum(a.total_ps for a in accounts) / n, 2)
+    return f"{n} replicas of {each}" if n > 1 else each
+
+
+def _remedy(comparison: Comparison, costs: Costs) -> str:
+    """Return what would tell more; a longer budget where its replicas outlast the slowest relaxation that was seen."""
+    found, judged = comparison.convergence, comparison.judgements[0]
+    if found is not None and not found.converged:
+        said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
+        if found.needed_ps is None or found.needed_ps <= found.replica_ps:
+            return f"{said}."
+        return f"{said}: a budget of about {_wall(costs.budget_s * found.needed_ps / found.replica_ps)}."
+    n = judged.effective_samples
+    if judged.status == "undecided" and 0.0 < n < LEAST_SAMPLES:
+        return (
+            f"Of the slowest motion {n:.2g} independent samples were seen, of {LEAST_SAMPLES} that it takes: a budget "
+            f"of about {_wall(costs.budget_s * LEAST_SAMPLES / n)} would tell."
+        )
+    return ""
+
+
+def _wall(seconds: float) -> str:
+    return format_wall(float(f"{seconds:.2g}"))
 
 
 def _least_gain(worth: Worth | None, costs: Costs) -> float | None:
     """Return what MD of a worth's lower end would cost, over what the candidate did; training here counts."""
     if worth is None or costs.md_ps_per_s <= 0.0:
         return None
+    least_ps = worth.low_ps if worth.low_ps is not None else worth.worth_ps if worth.bound == "at least" else 0.0
     # Where MD at hand ends first, the part of the rollout that comes as near is what it is the worth of.
     spent_s = costs.training_s + worth.share * costs.rolling_s
-    return _least_ps(worth) / (costs.md_ps_per_s * max(spent_s, 1e-9))
+    return (0.0 if worth.bound == "less than" else least_ps) / (costs.md_ps_per_s * max(spent_s, 1e-9))
 
 
 def _gain_words(worth: Worth, gain: float | None, costs: Costs) -> str:
@@ -110,12 +152,12 @@ def _gain_words(worth: Worth, gain: float | None, costs: Costs) -> str:
         return "what MD of it would cost is not known."
     spent_s = costs.training_s + worth.share * costs.rolling_s
     training = f", training included ({format_wall(costs.training_s)})" if costs.training_s else ""
-    bought = format_time_ps(costs.md_ps_per_s * spent_s, 2)
+    each = format_time_ps(costs.md_ps_per_s * spent_s / costs.replicas, 2)
+    bought = f"{costs.replicas} replicas of {each}" if costs.replicas > 1 else each
+    rival = f"in the {format_wall(spent_s)} that took{training}, MD by {costs.by}, the fastest here, makes {bought}."
     if gain >= 1.0:
-        return f"gain at least {gain:.2g}: in the {format_wall(spent_s)} that took{training}, MD makes {bought}."
+        return f"speed-up at equal accuracy at least {gain:.2g}: {rival}"
     most_ps = worth.high_ps if worth.bound == "" else None if worth.bound == "at least" else worth.worth_ps
     if most_ps is not None and most_ps < costs.md_ps_per_s * spent_s:
-        return f"MD was the better choice: in the {format_wall(spent_s)} that took{training}, it makes {bought}."
-    return (
-        f"no gain is shown (at least {gain:.2g}): in the {format_wall(spent_s)} that took{training}, MD makes {bought}."
-    )
+        return f"MD was the better choice: {rival}"
+    return f"no speed-up is shown (at least {gain:.2g}): {rival}"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from systems.errors import OutOfDomainError, SimulationError
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -21,9 +22,13 @@ if TYPE_CHECKING:
 # Rollouts side by side: one batch, which costs little more than one of them. Of a potential's, sixteen run at once on
 # each core; by torch a step of 32 is half as dear for each as of 8.
 REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
-# Weights for several lags step so far, or as near to it as they can.
+# Weights for several lags step so far, or as near to it as they can; while they are measured so many times as far, as
+# far as they go, which costs the same and shows how slowly the molecule relaxes.
 LONG_LAG_PS = 10.0
+_FURTHER = 10
 _CHUNKS = 6
+# Taken for the slowest relaxation of what nothing has been seen of: ps.
+UNSEEN_PS = 1000.0
 _LONGEST_STRETCH = 30.0
 # Beyond this SIMD replicas are not tried: all compute the same pairs of waters, the more in vain the larger the cell.
 _MOST_ATOMS_BY_SIMD = 3000
@@ -31,12 +36,14 @@ _MOST_ATOMS_BY_SIMD = 3000
 
 @dataclass(frozen=True)
 class Rolls:
-    """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together."""
+    """How weights (a name or a file) roll: frames `lag_ps` apart, ps in a second of wall time, replicas together;
+    `relaxation_ps` of the slowest motion in the rollouts that were measured, 0 where they are too short to show one."""
 
     weights: str
     lag_ps: float
     ps_per_s: float
     replicas: int = REPLICAS
+    relaxation_ps: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,17 @@ class Rates:
     def replicas(self) -> int:
         """How many replicas of MD run at once."""
         return self.cores * self.at_once
+
+    @property
+    def relaxation_ps(self) -> float:
+        """The slowest relaxation that is reckoned with, ps."""
+        return (self.rolls.relaxation_ps if self.rolls else 0.0) or UNSEEN_PS
+
+    @property
+    def relaxation_words(self) -> str:
+        """The same in words."""
+        seen = "as the first rollouts show" if self.rolls and self.rolls.relaxation_ps else "assumed"
+        return f"a slowest relaxation of {format_time_ps(self.relaxation_ps, 2)}, {seen}"
 
     @property
     def openmm_ps_per_s(self) -> float:
@@ -159,26 +177,42 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
     lag_ps = weights.domain.lag_ps
     if weights.domain.jumps:
         lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
-    replicas = REPLICAS
+    replicas, relaxation_ps = REPLICAS, 0.0
+    seen_ps = min(_FURTHER * lag_ps, weights.domain.longest_lag_ps) if weights.domain.jumps else lag_ps
     if weights.model.integrates:  # so many steps a frame that one frame tells
         weights, replicas = in_bath(weights, {"n_new": 1}), max(_POTENTIAL_REPLICAS, _REPLICAS_A_CORE * cores)
-    chunk_ps = weights.model.n_new * lag_ps
     seen: list[tuple[float, float]] = []
     with tempfile.TemporaryDirectory(prefix="surromd-rate-") as folder:
+        files = [Path(folder) / f"r{k}.h5" for k in range(replicas)]
+        time_ps = _CHUNKS * weights.model.n_new * seen_ps
         rollout(
             scene,
             weights,
-            [Path(folder) / f"r{k}.h5" for k in range(replicas)],
-            RolloutConfig(time_ps=_CHUNKS * chunk_ps, save_every_ps=lag_ps, temperature_k=temperature_k),
+            files,
+            RolloutConfig(time_ps=time_ps, save_every_ps=seen_ps, temperature_k=temperature_k),
             progress=lambda done, total, note: seen.append((time.monotonic(), time.process_time())),
             flush_every_s=3600.0,
         )
+        if not weights.model.integrates:
+            relaxation_ps = _slowest_ps(files)
     # As of MD the fastest batch counts: the first chunk makes what all others use again, the last one is flushed. Where
     # other work interrupts them all, processor time tells what a chunk takes; on several cores by itself, wall time.
     passed = [(wall - wall0, own - own0) for (wall0, own0), (wall, own) in pairwise(seen[:-1])]
     fastest_s = max(min(min(both) for both in passed), 1e-6)
     name = weights.path.stem if shipped_weights().get(weights.path.stem) == weights.path else str(weights.path)
-    return Rolls(name, lag_ps, replicas * chunk_ps / fastest_s / stretch, replicas)
+    ps_per_s = replicas * weights.model.n_new * lag_ps / fastest_s / stretch
+    return Rolls(name, lag_ps, ps_per_s, replicas, relaxation_ps)
+
+
+def _slowest_ps(files: list[Path]) -> float:
+    """Return the longest integrated correlation time in trajectories, about the mean of all."""
+    from surrogate.judge.measure.slow_motion import longest_correlation
+    from surrogate.judge.measure.structure import Yardstick
+    from surrogate.judge.read.ensemble import load_ensemble
+
+    rolled = load_ensemble(files)
+    measured = Yardstick.of(rolled, parent=rolled.scene, kept=rolled.kept).measure(rolled)
+    return round(longest_correlation(measured) * rolled.lag_ps, 3)
 
 
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:

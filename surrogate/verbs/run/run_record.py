@@ -15,7 +15,7 @@ from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
 
 RUN_NAME = "run.json"
-FORMAT = 3
+FORMAT = 4
 # What may change from one sitting to the next.
 _FREE = frozenset({"quiet", "resume", "overwrite", "dry_run", "workers", "scheduler"})
 
@@ -34,10 +34,11 @@ class StageEntry:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run. `headline`: the report's first line; `answer`: what MD says of equilibrium, `on_surrogate`:
-    what that says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of MD that judged,
-    `rolled_ps` that was judged; `worth` in words, `gain` over as much wall time of MD as a lower bound, None where it
-    cannot be told."""
+    """What came of a run. `in_short`: use MD's answer or not, for what, why, `headline`: the same in one line;
+    `details`: what the surrogate is worth, and what would tell more; `answer`: what MD says of equilibrium,
+    `on_surrogate`: what that says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of
+    MD that judged, `rolled_ps` that was judged, replicas together; `worth` in words, `gain` over as much wall time of
+    the fastest MD here as a lower bound, None where it cannot be told."""
 
     headline: str
     status: str
@@ -50,12 +51,14 @@ class Outcome:
     on_surrogate: str = ""
     converged: bool = False
     notes: tuple[str, ...] = ()
+    in_short: tuple[str, str, str] = ("", "", "")
+    details: str = ""
 
 
 @dataclass(frozen=True)
 class RunRecord:
     """A run on its way or done. `settings`: what was asked for, in our units; `spent_s` of its budget, `spent_in` each
-    stage; `trajectory`, `held_out`, `training`: files, relative to the folder; `weights`: a file there, or the name of
+    stage; `trajectory`, `held_out`: files, relative to the folder; `weights`: a file there, or the name of
     shipped ones; `simd_failed`: the number of SIMD replicas when MD by them failed, else 0."""
 
     scene: str
@@ -72,7 +75,6 @@ class RunRecord:
     stages: tuple[StageEntry, ...] = ()
     trajectory: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
-    training: tuple[str, ...] = ()
     weights: str = ""
     simd_failed: int = 0
     outcome: Outcome | None = None

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from surrogate.verbs.options import PathLike, RunOptions
 from surrogate.verbs.run.decision import table
 from surrogate.verbs.run.many_scenes import molecules_in, run_many
-from surrogate.verbs.run.one_scene import describe_run, plan_scene, run_scene
+from surrogate.verbs.run.one_scene import plan_scene, run_scene
 from surrogate.verbs.run.run_record import RunRecord
+from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.telling import tell
 from systems.errors import InputError
 from systems.options import takes
@@ -56,7 +57,7 @@ def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOpt
                 tell(found.molecule, f"{name}: {text}")
 
     run_scene(scene, folder, options, told)
-    return describe_run(folder)
+    return RunResult.of(folder)
 
 
 def decision_table(record: RunRecord, options: RunOptions) -> dict[str, str]:

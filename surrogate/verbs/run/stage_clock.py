@@ -6,8 +6,6 @@ import contextvars
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
 from typing import TypeVar
 
 from surrogate.progress import ProgressFn
@@ -19,38 +17,36 @@ _TICK_S = 0.2
 _SAVE_EVERY_S = 2.0
 
 
-@dataclass(frozen=True)
-class Pace:
-    """What a stage has taken so far: wall seconds, and processor seconds of this process and of those it started."""
-
-    wall_s: float
-    processor_s: float
-
-
 class Clock:
     """Counts the wall time of a run, of earlier sittings too (`spent_s`). `save` is told every few seconds what is
-    spent, so that a run that is killed does not start its budget over; `advance` shows it."""
+    spent, so that a run that is killed does not start its budget over; `advance` shows it, `warn` says once, and while
+    it happens, that the budget is overrun."""
 
     def __init__(
-        self, budget_s: float, spent_s: float, save: Callable[[float], None], advance: ProgressFn | None = None
+        self,
+        budget_s: float,
+        spent_s: float,
+        save: Callable[[float], None],
+        advance: ProgressFn | None = None,
+        warn: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.budget_s = budget_s
         self._before_s, self._began = spent_s, time.monotonic()
-        self._save, self._advance = save, advance
+        self._save, self._advance, self._warn = save, advance, warn
+        self._is_over = spent_s > budget_s
 
     @property
     def spent_s(self) -> float:
         return self._before_s + time.monotonic() - self._began
 
-    def work(self, said: str, may_take: Callable[[Pace], float], stage: Callable[[], T]) -> T | None:
+    def work(self, said: str, may_take_s: float, stage: Callable[[], T]) -> T | None:
         """Do a stage and return its result; None where it was asked to stop, as Ctrl-C asks, when its time was up.
 
-        `may_take` is asked every few seconds, for the pace of a stage may tell what later ones will need. A stage runs
-        in a thread of its own, and must end with KeyboardInterrupt when it is asked to (`deferred_interrupt`,
-        `stop_if_asked`). Ctrl-C stops it likewise: KeyboardInterrupt with the stage's own words. Raises what it raises.
+        A stage runs in a thread of its own, and must end with KeyboardInterrupt when it is asked to
+        (`deferred_interrupt`, `stop_if_asked`). Ctrl-C stops it likewise: KeyboardInterrupt with the stage's own words.
+        Raises what it raises.
         """
-        began, processor_s = time.monotonic(), _processor_s()
-        until = began + may_take(Pace(0.0, 0.0))
+        until = time.monotonic() + may_take_s
         results: list[T] = []
         errors: list[BaseException] = []
         with deferred_interrupt() as asked_to_stop:
@@ -71,7 +67,6 @@ class Clock:
                 if time.monotonic() - saved > _SAVE_EVERY_S:
                     saved = time.monotonic()
                     self._save(self.spent_s)
-                    until = began + may_take(Pace(saved - began, _processor_s() - processor_s))
             self._save(self.spent_s)
             if errors and isinstance(errors[0], KeyboardInterrupt):
                 if asked_to_stop():
@@ -84,21 +79,13 @@ class Clock:
         return results[0]
 
     def _show(self, said: str) -> None:
+        spent_s = self.spent_s
+        if spent_s > self.budget_s + _SAVE_EVERY_S and not self._is_over:
+            self._is_over = True
+            self._warn(
+                f"{said}: over the budget of {format_wall(self.budget_s)}, as busy as the machine is; it goes on"
+            )
         if self._advance is not None:
-            spent_s = min(self.spent_s, self.budget_s)
             note = f"{said}, {format_wall(round(spent_s))} of {format_wall(self.budget_s)}"
+            spent_s = min(spent_s, self.budget_s)
             self._advance(round(10 * spent_s), round(10 * self.budget_s), note)
-
-
-def _processor_s() -> float:
-    """Return the processor seconds that this process and those it started have used so far."""
-    import psutil
-
-    total = 0.0
-    own = psutil.Process()
-    for process in (own, *own.children(recursive=True)):
-        with suppress(psutil.Error):
-            # Its own and those of children that have ended; the system's share of OpenMM's threads is waiting.
-            used = process.cpu_times()
-            total += used.user + used.children_user
-    return total

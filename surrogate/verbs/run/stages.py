@@ -17,14 +17,16 @@ from surrogate.verbs.compare import compare
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
 from surrogate.verbs.outputs import accounted_outputs
 from surrogate.verbs.rollout import rollout
-from surrogate.verbs.run.decision import Decision, Stage, expected_errors, md_ps, table
-from surrogate.verbs.run.outcome_words import Costs, outcome
+from surrogate.verbs.run.decision import Decision, Stage, errors_in_words, expected_errors, md_ps, table
+from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
+from surrogate.verbs.run.run_result import ANSWER_NAME, REPORT_NAME, weighted_maps
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
 from systems.files.whole_file import create_whole
 from systems.options import Preparation
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -37,10 +39,6 @@ _AMPLE = 2.0
 _LEAST_FRAMES = 20
 # Of MD from frames of a rollout is left out so much: what is local has forgotten the model by then.
 _LEFT_OUT_PS = 20.0
-# Of a training's time what may go into steps, and must; processor seconds that do not: weights are tried out, frames
-# read and encoded (of an atom in a frame), which may take so large a share.
-_OPTIMISING, _LEAST_OPTIMISING = 0.95, 0.1
-_BESIDE_STEPS_S, _ENCODING_S, _ENCODING = 9.0, 1.2e-5, 0.3
 # Of a potential's rollout goes into annealing, at most: what turns once in a ns would keep the state it was built in.
 _ANNEAL_PS, _ANNEAL = 50.0, 0.2
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
@@ -50,7 +48,12 @@ _LOADED_BEFORE: dict[Stage, tuple[str, ...]] = {
     "report": ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj"),
     "train": ("torch", "lightning_fabric", "matplotlib.backends.backend_svg", "surrogate.models.lam_slide.trainer"),
 }
-WEIGHTS_NAME, ANSWER_NAME, REPORT_NAME = "weights.safetensors", "equilibrium.json", "report.html"
+# Of a run's report, where MD's frames have weights.
+UNWEIGHTED = (
+    "This comparison counts all frames of held-out MD alike; the weights that MD's transitions give them are in the "
+    "lines on top, in the maps below them and in the files."
+)
+WEIGHTS_NAME = "weights.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +135,6 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
             return None
         if name == "held-out md":  # beside what an only replica has left to it
             return replace(record, held_out=tuple(dict.fromkeys((*record.held_out, *together))))
-        if name == "training md":
-            return replace(record, training=together)
         n_own = [-(-len(part) // 2) for part in files]
         own = [part[:n] for part, n in zip(files, n_own, strict=True)]
         held = [part[n:] for part, n in zip(files, n_own, strict=True)]
@@ -186,41 +187,16 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
-    from surrogate.sampling.choice import weights_to_go_on_from
-
-    out = site.folder / WEIGHTS_NAME
     _, decision = _rates_and_decision(record)
-    dear, seconds = decision.way == "potential", decision.seconds("train")
-    files, beside_s = _to_train_on(site, record, seconds)
-    if not dear and beside_s > (1.0 - _LEAST_OPTIMISING) * seconds:
-        raise InputError(f"it takes {beside_s:.0f} s beside its steps, and has {seconds:.0f} s.")
     options = TrainOptions(
-        level=site.options.level if dear else None,
-        start_from=None if dear else weights_to_go_on_from(site.scene),
-        # A potential's budget covers all it does, that of others their steps. They are tried out when they are written.
-        budget_s=seconds if dear else min(seconds - beside_s, _OPTIMISING * seconds),
+        level=site.options.level,
+        budget_s=decision.seconds("train"),
         seed=site.options.seed,
         resume=True,
         quiet=True,
     )
-    train(site.scene if dear else files, out, options=options)
+    train(site.scene, site.folder / WEIGHTS_NAME, options=options)
     return _rolling(site, record) or record
-
-
-def _to_train_on(site: Site, record: RunRecord, seconds: float) -> tuple[list[Path], float]:
-    """Return as many of the files to train on as can be encoded in time, and the wall seconds of all but the steps."""
-    from systems.trajectory.checkpoint import frames_in
-
-    rates, _ = _rates_and_decision(record)
-    stretch = max(1.0, rates.stretch * rates.alone)
-    files: list[Path] = []
-    encoding_s = 0.0
-    for path in (site.folder / file for file in record.training):
-        encoding_s += stretch * _ENCODING_S * rates.n_atoms * frames_in(path)
-        if files and encoding_s > _ENCODING * seconds:
-            break
-        files.append(path)
-    return files, stretch * _BESIDE_STEPS_S + min(encoding_s, _ENCODING * seconds)
 
 
 def _trained(site: Site, record: RunRecord) -> RunRecord | None:
@@ -294,10 +270,11 @@ def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs
     spent, rates = record.spent_in, _rates_and_decision(record)[0]
     # The faster of what was measured before and what it came to: the gain is a lower bound.
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
-    training_s = spent.get("train", 0.0) + spent.get("training md", 0.0)
+    training_s = spent.get("train", 0.0)
     # What reading weights takes is no part of it: a longer rollout does it once, too.
     rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
-    return Costs(rolling_s, training_s, md_ps_per_s, record.settings["budget_s"])
+    by = "SIMD" if rates.at_once > 1 else "OpenMM"
+    return Costs(rolling_s, training_s, md_ps_per_s, record.settings["budget_s"], rates.replicas, by)
 
 
 def worth_saying(notes: tuple[str, ...]) -> tuple[str, ...]:
@@ -341,21 +318,27 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
     truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
     comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
-    comparison = replace(comparison, notes=worth_saying(comparison.notes))
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
     found = outcome(decision.way, comparison, costs_of(record, comparison, held_ps), answer, notes)
+    judged = comparison.judgements[0]
+    judged = replace(judged, in_short=lines_of(decision.way, judged, answer))
+    said = (*(() if answer is None else (UNWEIGHTED,)), *worth_saying(comparison.notes))
+    comparison = replace(comparison, notes=said, judgements=(judged,))
     lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s)]
     if answer is not None and answer.timescales_ps:
-        errors = expected_errors(rates, decision, answer.timescales_ps[0], answer.model_error)
-        said = ", ".join(f"{100 * error:.2g} % by {name}" for name, error in errors.items())
-        lines.append(("expected error", f"of a population, in this budget: {said}"))
+        errors = expected_errors(rates, record.settings["budget_s"], answer.timescales_ps[0], answer.model_error)
+        slow = format_time_ps(answer.timescales_ps[0], 2)
+        lines.append(("looking back", f"{errors_in_words(errors)}, with the slowest relaxation that was found, {slow}"))
     write_report(
         comparison,
         site.folder / REPORT_NAME,
         command=f"surromd run {record.scene!r} -o {site.folder.name}",
         foreword=Foreword(
-            found.headline, "States by MD, and how the budget was spent", [*lines, *(("note", note) for note in notes)]
+            "\n".join(found.in_short),
+            "States by MD, what the trajectory is worth, and how the budget was spent",
+            [("worth", found.details), *lines, *(("note", note) for note in notes)],
+            [] if answer is None else weighted_maps(answer, comparison.temperature_k),
         ),
     )
     return replace(record, outcome=found)
@@ -377,7 +360,6 @@ def _nothing(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 STAGES: dict[str, StageOf] = {
-    "training md": _md_stage("training md", "reference/training", 2),
     "md": _md_stage("md", "trajectory/md", 0),
     "held-out md": _md_stage("held-out md", "reference/held_out", 1),
     "train": StageOf(_train, _trained, may_fail=True),

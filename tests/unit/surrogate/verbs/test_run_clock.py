@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -28,22 +29,22 @@ def clock(kept: list[float] | None = None, spent_s: float = 0.0) -> Clock:
 
 def test_a_stage_is_stopped_when_its_time_is_up() -> None:
     began = time.monotonic()
-    assert clock().work("md", lambda _: 0.3, until_asked) is None
+    assert clock().work("md", 0.3, until_asked) is None
     assert time.monotonic() - began >= 0.3
-    assert clock().work("md", lambda _: 60.0, lambda: "done") == "done", "control"
+    assert clock().work("md", 60.0, lambda: "done") == "done", "control"
 
 
 def test_time_of_earlier_sittings_counts() -> None:
     kept: list[float] = []
     found = clock(kept, spent_s=40.0)
-    found.work("md", lambda _: 0.1, until_asked)
+    found.work("md", 0.1, until_asked)
     assert 40.1 <= kept[-1] <= found.spent_s
 
 
 def test_ctrl_c_stops_a_stage_and_says_what_is_kept() -> None:
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt, match="7 frames"):
-        clock().work("md", lambda _: 60.0, until_asked)
+        clock().work("md", 60.0, until_asked)
 
 
 def test_a_run_inside_a_worker_is_stopped_by_the_worker() -> None:
@@ -52,7 +53,7 @@ def test_a_run_inside_a_worker_is_stopped_by_the_worker() -> None:
     def run() -> None:
         with stop_when(lambda: time.monotonic() - began > 0.3):
             try:
-                clock().work("md", lambda _: 60.0, until_asked)
+                clock().work("md", 60.0, until_asked)
             except KeyboardInterrupt as stop:
                 caught.append(stop)
 
@@ -67,7 +68,7 @@ def test_errors_of_a_stage_come_through() -> None:
         raise SimulationError("it blew up")
 
     with pytest.raises(SimulationError, match="blew up"):
-        clock().work("md", lambda _: 60.0, fail)
+        clock().work("md", 60.0, fail)
 
 
 def test_work_that_only_looks_now_and_then_is_stopped_too() -> None:
@@ -76,4 +77,21 @@ def test_work_that_only_looks_now_and_then_is_stopped_too() -> None:
             stop_if_asked()
             time.sleep(0.01)
 
-    assert clock().work("train", lambda _: 0.2, loop) is None
+    assert clock().work("train", 0.2, loop) is None
+
+
+def test_a_budget_that_is_overrun_is_said_once_while_it_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surrogate.verbs.run.stage_clock._SAVE_EVERY_S", 0.1)
+    said: list[tuple[str, bool]] = []
+    done: list[bool] = []
+
+    def work() -> None:
+        time.sleep(1.0)
+        done.append(True)
+
+    late = Clock(0.3, 0.0, lambda _: None, None, lambda line: said.append((line, bool(done))))
+    late.work("report", math.inf, work)
+    assert len(said) == 1 and said[0][0].startswith("report: over the budget of") and not said[0][1]
+    said.clear()
+    Clock(60.0, 0.0, lambda _: None, None, lambda line: said.append((line, True))).work("report", math.inf, work)
+    assert not said, "control"

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
@@ -18,8 +19,10 @@ from md_reference.simd import force_field
 from md_reference.simd.system_terms import SimdUnavailableError
 from surrogate.data.shipped import weights_path
 from surrogate.data.weights import load_weights
+from surrogate.judge.read.ensemble import Ensemble
 from surrogate.verbs.run import rates as measuring
 from surrogate.verbs.run.rates import Rates, measure, rollout_rate
+from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import SimulationError
 from systems.prepare.peptide import build_peptide
 
@@ -121,9 +124,43 @@ def test_the_rate_is_that_of_a_rollout_of_so_many_replicas(
 
     weights = load_weights(weights_path(name))
     monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
+    monkeypatch.setattr(measuring, "_slowest_ps", lambda files: 40.0)
     clocks = {"monotonic": iter(wall_s).__next__, "process_time": iter(processor_s).__next__}
     monkeypatch.setattr(measuring, "time", SimpleNamespace(**clocks))
     found = rollout_rate(weights.domain.scene, weights, 300.0, 2.0, 4)
     assert asked == [(replicas, pytest.approx(6 * chunk_ps))], "of a potential a frame a chunk tells"
     assert found.replicas == replicas
+    assert found.relaxation_ps == (0.0 if weights.model.integrates else 40.0), "so few frames show no relaxation"
     assert found.ps_per_s == pytest.approx(replicas * chunk_ps / 4.0 / 2.0), "half of the core is others'"
+
+
+def test_weights_for_several_lags_are_measured_by_long_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def rollout(scene: Any, weights: Any, outs: Any, config: Any, *, progress: Any, **_: Any) -> None:
+        asked.append(config)
+        for k in range(4):
+            progress(k, 3, "")
+
+    monkeypatch.setattr("surrogate.sampling.runner.rollout", rollout)
+    monkeypatch.setattr(measuring, "_slowest_ps", lambda files: 1_500.0)
+    weights = load_weights(weights_path("peptides"))
+    rolls = rollout_rate(build_peptide("ACE-ALA-NME"), weights, 300.0, 1.0, 1)
+    assert rolls.lag_ps == 10.0 and asked[0].save_every_ps == 100.0
+    assert asked[0].time_ps == 6 * weights.model.n_new * 100.0
+    rates = replace(found(), rolls=rolls)
+    assert rates.relaxation_words == "a slowest relaxation of 1.5 ns, as the first rollouts show"
+    assert found().relaxation_words == "a slowest relaxation of 1 ns, assumed"
+
+
+def test_the_slowest_relaxation_is_that_of_a_torsion_that_jumps(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, rng = build_peptide("ACE-ALA-NME"), np.random.default_rng(2)
+    quad = backbone_torsions(scene)["psi"][0].tolist()
+    other = turned(scene.positions_nm, quad, np.pi, bonded_graph(scene))
+    for tau in (4.0, 16.0):
+        state = np.cumsum(rng.random((8, 500)) < 0.5 * -np.expm1(-1.0 / tau), axis=1) % 2
+        frames = np.where(state[..., None, None] > 0, other, scene.positions_nm)
+        frames = (frames + 1e-3 * rng.standard_normal(frames.shape)).astype(np.float32)
+        rolled = Ensemble("rolled", list(frames), 100.0, scene)
+        monkeypatch.setattr("surrogate.judge.read.ensemble.load_ensemble", lambda files, rolled=rolled: rolled)
+        assert 0.6 < measuring._slowest_ps([]) / (100.0 * tau) < 1.7

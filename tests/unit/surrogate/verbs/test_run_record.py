@@ -8,13 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from surrogate import api
+from surrogate.judge.md_answer import Answer, StateEnergy
 from surrogate.judge.worth import Worth
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import Way, decide
-from surrogate.verbs.run.outcome_words import Costs, outcome
+from surrogate.verbs.run.outcome_words import Costs, answer_lines, lines_of, outcome
 from surrogate.verbs.run.rates import Rates, Rolls
 from surrogate.verbs.run.run_record import (
     Outcome,
@@ -24,6 +26,7 @@ from surrogate.verbs.run.run_record import (
     settings_of_run,
     write_run,
 )
+from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.stages import costs_of
 from systems.errors import InputError, PreparationError
 
@@ -35,7 +38,7 @@ OPTIONS = RunOptions(budget_s=600.0, weights=Path("mine.safetensors"))
 def record() -> RunRecord:
     return RunRecord(
         "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
-        RATES, decide(RATES, 600.0), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
+        RATES, decide(RATES, 600.0, "surrogate"), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
         outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
     )  # fmt: skip
 
@@ -98,50 +101,112 @@ def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth
                  lengths_ps=(1e3, 1e4, 1e5), errors=(3.0, 2.0, 1.0), errors_high=(), **given)  # fmt: skip
 
 
-def told(way: Way, found: Worth | None, costs: Costs = CHEAP, answer: Any = None) -> Outcome:
-    account = SimpleNamespace(total_ps=50_000.0, n_segments=16)
-    status, worths = ("close", (found,)) if found else ("undecided", ())
-    judged = SimpleNamespace(account=account, worth=worths, worth_words="words" if found else "", status=status,
-                             verdict="Close.", effective_samples=4.0)  # fmt: skip
-    half = SimpleNamespace(total_ps=6_000.0)
-    comparison: Any = SimpleNamespace(judgements=(judged,), reference=half, replicate=half)
+def convergence(**more: Any) -> Any:
+    given = {"converged": True, "verdict": "", "remedy": "", "needed_ps": None, "replica_ps": 375.0} | more
+    return SimpleNamespace(**given)
+
+
+SHORT = convergence(converged=False, verdict="32 replicas of 380 ps, not converged: it drifts.", needed_ps=3_750.0,
+                    remedy="replicas of 3.8 ns or more would tell")  # fmt: skip
+
+
+def account(total_ps: float, n: int) -> Any:
+    return SimpleNamespace(total_ps=total_ps, n_segments=n)
+
+
+def judgement(found: Worth | None, status: str = "close") -> Any:
+    return SimpleNamespace(account=account(50_000.0, 16), worth=(found,) if found else (), status=status,
+                           worth_words="words" if found else "", verdict="Close.", effective_samples=4.0,
+                           in_short=("Use it.", "Right: all.", "Why: so."))  # fmt: skip
+
+
+def told(way: Way, found: Worth | None, costs: Costs = CHEAP, answer: Any = None, of: Any = None) -> Outcome:
+    half, judged = account(6_000.0, 16), judgement(found, "close" if found else "undecided")
+    comparison: Any = SimpleNamespace(
+        judgements=(judged,), reference=half, replicate=half, convergence=of or convergence()
+    )
     return outcome(way, comparison, costs, answer)
 
 
-def answer(method: str, **more: Any) -> Any:
-    given = {"headline": "Equilibrium from MD.", "on_surrogate": "It agrees.", "holds": True, "missing": ()} | more
-    return SimpleNamespace(method=method, **given)
+def state(**more: Any) -> StateEnergy:
+    return replace(StateEnergy("ALA 2", "α", 0.5, 0.01, 0.0, 0.1, 32, 20, 0.52, 0.01), **more)
 
 
-def test_the_headline_says_held_out_worth_and_least_gain() -> None:
-    found = told("rollout", worth())
-    assert found.headline.startswith("12 ns of held-out MD; the 50 ns of the surrogate are worth 10 ns [8 ns, 12 ns]")
-    assert found.gain == pytest.approx(8_000.0 / (200.0 * 10.0)) and "gain at least 4:" in found.headline
+def answer(**more: Any) -> Answer:
+    given: dict[str, Any] = {
+        "method": "Markov model", "n_replicas": 32, "replica_ps": 375.0, "lag_ps": 1.0, "model_lag_ps": 10.0,
+        "timescales_ps": (900.0,), "timescale_errors_ps": (90.0,), "tests": "a Markov model", "holds": True,
+        "states": (state(), state(state="β")), "maps": {}, "missing": (), "weights": (),
+    }  # fmt: skip
+    return Answer(**(given | more))
 
 
-def test_md_s_answer_comes_first_and_short_replicas_tell_no_equivalent_time() -> None:
-    long = told("rollout", worth(), answer=answer("plain averages"))
-    assert long.headline.startswith("Equilibrium from MD. It agrees. 12 ns of held-out MD") and long.gain
-    assert long.converged and long.answer == "Equilibrium from MD." and long.on_surrogate == "It agrees."
-    short = told("rollout", worth(), answer=answer("Markov model"))
-    assert "No equivalent MD time" in short.headline and short.gain is None and not short.worth
-    assert not told("rollout", worth(), answer=answer("Markov model", missing=("ALA 2 β",))).converged
+def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_worth() -> None:
+    found = told("rollout", worth(), answer=answer())
+    assert found.in_short == (
+        "Use MD's answer.",
+        "For populations and free energies of 2 states, each to 1 % or better (one standard error), "
+        "and relaxation times.",
+        "Why: MD is 32 replicas of 380 ps, weighed by a Markov model; the slowest process takes 900 ps ± 90 ps.",
+    )
+    assert found.headline == " ".join(found.in_short) and found.converged
+    assert "16 replicas of 3.1 ns of the surrogate are worth 10 ns [8 ns, 12 ns]" in found.details
+    assert (
+        found.gain == pytest.approx(8_000.0 / (200.0 * 10.0))
+        and "speed-up at equal accuracy at least 4:" in found.details
+    )
+    simd = replace(CHEAP, replicas=32, by="SIMD")
+    assert "MD by SIMD, the fastest here, makes 32 replicas of 62 ps" in told("rollout", worth(), simd).details
+
+
+def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
+    found = told("rollout", None, answer=answer(holds=False))
+    assert found.in_short[0] == "Do not use MD's populations yet." and not found.converged
+    assert "has not converged" in found.in_short[2]
+    part = told("rollout", None, answer=answer(missing=("ALA 2 left-handed: not connected",)))
+    assert "but for what it did not connect" in part.in_short[0] and "ALA 2 left-handed" in part.in_short[1]
+    assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
+
+
+def test_a_longer_budget_is_named_only_where_its_replicas_outlast_what_is_slow() -> None:
+    short = told("rollout", None, of=SHORT)
+    assert "replicas of 3.8 ns or more would tell: a budget of about 10 min." in short.details
+    assert "12 ns" not in short.details, "the sum of many short replicas is no length"
+    unseen = told("rollout", None, of=replace_in(SHORT, needed_ps=None, remedy="starts spread over all states"))
+    assert "budget" not in unseen.details and "starts spread over all states" in unseen.details
+    assert "a budget of about 5 min would tell" in told("rollout", None).details, "replicas outlast it"
+
+
+def replace_in(found: Any, **more: Any) -> Any:
+    return SimpleNamespace(**(vars(found) | more))
+
+
+def test_the_lines_over_the_comparison_agree_with_md_s_answer() -> None:
+    judged = judgement(None, "different")
+    assert lines_of("md", judged, answer()) == answer_lines(answer())
+    assert lines_of("rollout", judged, answer())[0] == "Use the surrogate for populations."
+    wrong = answer(states=(state(surrogate=0.9), state(state="β")))
+    use, for_what, why = lines_of("rollout", judgement(None, "agrees"), wrong)
+    assert use == "Use MD's populations, not the surrogate's." and "1 of 2 states. Wrong: ALA 2 α." in for_what
+    assert "90 % instead of 50.0 ± 1.0 %" in why
+    assert lines_of("rollout", judged, answer(holds=False))[0].startswith("Not known yet")
+    assert lines_of("rollout", judgement(None, "broken"), answer())[0] == "Use it.", "the judge's own words"
 
 
 def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:
-    account = SimpleNamespace(wall_s=7.0)
-    comparison: Any = SimpleNamespace(judgements=(SimpleNamespace(account=account),))
-    spent = {"train": 100.0, "training md": 20.0, "rollout": 9.0, "held-out md": 10.0, "report": 50.0}
+    rolled = SimpleNamespace(wall_s=7.0)
+    comparison: Any = SimpleNamespace(judgements=(SimpleNamespace(account=rolled),))
+    spent = {"train": 120.0, "rollout": 9.0, "held-out md": 10.0, "report": 50.0}
     run = replace(record(), spent_in=spent)
-    assert costs_of(run, comparison, 1_000.0) == Costs(7.0, 120.0, RATES.md_ps_per_s, 600.0)
+    assert costs_of(run, comparison, 1_000.0) == Costs(7.0, 120.0, RATES.md_ps_per_s, 600.0, 2, "OpenMM")
     assert costs_of(run, comparison, 5_000.0).md_ps_per_s == 500.0, "MD came to more than was measured"
-    account.wall_s = None
+    rolled.wall_s = None
     assert costs_of(run, comparison, 1_000.0).rolling_s == 9.0
 
 
 def test_a_capped_worth_is_at_least_what_md_there_is() -> None:
     found = told("rollout", worth("at least", None, share=0.5))
-    assert "at least 10 ns" in found.headline
+    assert "at least 10 ns" in found.details
     assert found.gain == pytest.approx(10_000.0 / (200.0 * 5.0)), "by the part of the rollout that it takes"
 
 
@@ -149,16 +214,34 @@ def test_where_md_was_the_better_choice_it_is_said() -> None:
     dear = Costs(10.0, 90.0, 200.0, 60.0)
     found = told("potential", worth(), dear)
     assert found.gain == pytest.approx(0.4)
-    assert "MD was the better choice" in found.headline and "training included" in found.headline
+    assert "MD was the better choice" in found.details and "training included" in found.details
     unsure = told("potential", worth(high_ps=None), dear)
-    assert "no gain is shown" in unsure.headline, "its upper end is not known"
+    assert "no speed-up is shown" in unsure.details, "its upper end is not known"
     none = told("rollout", worth("less than", None))
     assert none.gain == 0.0
 
 
-def test_md_claims_no_gain_and_what_has_no_worth_says_so() -> None:
+def test_md_claims_no_speed_up() -> None:
     found = told("md", worth())
-    assert found.gain is None and "62 ns to use" in found.headline
-    assert found.headline.startswith("50 ns of MD in 16 replicas of 3.1 ns, and 12 ns of held-out MD")
-    untold = told("rollout", None).headline
-    assert "tell no worth" in untold and "a budget of about 5 min would tell" in untold
+    assert found.gain is None
+    assert found.details.startswith("16 replicas of 3.1 ns of MD, judged by 32 replicas of 380 ps: worth 10 ns")
+    assert "No equivalent MD time is told" in told("rollout", None).details
+
+
+def test_a_result_has_a_headline_files_and_a_picture(tmp_path: Path) -> None:
+    done = Outcome("Use it. For all. So.", "close", "so", 1.0, 2.0, in_short=("Use <it>.", "For all.", "So."))
+    write_run(tmp_path, replace(record(), outcome=done, held_out=("reference/held_out_r0.h5",)))
+    found = RunResult.of(tmp_path)
+    assert found.headline == "Use it. For all. So." and found["outcome"]["status"] == "close"
+    assert found.trajectory == [tmp_path / "trajectory/surrogate_r0.h5"]
+    assert found.md == [tmp_path / "reference/held_out_r0.h5"]
+    shown = found._repr_html_()
+    assert "<b>Use &lt;it&gt;.</b><br>For all.<br>So." in shown and "report.html" in shown
+    assert len(found.plot().axes) == 1 and not found.answer, "control"
+    maps = {"ALA 2": np.zeros((36, 36))}
+    (tmp_path / "equilibrium.json").write_text(json.dumps(answer(maps=maps).to_dict()))
+    axes = found.plot().axes
+    assert len(axes) == 3 and axes[1].get_title() == "ALA 2, kJ/mol"
+    assert [t.get_text() for t in axes[0].get_yticklabels()] == ["ALA 2 α", "ALA 2 β"]
+    write_run(tmp_path, replace(record(), outcome=None))
+    assert "not done" in RunResult.of(tmp_path).headline

@@ -264,7 +264,7 @@ def test_measuring_that_takes_the_budget_leaves_the_stages_the_least(monkeypatch
         one_scene._decide(record, None, None, RunOptions(budget_s=19.0), lambda: 0.0)  # type: ignore[arg-type]
     late = one_scene._decide(record, None, None, RunOptions(budget_s=60.0), lambda: 59.0)  # type: ignore[arg-type]
     assert late.decision is not None
-    assert 19.0 < sum(stage.seconds for stage in late.decision.stages) <= least_budget_s(OPENMM, "md")
+    assert 19.0 < sum(stage.seconds for stage in late.decision.stages) <= least_budget_s(OPENMM)
 
 
 def test_ctrl_c_in_each_stage_keeps_everything(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
