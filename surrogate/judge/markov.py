@@ -278,7 +278,7 @@ def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
         own = _timescales(matrix, stationary, model.lag)[0][: len(found)]
         found[: len(own)] = own
         times.append(found)
-    return np.array(populations), np.array(times).reshape(-1, len(model.times))
+    return np.array(populations), np.array(times).reshape(len(times), len(model.times))
 
 
 def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:

@@ -51,6 +51,8 @@ def outcome(
         said += _gain_words(worth, gain, costs)
     lines = judged.in_short if answer is None else answer_lines(answer)
     on_surrogate = answer.on_surrogate if answer else ""
+    if answer is not None and on_surrogate and not answer.holds:
+        on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
         headline=" ".join(lines),
         in_short=lines,
@@ -72,7 +74,7 @@ def answer_lines(answer: Answer) -> Lines:
     """Return whether to use MD's answer, for what, and why."""
     told = [s for s in answer.states if not s.missing]
     widest = max((s.error for s in told), default=0.0)
-    if not answer.holds:
+    if not answer.holds or (answer.missing and not answer.timescales_ps):
         use, for_what = "Do not use MD's populations yet.", f"They show which states there are: {len(answer.states)}."
     else:
         use = "Use MD's answer" + (", but for what it did not connect." if answer.missing else ".")
@@ -119,6 +121,8 @@ def _length(accounts: list[Account]) -> str:
 def _remedy(comparison: Comparison, costs: Costs) -> str:
     """Return what would tell more; a longer budget where its replicas outlast the slowest relaxation that was seen."""
     found, judged = comparison.convergence, comparison.judgements[0]
+    if found is not None and not found.converged and not found.n_replicas:
+        return f"MD that judges it is too short to be tested: {found.reasons[0]}."
     if found is not None and not found.converged:
         said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
         if found.needed_ps is None or found.needed_ps <= found.replica_ps:

@@ -126,3 +126,9 @@ def test_states_that_are_too_coarse_are_found_out() -> None:
 def test_nothing_to_count_is_one_line() -> None:
     with pytest.raises(InputError, match="longer replicas"):
         equilibrium([np.full(10, -1)])
+
+
+def test_replicas_that_never_change_their_state_tell_no_timescale() -> None:
+    micro = [np.full(80, k % 2, dtype=np.int64) for k in range(16)]
+    found = equilibrium(micro)
+    assert not len(found.timescales) and [u.fate for u in found.unconnected] == ["only begun in"]

@@ -38,7 +38,8 @@ OPTIONS = RunOptions(budget_s=600.0, weights=Path("mine.safetensors"))
 def record() -> RunRecord:
     return RunRecord(
         "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
-        RATES, decide(RATES, 600.0, "surrogate"), (StageEntry("rollout", "out of time", 9.0),), ("trajectory/surrogate_r0.h5",),
+        RATES, decide(RATES, 600.0, "surrogate"), (StageEntry("rollout", "out of time", 9.0),),
+        ("trajectory/surrogate_r0.h5",),
         outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
     )  # fmt: skip
 
@@ -102,7 +103,14 @@ def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth
 
 
 def convergence(**more: Any) -> Any:
-    given = {"converged": True, "verdict": "", "remedy": "", "needed_ps": None, "replica_ps": 375.0} | more
+    given = {
+        "converged": True,
+        "verdict": "",
+        "remedy": "",
+        "needed_ps": None,
+        "replica_ps": 375.0,
+        "n_replicas": 32,
+    } | more
     return SimpleNamespace(**given)
 
 
@@ -163,6 +171,9 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     found = told("rollout", None, answer=answer(holds=False))
     assert found.in_short[0] == "Do not use MD's populations yet." and not found.converged
     assert "has not converged" in found.in_short[2]
+    wrong = answer(holds=False, states=(state(surrogate=0.9),))
+    assert "differ" in wrong.on_surrogate and "differ" not in told("rollout", None, answer=wrong).details
+    assert "cannot say whether" in told("rollout", None, answer=wrong).on_surrogate
     part = told("rollout", None, answer=answer(missing=("ALA 2 left-handed: not connected",)))
     assert "but for what it did not connect" in part.in_short[0] and "ALA 2 left-handed" in part.in_short[1]
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
@@ -174,6 +185,8 @@ def test_a_longer_budget_is_named_only_where_its_replicas_outlast_what_is_slow()
     assert "12 ns" not in short.details, "the sum of many short replicas is no length"
     unseen = told("rollout", None, of=replace_in(SHORT, needed_ps=None, remedy="starts spread over all states"))
     assert "budget" not in unseen.details and "starts spread over all states" in unseen.details
+    none = replace_in(SHORT, n_replicas=0, reasons=("no replica has 16 frames",))
+    assert "too short to be tested: no replica has 16 frames." in told("rollout", None, of=none).details
     assert "a budget of about 5 min would tell" in told("rollout", None).details, "replicas outlast it"
 
 
