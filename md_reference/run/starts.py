@@ -6,7 +6,7 @@ bonds are those of the scene. All is a function of scene, forces, number and see
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -79,17 +79,21 @@ def many_starts(scene: Scene, conditions: Conditions, n: int, *, hot_ps: float =
     return Starts(_scenes(scene, frames), how + (", cooled" if scene.cell_nm is None else ", turned to in water"))
 
 
-def frames_as_starts(scene: Scene, conditions: Conditions, frames_nm: npt.NDArray[np.floating], n: int) -> Starts:
-    """Return starts from frames `(k, n_atoms, 3)` nm, k at least `n`: the first `n` that are the scene's molecule when
-    they are relaxed near where they are; fewer where fewer are, each then taken several times.
+def frames_as_starts(
+    scene: Scene, conditions: Conditions, frames_nm: Iterable[npt.NDArray[np.floating]], n: int
+) -> Starts:
+    """Return starts from frames, each `(n_atoms, 3)` nm, that may be drawn while they are taken: the first `n` that are
+    the scene's molecule when they are relaxed near where they are; fewer where fewer are, each then taken several
+    times.
 
     Raises SimulationError where none is.
     """
     found: list[FloatArray] = []
+    tried = 0
     geometry = geometry_from_scene(scene)
     system = build_system(scene, conditions.force)
     with Relaxer(scene, system, born=conditions.force.is_born) as relaxer:
-        for frame in frames_nm:
+        for tried, frame in enumerate(frames_nm, 1):  # noqa: B007
             stop_if_asked()
             try:
                 relaxed = relaxer.relax(np.asarray(frame, dtype=np.float64)).positions_nm
@@ -100,7 +104,7 @@ def frames_as_starts(scene: Scene, conditions: Conditions, frames_nm: npt.NDArra
             if len(found) == n:
                 break
     if not found:
-        raise SimulationError(f"none of {len(frames_nm)} frames of the rollout can be a start of MD")
+        raise SimulationError(f"none of {tried} frames of the rollout can be a start of MD")
     scenes = _scenes(scene, np.stack(found))
     return Starts(
         tuple(scenes[k % len(scenes)] for k in range(n)), f"{len(found)} starts: frames of the rollout, relaxed"

@@ -41,6 +41,7 @@ from surrogate.verbs.reference import settle_run
 from surrogate.verbs.run.run_record import RUN_NAME
 from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.stage_clock import Clock
+from systems.errors import OutOfDomainError, SurromdError
 from systems.source import prepare
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps, parse_time_ps
 
@@ -102,12 +103,20 @@ def spent(out: Path, name: str, budget_s: float, **how: Any) -> None:
     if is_there and RunResult.of(out)["outcome"]:
         return
     out.parent.mkdir(parents=True, exist_ok=True)
-    sm.run(MOLECULES[name], out, budget_s=budget_s, quiet=True, resume=is_there, **how)
+    if is_there and "weights" in how:
+        how["weights"] = RunResult.of(out)["settings"]["weights"]
+    try:
+        sm.run(MOLECULES[name], out, budget_s=budget_s, quiet=True, resume=is_there, **how)
+    except OutOfDomainError:
+        sm.run(MOLECULES[name], out, budget_s=budget_s, quiet=True, overwrite=True, **(how | {"weights": None}))
+    except SurromdError as error:  # its line of the table stays empty, and the next time it goes on
+        said(f"{out}: {error}")
 
 
 def rolled(place: Path, name: str, budget_s: float) -> None:
     """Roll for the whole budget with the weights that the run took; nothing where no weights cover the molecule."""
-    rolls = RunResult.of(place / "run")["rates"]["rolls"]
+    rates = RunResult.of(place / "run")["rates"]
+    rolls = rates["rolls"] if rates else None
     done = place / "rollout" / "done"
     if rolls is None or done.exists():
         return

@@ -7,7 +7,8 @@ import itertools
 import json
 import math
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -29,6 +30,9 @@ from systems.options import Preparation
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from md_reference.run.config import MDConfig
     from surrogate.judge.comparison import Comparison
     from surrogate.judge.md_answer import Answer
@@ -41,6 +45,8 @@ _LEAST_FRAMES = 20
 _LEFT_OUT_PS = 20.0
 # Of a potential's rollout goes into annealing, at most: what turns once in a ns would keep the state it was built in.
 _ANNEAL_PS, _ANNEAL = 50.0, 0.2
+# Of MD's time goes into relaxing frames of a rollout to begin at; in less, fewer replicas begin apart, but so many.
+_STARTING, _LEAST_STARTS = 0.15, 4
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
 # What a stage takes a third of its time, or ten seconds, to load when it is the first to.
@@ -167,10 +173,20 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
     if rolled is not None:
         with suppress(SimulationError):
             frames = frames_over_states(rolled, 2 * len(files), seed=site.options.seed)
-            return list(frames_as_starts(site.scene, config, frames, len(files)).scenes), config
+            in_time = _until(frames, _STARTING * decision.seconds("held-out md"))
+            return list(frames_as_starts(site.scene, config, in_time, len(files)).scenes), config
     # On one core, while the others wait.
     hot_ps = min(HOT_PS, 1.2 * config.equilibrate_ps / rates.cores)
     return list(many_starts(site.scene, config, len(files), hot_ps=hot_ps).scenes), config
+
+
+def _until(frames: npt.NDArray[np.float32], seconds: float) -> Iterator[npt.NDArray[np.float32]]:
+    """Yield frames until their time is up, but a few in any case."""
+    began = time.monotonic()
+    for k, frame in enumerate(frames):
+        if k >= _LEAST_STARTS and time.monotonic() - began > seconds:
+            return
+        yield frame
 
 
 def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
