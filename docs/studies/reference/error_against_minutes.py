@@ -92,7 +92,7 @@ def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float], weig
             place, budget_s = folder / name / f"{budget:g}min", 60.0 * budget
             spent(place / "run", name, budget_s, weights=weights)
             for way in ("one", "many"):
-                spent(place / way, name, budget_s, way="md", starts=way)
+                spent(place / way, name, budget_s, way="md", starts=way, weights=weights)
             rolled(place, name, budget_s)
             said(f"{name}: {budget:g} min")
 

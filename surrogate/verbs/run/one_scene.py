@@ -167,7 +167,7 @@ class _Run:
         there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
         may_take_s = seconds_of_first(self._pending, left_s)
         if name in MD_STAGES and there is None:  # without MD to judge by all else was in vain
-            may_take_s = max(may_take_s, LEAST_MD_S)
+            may_take_s = max(may_take_s, LEAST_MD_S * max(1.0, 0.5 * record.rates.stretch))
         if name == "report":  # it is made however long it takes, for the same reason
             may_take_s = math.inf
         if may_take_s <= RESTART_S * record.rates.stretch and there is not None and (name != "md" or there.held_out):
