@@ -161,7 +161,8 @@ class Comparison:
         residue; where there is no backbone, its torsions' histograms."""
         from surrogate.judge.report.overview import overview
 
-        return overview(self)
+        drawn = [(j.account.label, j.curves.ramachandran, j.curves.histograms) for j in self.judgements]
+        return overview(drawn, self.temperature_k)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""

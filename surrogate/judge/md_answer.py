@@ -89,17 +89,24 @@ class Answer:
     weights: tuple[FloatArray, ...]
 
     @property
-    def headline(self) -> str:
-        """One line: by what, how sure, and what is missing."""
-        length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
+    def in_short(self) -> tuple[str, str, str]:
+        """Three lines: whether to use it, for what and what is missing, why."""
+        told = [s for s in self.states if not s.missing]
+        if not self.holds or (self.missing and not self.timescales_ps):
+            use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
+        else:
+            widest = 100 * max((s.error for s in told), default=0.0)
+            use = "Use MD's answer" + (", but for what it did not connect." if self.missing else ".")
+            what = f"For populations and free energies of {len(told)} states, each to {widest:.2g} % or better"
+            what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
+        missing = f" Missing: {'; '.join(self.missing)}." if self.missing else ""
         slow = ""
         if self.timescales_ps:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
-            slow = f"; slowest process {format_time_ps(self.timescales_ps[0], 2)}{error}"
-        said = f"Equilibrium from MD, {length}, by {self.tests}{slow}."
-        if not self.holds:
-            said += " Not converged: longer replicas, or more, are needed before these numbers can be used."
-        return said + (f" Missing: {'; '.join(self.missing)}." if self.missing else "")
+            slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
+        length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
+        not_yet = "" if self.holds else " and has not converged"
+        return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
 
     @property
     def on_surrogate(self) -> str:
@@ -132,7 +139,12 @@ class Answer:
         found = {key: value for key, value in vars(self).items() if key not in ("weights", "states", "maps")}
         states = [vars(s) | {"differs": s.differs} for s in self.states]
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
-        own = {"headline": self.headline, "on_surrogate": self.on_surrogate, "states": states, "maps_kj_mol": maps}
+        own = {
+            "in_short": list(self.in_short),
+            "on_surrogate": self.on_surrogate,
+            "states": states,
+            "maps_kj_mol": maps,
+        }
         return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()} | own
 
     def table(self) -> list[tuple[str, str]]:

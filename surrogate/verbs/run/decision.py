@@ -122,7 +122,7 @@ def least_budget_s(rates: Rates) -> float:
 def _report_s(rates: Rates) -> tuple[float, float]:
     """Return the wall seconds that a report takes at all, and of a frame; it runs on one core."""
     at_all_s, of_atom_s, of_atom_frame_s = _READING_S
-    busy = max(1.0, rates.stretch * rates.alone)
+    busy = rates.stretch
     return busy * (at_all_s + of_atom_s * rates.n_atoms), busy * of_atom_frame_s * rates.n_atoms
 
 
@@ -229,16 +229,12 @@ def table(rates: Rates, decision: Decision, budget_s: float) -> list[tuple[str, 
         lines.append(("by rollout", f"{per_day(rolls.ps_per_s)}, {rolls.replicas} replicas of {rolls.weights}"))
     lines.append(("way", PLANS[decision.way].words))
     lines += [("because", reason) for reason in decision.why]
-    lines += [(stage.name, f"{format_wall(stage.seconds)}{_to_come(stage.name, decision, rates)}")
-              for stage in decision.stages]  # fmt: skip
+    for stage in decision.stages:
+        is_md = stage.name in MD_STAGES
+        to_come_ps = md_ps(rates, decision, stage.name) if is_md else decision.expected_rollout_ps
+        to_come = (
+            f", about {format_time_ps(to_come_ps, 2)}" if to_come_ps and (is_md or stage.name == "rollout") else ""
+        )
+        lines.append((stage.name, format_wall(stage.seconds) + to_come))
     lines.append(("in all", f"{format_wall(budget_s)}, frames every {format_time_ps(decision.save_every_ps)}"))
     return lines
-
-
-def _to_come(name: Stage, decision: Decision, rates: Rates) -> str:
-    """Return what a stage is expected to come to."""
-    if name in MD_STAGES:
-        return f", about {format_time_ps(md_ps(rates, decision, name), 2)}"
-    if name == "rollout" and decision.expected_rollout_ps:
-        return f", about {format_time_ps(decision.expected_rollout_ps, 2)}"
-    return ""

@@ -36,7 +36,7 @@ from surrogate.verbs.run.run_record import (
     write_run,
 )
 from surrogate.verbs.run.stage_clock import Clock
-from surrogate.verbs.run.stages import STAGES, Site, load_beside, md_options
+from surrogate.verbs.run.stages import STAGES, Site, md_options
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.errors import InputError, SimulationError, SurromdError
@@ -175,8 +175,6 @@ class _Run:
             return
         self.say(f"{name}: for {may_take_s:.0f} s" if name != "report" else name)
         self.kept.stage = name
-        if name in MD_STAGES:
-            load_beside(self._pending[1].name)
         try:
             done = self.clock.work(name, may_take_s, lambda: stage.work(self.site, record))
         except SurromdError as error:

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from surrogate.judge.rows.account import Account
     from surrogate.judge.worth import Worth
 
-Lines = tuple[str, str, str]
-
 
 @dataclass(frozen=True)
 class Costs:
@@ -49,7 +47,7 @@ def outcome(
     else:
         said = f"{rolled} of the surrogate are worth {worth.in_words()} of MD by its {worth.measure}; "
         said += _gain_words(worth, gain, costs)
-    lines = judged.in_short if answer is None else answer_lines(answer)
+    lines = judged.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
     if answer is not None and on_surrogate and not answer.holds:
         on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
@@ -63,40 +61,19 @@ def outcome(
         rolled_ps=judged.account.total_ps,
         worth=worth.in_words() if worth else "",
         gain=gain,
-        answer=answer.headline if answer else "",
         on_surrogate=on_surrogate,
         converged=answer.holds and not answer.missing if answer else False,
         notes=notes,
     )
 
 
-def answer_lines(answer: Answer) -> Lines:
-    """Return whether to use MD's answer, for what, and why."""
-    told = [s for s in answer.states if not s.missing]
-    widest = max((s.error for s in told), default=0.0)
-    if not answer.holds or (answer.missing and not answer.timescales_ps):
-        use, for_what = "Do not use MD's populations yet.", f"They show which states there are: {len(answer.states)}."
-    else:
-        use = "Use MD's answer" + (", but for what it did not connect." if answer.missing else ".")
-        for_what = f"For populations and free energies of {len(told)} states, each to {100 * widest:.2g} % or better"
-        for_what += " (one standard error)" + (", and relaxation times." if answer.timescales_ps else ".")
-    missing = f" Missing: {'; '.join(answer.missing)}." if answer.missing else ""
-    length = f"{answer.n_replicas} replicas of {format_time_ps(answer.replica_ps, 2)}"
-    slow = ""
-    if answer.timescales_ps:
-        error = f" ± {format_time_ps(answer.timescale_errors_ps[0], 2)}" if answer.timescale_errors_ps else ""
-        slow = f"; the slowest process takes {format_time_ps(answer.timescales_ps[0], 2)}{error}"
-    not_yet = "" if answer.holds else " and has not converged"
-    return use, for_what + missing, f"Why: MD is {length}, weighed by {answer.tests}{not_yet}{slow}."
-
-
-def lines_of(way: Way, judged: Judgement, answer: Answer | None) -> Lines:
+def lines_of(way: Way, judged: Judgement, answer: Answer | None) -> tuple[str, str, str]:
     """Return the three lines on top of the report, which say of the trajectory what MD's answer says: a comparison
     counts all frames of MD alike, and MD's transitions weigh them."""
     if answer is None or judged.status == "broken":
         return judged.in_short
     if way == "md":
-        return answer_lines(answer)
+        return answer.in_short
     told = [s for s in answer.states if s.surrogate is not None and not s.missing]
     off = [s for s in told if s.differs]
     if not answer.holds or not told:

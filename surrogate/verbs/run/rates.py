@@ -49,7 +49,7 @@ class Rolls:
 @dataclass(frozen=True)
 class Rates:
     """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
-    other work shares them; `alone`: what part of that a thread sees which runs by itself. `step_s`: processor seconds
+    other work shares them. `step_s`: processor seconds
     of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
     on this `platform`, `at_once` replicas on each core; `md`: in words; `dear`: it is quantum mechanics. `rolls`: of
     weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run
@@ -69,7 +69,6 @@ class Rates:
     platform: str = "auto"
     at_once: int = 1
     without_simd: str = ""
-    alone: float = 1.0
     in_water: bool = False
 
     @property
@@ -124,7 +123,6 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         coverage=coverage,
         rolls=None if weights is None else rollout_rate(scene, weights, config.temperature_k, stretch, cores),
         platform=by_openmm.platform,
-        alone=1.0 if cores == 1 else min(1.0, measured_stretch(1) / stretch),
     )
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
     return rates if rates.dear or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)

@@ -35,8 +35,8 @@ class StageEntry:
 @dataclass(frozen=True)
 class Outcome:
     """What came of a run. `in_short`: use MD's answer or not, for what, why, `headline`: the same in one line;
-    `details`: what the surrogate is worth, and what would tell more; `answer`: what MD says of equilibrium,
-    `on_surrogate`: what that says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of
+    `details`: what the surrogate is worth, and what would tell more; `on_surrogate`: what MD's answer says
+    of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of
     MD that judged, `rolled_ps` that was judged, replicas together; `worth` in words, `gain` over as much wall time of
     the fastest MD here as a lower bound, None where it cannot be told."""
 
@@ -47,7 +47,6 @@ class Outcome:
     rolled_ps: float
     worth: str = ""
     gain: float | None = None
-    answer: str = ""
     on_surrogate: str = ""
     converged: bool = False
     notes: tuple[str, ...] = ()

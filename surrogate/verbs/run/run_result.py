@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import json
-import math
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from surrogate.verbs.run.run_record import read_run
 from systems.files.outside import content
 from systems.files.schema import parsed
-from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from surrogate.judge.md_answer import Answer
-    from surrogate.judge.report.figures import Figure as Picture
-
 ANSWER_NAME, REPORT_NAME = "equilibrium.json", "report.html"
-_DRAWN = 6
 
 
 class RunResult(dict[str, Any]):
@@ -72,34 +64,9 @@ class RunResult(dict[str, Any]):
     def plot(self) -> Figure:
         """Return a matplotlib figure of the populations of all states by MD, with their errors, beside the
         surrogate's, and of the first residues' free energies over φ and ψ."""
-        from matplotlib.figure import Figure
+        from surrogate.judge.report.overview import answer_overview
 
-        answer = self.answer
-        maps = list(answer.get("maps_kj_mol", {}).items())[:_DRAWN]
-        states = [s for s in answer.get("states", []) if not s["missing"]]
-        figure = Figure(figsize=(4.0 * (1 + len(maps)), max(3.5, 0.22 * len(states))), layout="constrained")
-        bars, *others = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
-        rows = np.arange(len(states))
-        bars.barh(rows, [s["share"] for s in states], xerr=[s["error"] for s in states], color="0.75", label="MD")
-        rolled = [(k, s["surrogate"], s["surrogate_error"] or 0.0) for k, s in enumerate(states)
-                  if s["surrogate"] is not None]  # fmt: skip
-        if rolled:
-            at, share, error = zip(*rolled, strict=True)
-            bars.errorbar(share, at, xerr=error, fmt="o", color="C1", label="surrogate")
-        bars.set_yticks(rows, [f"{s['torsion']} {s['state']}" for s in states], fontsize=7)
-        bars.set_xlabel("population")
-        bars.set_title(self["molecule"], fontsize=9)
-        if states:
-            bars.invert_yaxis()
-            bars.legend(fontsize=8)
-        for axes, (label, energy) in zip(others, maps, strict=True):
-            values = np.array([[math.nan if x is None else x for x in row] for row in energy])
-            image = axes.imshow(
-                values.T, origin="lower", extent=(-180, 180, -180, 180), vmin=0, vmax=20, cmap="viridis_r"
-            )
-            axes.set(xlabel="φ / °", ylabel="ψ / °", title=f"{label}, kJ/mol")
-            figure.colorbar(image, ax=axes, shrink=0.7)
-        return figure
+        return answer_overview(self["molecule"], self.answer)
 
     def _repr_html_(self) -> str:
         """Return the three lines and where the report is, for a notebook."""
@@ -110,17 +77,3 @@ class RunResult(dict[str, Any]):
         said = "<br>".join(escape(line) for line in (*rest, outcome["details"]) if line)
         link = escape(str(self.report))
         return f'<p><b>{escape(first)}</b><br>{said}<br><a href="{link}">{link}</a></p>'
-
-
-def weighted_maps(answer: Answer, temperature_k: float) -> list[Picture]:
-    """Return the report's pictures of MD's answer: the free energy of each of the first residues over φ and ψ."""
-    from surrogate.judge.report import figures
-
-    rt_kj = GAS_CONSTANT_KJ_MOL_K * temperature_k
-    return [
-        figures.Figure(
-            figures.ramachandran(f"By MD's weights, {label}", np.exp(-energy / rt_kj), temperature_k),
-            f"{label}: free energy by MD's answer, all its frames weighted",
-        )
-        for label, energy in list(answer.maps.items())[:_DRAWN]
-    ]

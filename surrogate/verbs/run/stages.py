@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import json
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -22,7 +20,7 @@ from surrogate.verbs.run.decision import Decision, Stage, errors_in_words, expec
 from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
 from surrogate.verbs.run.rates import Rates, Rolls, rollout_rate
 from surrogate.verbs.run.run_record import RunRecord
-from surrogate.verbs.run.run_result import ANSWER_NAME, REPORT_NAME, weighted_maps
+from surrogate.verbs.run.run_result import ANSWER_NAME, REPORT_NAME
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
 from systems.files.whole_file import create_whole
@@ -49,11 +47,6 @@ _ANNEAL_PS, _ANNEAL = 50.0, 0.2
 _STARTING, _LEAST_STARTS = 0.15, 4
 # Runs of one scene whose seeds differ by this are independent, replicas and all.
 _SEEDS_APART = 10_000
-# What a stage takes a third of its time, or ten seconds, to load when it is the first to.
-_LOADED_BEFORE: dict[Stage, tuple[str, ...]] = {
-    "report": ("deeptime.decomposition", "matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "mdtraj"),
-    "train": ("torch", "lightning_fabric", "matplotlib.backends.backend_svg", "surrogate.models.lam_slide.trainer"),
-}
 # Of a run's report, where MD's frames have weights.
 UNWEIGHTED = (
     "This comparison counts all frames of held-out MD alike; the weights that MD's transitions give them are in the "
@@ -120,9 +113,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
         files[0].parent.mkdir(exist_ok=True)
 
         def heard(said: str | SimulationError) -> None:
-            if (
-                isinstance(said, SimulationError) and rates.at_once > 1
-            ):  # what is left of SIMD replicas is no reason to wait
+            if isinstance(said, SimulationError) and rates.at_once > 1:  # nothing to wait for
                 raise said
 
         with accounted_outputs(files):
@@ -323,6 +314,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
 
 
 def _report(site: Site, record: RunRecord) -> RunRecord:
+    from surrogate.judge.report.overview import weighted_maps
     from surrogate.judge.report.report import Foreword, write_report
 
     rates, decision = _rates_and_decision(record)
@@ -354,21 +346,10 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
             "\n".join(found.in_short),
             "States by MD, what the trajectory is worth, and how the budget was spent",
             [("worth", found.details), *lines, *(("note", note) for note in notes)],
-            [] if answer is None else weighted_maps(answer, comparison.temperature_k),
+            [] if answer is None else weighted_maps(answer.maps, comparison.temperature_k),
         ),
     )
     return replace(record, outcome=found)
-
-
-def load_beside(coming: Stage) -> None:
-    """Load the libraries of a stage that is to come, beside other work."""
-
-    def load() -> None:
-        with suppress(ImportError, RuntimeError):  # the stage says what is missing; or the program is at its end
-            for name in _LOADED_BEFORE.get(coming, ()):
-                importlib.import_module(name)
-
-    threading.Thread(target=load, name=f"libraries of {coming}").start()
 
 
 def _nothing(site: Site, record: RunRecord) -> RunRecord | None:

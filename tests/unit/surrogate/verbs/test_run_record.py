@@ -16,7 +16,7 @@ from surrogate.judge.md_answer import Answer, StateEnergy
 from surrogate.judge.worth import Worth
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import Way, decide
-from surrogate.verbs.run.outcome_words import Costs, answer_lines, lines_of, outcome
+from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
 from surrogate.verbs.run.rates import Rates, Rolls
 from surrogate.verbs.run.run_record import (
     Outcome,
@@ -40,7 +40,7 @@ def record() -> RunRecord:
         "smiles:CCO", "CCO", "C2H6O", "abc", settings_of_run(OPTIONS), {"openmm": "8"}, "now", 12.5, {"rollout": 9.0},
         RATES, decide(RATES, 600.0, "surrogate"), (StageEntry("rollout", "out of time", 9.0),),
         ("trajectory/surrogate_r0.h5",),
-        outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "MD.", "It does.", True, ("note",)),
+        outcome=Outcome("head", "close", "so", 10.0, 20.0, "at least 10 ns", None, "It does.", True, ("note",)),
     )  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def replace_in(found: Any, **more: Any) -> Any:
 
 def test_the_lines_over_the_comparison_agree_with_md_s_answer() -> None:
     judged = judgement(None, "different")
-    assert lines_of("md", judged, answer()) == answer_lines(answer())
+    assert lines_of("md", judged, answer()) == answer().in_short
     assert lines_of("rollout", judged, answer())[0] == "Use the surrogate for populations."
     wrong = answer(states=(state(surrogate=0.9), state(state="β")))
     use, for_what, why = lines_of("rollout", judgement(None, "agrees"), wrong)

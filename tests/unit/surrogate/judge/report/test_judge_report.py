@@ -21,6 +21,7 @@ from surrogate.judge.report import report, wording
 from surrogate.judge.report.cards import side_by_side
 from surrogate.judge.report.markdown import to_markdown
 from surrogate.judge.report.pictures import Album, albums
+from surrogate.judge.report.figures import Figure
 from surrogate.judge.report.report import Foreword, write_report
 from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
@@ -124,10 +125,11 @@ def test_verdict_stands_before_everything_else(written: tuple[str, dict[str, obj
 def test_a_foreword_stands_before_the_verdict(
     few_pictures: Comparison, written: tuple[str, dict[str, object]], tmp_path: Path
 ) -> None:
-    said = Foreword("worth <b>much</b>", "How", [("way", "MD & more")])
+    said = Foreword("worth <b>much</b>", "How", [("way", "MD & more")], [Figure("<svg></svg>", "By MD's <weights>")])
     files = write_report(few_pictures, tmp_path / "r.html", foreword=said)
     page = files.html.read_text("utf-8")
     assert page.index("worth &lt;b&gt;much&lt;/b&gt;") < page.index("MD &amp; more") < page.index('class="verdict')
+    assert page.index("By MD&#39;s &lt;weights&gt;") < page.index('class="verdict')
     assert "worth &lt;b>much" in files.markdown.read_text("utf-8")
     assert '<p class="foreword">' in page and '<p class="foreword">' not in written[0]
 
