@@ -250,8 +250,12 @@ def of_distribution(judged: dict[str, Any]) -> dict[str, Any] | None:
 
 def row(name: str, minutes: float, place: Path, truth: Truth) -> dict[str, Any]:
     """Return a line of the table; a way that was not gone has no error."""
-    line: dict[str, Any] = {"molecule": name, "minutes": minutes, "R-hat": round(truth.r_hat, 3),
-                            "reference's halves": round(truth.floor, 4)}  # fmt: skip
+    line: dict[str, Any] = {
+        "molecule": name,
+        "minutes": minutes,
+        "R-hat": round(truth.r_hat, 3) if math.isfinite(truth.r_hat) else None,
+        "reference's halves": round(truth.floor, 4),
+    }
     for way in WAYS:
         if way == "rollout":
             files = sorted((place / way).glob("rolled*.h5")) if (place / way / "done").exists() else []
@@ -264,7 +268,8 @@ def row(name: str, minutes: float, place: Path, truth: Truth) -> dict[str, Any]:
             continue
         angles = truth.of_files(files)
         line[f"{way}: distance"] = round(torsion_distance(truth.angles, angles, weights), 4)
-        line[f"{way}: kJ/mol"] = round(energy_error(truth.angles, angles, weights), 3)
+        error = energy_error(truth.angles, angles, weights)
+        line[f"{way}: kJ/mol"] = round(error, 3) if math.isfinite(error) else None
     if "run: distance" in line:
         result = RunResult.of(place / "run")
         held, total = intervals_held(result.answer, truth.answer)
@@ -303,7 +308,7 @@ def make_table(folder: Path, out: Path | None, figure: Path | None) -> None:
     for line in summary(rows):
         said(line)
     if out is not None:
-        out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", "utf-8")
+        out.write_text(json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n", "utf-8")
     if figure is not None:
         draw(rows, figure)
 
@@ -323,8 +328,10 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
     told = [r for r in rows if "verdict" in r]
     for word in ("right", "not converged", "wrong"):
         found.append(f"verdict {word}: {sum(r['verdict'] == word for r in told)} of {len(told)}")
+    sure = [r for r in told if r["verdict"] != "not converged"]
+    held, total = (sum(r[key] for r in sure) for key in ("intervals held", "of"))
     found.append(
-        f"intervals of populations that hold: {sum(r['intervals held'] for r in told)} of {sum(r['of'] for r in told)}"
+        f"intervals of populations that hold, of answers that are not told to be unconverged: {held} of {total}"
     )
     worths = [r["equivalent MD time held"] for r in told if r["equivalent MD time held"] is not None]
     found.append(f"intervals of equivalent MD time that hold: {sum(worths)} of {len(worths)}")

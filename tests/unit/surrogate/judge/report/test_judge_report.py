@@ -19,9 +19,9 @@ from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.report import report, wording
 from surrogate.judge.report.cards import side_by_side
+from surrogate.judge.report.figures import Figure
 from surrogate.judge.report.markdown import to_markdown
 from surrogate.judge.report.pictures import Album, albums
-from surrogate.judge.report.figures import Figure
 from surrogate.judge.report.report import Foreword, write_report
 from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError

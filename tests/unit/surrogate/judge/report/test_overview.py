@@ -18,7 +18,7 @@ def test_a_comparison_draws_reference_replicate_and_candidates(trio: tuple[Ensem
     titles = [a.get_title() for a in axes if a.get_title()]
     label = titles[0].partition(", ")[2]
     assert titles == [f"{name}, {label}" for name in ("reference", "replicate", rolled.label, other.label)]
-    images = [np.ma.filled(a.images[0].get_array(), -1.0) for a in axes if a.get_title()]
+    images = [np.ma.filled(np.ma.asarray(a.images[0].get_array()), -1.0) for a in axes if a.get_title()]
     assert not np.array_equal(images[0], images[2]) and np.array_equal(images[1], images[3]), (
         "the replicate is judged too"
     )
