@@ -89,10 +89,15 @@ class Answer:
     weights: tuple[FloatArray, ...]
 
     @property
+    def is_sure(self) -> bool:
+        """Whether its tests hold, and transitions connect more than one of the states that were visited."""
+        return self.holds and bool(self.timescales_ps or not self.missing)
+
+    @property
     def in_short(self) -> tuple[str, str, str]:
         """Three lines: whether to use it, for what and what is missing, why."""
         told = [s for s in self.states if not s.missing]
-        if not self.holds or (self.missing and not self.timescales_ps):
+        if not self.is_sure:
             use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
         else:
             widest = 100 * max((s.error for s in told), default=0.0)
@@ -105,7 +110,7 @@ class Answer:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
             slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
-        not_yet = "" if self.holds else " and has not converged"
+        not_yet = "" if self.is_sure else " and has not converged"
         return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
 
     @property

@@ -49,7 +49,7 @@ def outcome(
         said += _gain_words(worth, gain, costs)
     lines = judged.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
-    if answer is not None and on_surrogate and not answer.holds:
+    if answer is not None and on_surrogate and not answer.is_sure:
         on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
         headline=" ".join(lines),
@@ -76,7 +76,7 @@ def lines_of(way: Way, judged: Judgement, answer: Answer | None) -> tuple[str, s
         return answer.in_short
     told = [s for s in answer.states if s.surrogate is not None and not s.missing]
     off = [s for s in told if s.differs]
-    if not answer.holds or not told:
+    if not answer.is_sure or not told:
         use, for_what = "Not known yet whether the surrogate can be used.", "It found the states that MD began in."
         return use, for_what, "Why: MD that judges it has not converged."
     right = f"Right: populations of {len(told) - len(off)} of {len(told)} states."

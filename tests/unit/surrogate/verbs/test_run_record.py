@@ -174,6 +174,9 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     wrong = answer(holds=False, states=(state(surrogate=0.9),))
     assert "differ" in wrong.on_surrogate and "differ" not in told("rollout", None, answer=wrong).details
     assert "cannot say whether" in told("rollout", None, answer=wrong).on_surrogate
+    stuck = answer(timescales_ps=(), missing=("not connected: ALA 2 β",), states=(state(surrogate=0.9),))
+    assert "cannot say whether" in told("rollout", None, answer=stuck).details, "one state, and what was never left"
+    assert told("rollout", None, answer=stuck).in_short[0] == "Do not use MD's populations yet."
     part = told("rollout", None, answer=answer(missing=("ALA 2 left-handed: not connected",)))
     assert "but for what it did not connect" in part.in_short[0] and "ALA 2 left-handed" in part.in_short[1]
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
