@@ -42,7 +42,7 @@ from surrogate.verbs.run.run_record import RUN_NAME
 from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.stage_clock import Clock
 from systems.errors import OutOfDomainError, SurromdError
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps, parse_time_ps
 
 FloatArray = npt.NDArray[np.float64]

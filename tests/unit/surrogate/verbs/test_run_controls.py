@@ -24,8 +24,7 @@ from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.run.stages import Site
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
-from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 from systems.scene import Scene
 
 # φ and ψ in degrees, and what long MD in OBC2 has there: α and β by ψ, left-handed where φ is above zero.
