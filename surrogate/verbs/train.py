@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import weights_path
-from surrogate.models.registry import architecture, names
+from surrogate.models.architecture import architecture, names
 from surrogate.progress import progress_bar
 from surrogate.verbs.learn_molecule import learn_molecule
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
@@ -21,7 +21,7 @@ from systems.trajectory.claim import Claim
 
 if TYPE_CHECKING:
     from surrogate.data.references import References
-    from surrogate.training.trainer import Choice, Trainer, TrainingRequest
+    from surrogate.models.architecture import Choice, Trainer, TrainingRequest
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
-    `arch`: an installed architecture (`surrogate.models.registry.names`): lam-slide; lam-slide-peptides; painet or its
+    `arch`: an installed architecture (`models.architecture.names`): lam-slide; lam-slide-peptides; painet or its
     decoder alone, egnn, which learn from velocities (a reference made with `save_velocities=True` and natural hydrogen
     masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
     others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
@@ -114,7 +114,7 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
     Budget, seed and device belong to the command and are left out. Raises InputError, TrajectoryError.
     """
-    from surrogate.models.settings import toml_text
+    from surrogate.models.architecture import toml_text
 
     plan = _plan(references, options.validation, _asked(options, Path("explained.safetensors")), explained=True)
     head = "".join(f"# {line}\n" for line in plan.lines())
@@ -126,14 +126,17 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
-    from surrogate.training.trainer import TrainingRequest
+    from surrogate.models.architecture import TrainingRequest
 
     start, arch = options.start_from, options.arch
     file = None if start is None else weights_path(start)
-    if arch is None and file is not None:
-        from surrogate.data.weights import read_header
+    if file is not None:
+        from surrogate.models.weights import read_header
 
-        arch = read_header(file).arch
+        found = read_header(file).arch
+        arch = arch or found
+        if found != arch:
+            raise InputError(f"{file} holds {found}, not {arch}.")
     if arch is not None:
         architecture(arch)
     return TrainingRequest(
@@ -211,7 +214,7 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
     """Draw the curves and try the weights; say what they are good for."""
     curves = written.with_suffix(".csv")
     if curves.exists():
-        from surrogate.training.loss_curves import plot_curves
+        from surrogate.training.loop import plot_curves
 
         plot_curves(curves)
     if fitted:

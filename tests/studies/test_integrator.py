@@ -11,8 +11,8 @@ from integrator import IntegratorReport, angles, bonds, judge_integrator
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.baselines.model import Baseline, BaselineConfig
-from surrogate.models.interface import Chunk, Molecule
+from surrogate.models.baselines import Baseline, BaselineConfig
+from surrogate.models.propagator import Chunk, Molecule
 from systems.scene import Scene
 
 LAG_PS, STIFFNESS = 0.002, 20_000.0

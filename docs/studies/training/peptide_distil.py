@@ -12,9 +12,9 @@ from pathlib import Path
 
 from peptide_subset import training_sets
 
-from surrogate.data.weights import load_weights
 from surrogate.models.peptides.distil import distil
 from surrogate.models.peptides.trainer import PeptideTraining
+from surrogate.models.weights import load_weights
 from systems.units import parse_wall_s
 
 _LEARNING_RATE, _VALIDATE_S = 3e-4, 300.0

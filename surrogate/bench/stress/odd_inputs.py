@@ -24,7 +24,7 @@ from systems.source import prepare
 from systems.trajectory.topology_file import pdb_text
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 FloatArray = npt.NDArray[np.float64]
 NOISE_NM = (0.001, 0.003, 0.01, 0.03, 0.1)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.references import References
-from surrogate.data.weights import Weights, save_weights
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet, Structure
+from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig, Structure
+from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
 from surrogate.training.devices import is_first_process, wait_for_all
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of, training_domain
-from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
 from systems.errors import InputError
 
 
@@ -90,7 +88,7 @@ def train_painet(
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = model_class(model_config).to(device)
-    structure = model.structure(describe(model, frames.scene).to(device))
+    structure = model.structure(model.featurise(frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
     if start is not None:
@@ -242,3 +240,7 @@ class PainetTrainer(Trainer):
             )  # fmt: skip
 
         return Prepared(frames.scene.name, run)
+
+
+PAINET = Architecture("painet", PainetConfig.from_dict, Painet, partial(PainetTrainer, Painet))
+EGNN = Architecture("egnn", PainetConfig.from_dict, EgnnForecaster, partial(PainetTrainer, EgnnForecaster))

@@ -16,20 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.molecules import FrameSets
-from surrogate.data.weights import Weights, save_weights
+from surrogate.data.references import FrameSets
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.subjects import pick
+from surrogate.models.lam_slide.trainer import pick
 from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideFlow, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
+from surrogate.models.peptides.subjects import PeptideSubject
 from surrogate.models.peptides.torsion_states import told_states
 from surrogate.models.peptides.trainer import PeptideTraining, by_kind, disturbed
+from surrogate.models.weights import Weights, provenance_of, save_weights
 from surrogate.training.devices import is_first_process
 from surrogate.training.loop import StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of
 
 # Evaluations of the teacher: more of them end in the same distribution.
 _TEACHER_STEPS = 6

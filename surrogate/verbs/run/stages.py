@@ -186,7 +186,7 @@ def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
 
 
 def _train(site: Site, record: RunRecord) -> RunRecord:
-    from surrogate.sampling.choice import weights_to_go_on_from
+    from surrogate.sampling.domain import weights_to_go_on_from
 
     out = site.folder / WEIGHTS_NAME
     _, decision = _rates_and_decision(record)
@@ -232,7 +232,7 @@ def _trained(site: Site, record: RunRecord) -> RunRecord | None:
 
 def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
     """Return the record with the weights that were trained, and how fast they roll. Raises SimulationError."""
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     out = site.folder / WEIGHTS_NAME
     if not out.exists():

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from surrogate.data import equilibrium
-from surrogate.data.equilibrium import equilibrium_weights
+from surrogate.models.peptides.subjects import equilibrium_weights
 
 FloatArray = npt.NDArray[np.float64]
 # Four states on a circle, the last of them rare: entered hardly ever, left soon. Rows obey detailed balance.

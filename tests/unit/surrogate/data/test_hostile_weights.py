@@ -10,8 +10,8 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from surrogate.data.tensor_checksums import tensor_checksum
-from surrogate.data.weights import Weights, load_weights
+from surrogate.models.weights import Weights, load_weights
+from surrogate.training.loop import tensor_checksum
 from systems.errors import WeightsError
 
 

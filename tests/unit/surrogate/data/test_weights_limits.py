@@ -11,7 +11,7 @@ import torch
 from add_limits import add_limits
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
 from systems.trajectory.codec import open_writer
 

@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights
 from surrogate.models import precision
-from surrogate.models.precision import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.training.devices import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError
 from systems.scene import Scene
@@ -56,7 +56,7 @@ def test_a_processor_of_either_kind_is_told() -> None:
     assert "GFLOP/s" in here.describe()
     if here.unit and "ONEDNN_MAX_CPU_ISA" not in os.environ:
         assert choose_precision("auto").bf16, here
-        code = "from surrogate.models.precision import choose_precision as c; print(c('auto').name)"
+        code = "from surrogate.training.devices import choose_precision as c; print(c('auto').name)"
         held_back = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "PYTHONPATH": str(Path(__file__).parents[4])}
         said = subprocess.run([sys.executable, "-c", code], env=held_back, capture_output=True, text=True, check=True)
         assert said.stdout == "fp32\n"

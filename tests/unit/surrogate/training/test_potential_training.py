@@ -12,13 +12,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.painet.potential import trainer
-from surrogate.models.painet.potential.config import PotentialConfig
-from surrogate.models.painet.potential.covered import domain_of
-from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
+from surrogate.models.painet.potential.energy import PotentialConfig
+from surrogate.models.painet.potential.trainer import (
+    Learner,
+    PotentialTraining,
+    Samples,
+    domain_of,
+    learn_potential,
+    samples_path,
+)
+from surrogate.models.propagator import Molecule, draw_noise
+from surrogate.models.weights import load_weights
 from systems.chemistry.limits import Limits, check_limits
 from systems.chemistry.validity import DRIFT
 from systems.errors import InputError, SimulationError

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from surrogate.models.peptides import state_windows
-from surrogate.models.peptides.model import PeptideConfig
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.state_windows import StateWindows
+from surrogate.models.peptides.layout import PeptideConfig
+from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 
 _LENGTH = 400_000
 

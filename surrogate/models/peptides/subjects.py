@@ -1,8 +1,15 @@
-"""One peptide in training: its frames, how likely each is in equilibrium, and the windows drawn from them."""
+"""Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model.
+
+Runs seeded in rare states show these states too often. Forward windows need no weights, whatever they start from: a
+propagator is conditional. A window read backwards does: it starts where a run ended up, so that exits from a rare state
+become entries, and there would be as many of these as seeds. Weighted by how likely equilibrium is to be where the run
+came from, there are as many as detailed balance asks for (Wu et al., Proc. Natl. Acad. Sci. 113, E3221 (2016)).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,12 +18,104 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.equilibrium import equilibrium_weights
 from surrogate.data.frames import TrainingFrames
 from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.torsion_states import FIRST_OF_SIDE_CHAIN
+from surrogate.models.peptides.layout import PeptideConfig
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.torsion_states import FIRST_OF_SIDE_CHAIN, MOST_TORSIONS
 from systems.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_CELLS = 150
+_FRAMES_A_CELL = 30
+_CLUSTERED_FRAMES = 20_000
+_DIMENSIONS = 6
+# No frame counts more than so many average ones: a cell hardly visited would otherwise be drawn over and over.
+_LARGEST = 20.0
+# How many jumps between any two frames each run stands for, its beginning and its end; a frame's odds to take part grow
+# with this power of its place in its run.
+_JUMPS_A_RUN, _LATE = 2.0, 2
+_CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
+_CLUSTER_SEED = 1
+
+
+def equilibrium_weights(
+    runs: Sequence[FloatArray], lag_frames: int, *, states: IntArray | None = None, shares: FloatArray | None = None
+) -> FloatArray | None:
+    """Return a weight for each frame, of mean 1, in the order of the runs. None for runs too short for the lag.
+
+    `runs`: features `(n, k)` that tell slow states apart (cosines and sines of torsions), one array for each run.
+
+    Where hardly any run goes between two states, a Markov model would put all weight into one that by chance was
+    entered and not left. So each run is taken to begin and to end with a jump between any two frames, late frames
+    (relaxed ones) more likely: what transitions do not tell is left as the runs show it.
+
+    Where runs leave a rare state and none enters it, they do not tell how rare it is. What is known otherwise (from
+    metadynamics) is given by `states` (n_frames,), the state of each frame, and `shares` (n_states,), their
+    populations, which need no norm: within each state the Markov model weighs frames, between them the shares do.
+
+    TICA, k-means and the reversible maximum-likelihood model of transition counts (Trendelkamp-Schroer et al., J. Chem.
+    Phys. 143, 174101 (2015)) are deeptime's.
+    """
+    cells = _cells(runs, lag_frames)
+    if cells is None:
+        return None
+    weights = _of_cells(cells, lag_frames)[np.concatenate(cells)]
+    if states is not None and shares is not None:
+        total = np.bincount(states, weights=weights, minlength=len(shares))
+        weights = weights * (shares / np.maximum(total, 1e-12))[states]
+    weights = np.minimum(weights / weights.mean(), _LARGEST)
+    return np.asarray(weights / weights.mean(), dtype=np.float64)
+
+
+def _cells(runs: Sequence[FloatArray], lag_frames: int) -> list[npt.NDArray[np.int32]] | None:
+    """Return the cell of each frame of each run, by k-means in the slow subspace; None for too few frames."""
+    from deeptime.clustering import KMeans
+    from deeptime.decomposition import TICA
+
+    long_enough = [x for x in runs if len(x) > lag_frames]
+    if sum(len(x) - lag_frames for x in long_enough) < 2 * _FRAMES_A_CELL:
+        return None
+    covariance = TICA.covariance_estimator(lagtime=lag_frames)
+    for x in long_enough:
+        covariance.partial_fit((x[:-lag_frames], x[lag_frames:]))
+    slow = TICA(lagtime=lag_frames, dim=_DIMENSIONS, scaling="kinetic_map").fit_from_covariances(covariance)
+    projected = [np.ascontiguousarray(slow.fetch_model().transform(x)) for x in runs]
+    every = np.concatenate(projected)
+    n_cells = max(2, min(_CELLS, len(every) // _FRAMES_A_CELL))
+    sample = every[:: max(1, len(every) // _CLUSTERED_FRAMES)]
+    cells = KMeans(n_cells, max_iter=100, fixed_seed=_CLUSTER_SEED, n_jobs=1).fit(sample).fetch_model()
+    return [cells.transform(x, n_jobs=1).astype(np.int32) for x in projected]
+
+
+def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatArray:
+    """Return what a frame of each cell weighs `(n_cells,)`."""
+    from deeptime.markov import TransitionCountEstimator, TransitionCountModel
+    from deeptime.markov.msm import MaximumLikelihoodMSM
+    from deeptime.util.exceptions import NotConvergedWarning
+
+    counted = TransitionCountEstimator(lagtime=lag_frames, count_mode="sliding", sparse=False).fit(list(cells))
+    counts = np.asarray(counted.fetch_model().count_matrix, dtype=np.float64)
+    lateness = np.concatenate([(np.arange(1, len(x) + 1) / len(x)) ** _LATE for x in cells])
+    late = np.asarray(np.bincount(np.concatenate(cells), weights=lateness, minlength=len(counts)), dtype=np.float64)
+    # Transitions are counted once at each frame of the lag, and so are the jumps.
+    counts += _JUMPS_A_RUN * len(cells) * lag_frames * np.outer(late, late) / late.sum() ** 2
+    visited = np.flatnonzero(late > 0)
+    with warnings.catch_warnings():
+        # What is left to converge after so many iterations is nothing beside the scatter of counts.
+        warnings.simplefilter("ignore", NotConvergedWarning)
+        model = MaximumLikelihoodMSM(reversible=True, maxerr=_CONVERGED, maxiter=_MOST_ITERATIONS).fit(
+            TransitionCountModel(counts[np.ix_(visited, visited)])
+        )
+    n_frames = np.bincount(np.concatenate(cells), minlength=len(counts))
+    weights = np.zeros(len(counts))
+    weights[visited] = model.fetch_model().stationary_distribution / n_frames[visited]
+    return weights
+
+
+# One peptide in training: its frames, how likely each is in equilibrium, and the windows drawn from them.
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
 _EVEN_SHARE = 0.5
@@ -295,3 +394,74 @@ def _distinct(ahead: Tensor, longest: int) -> Tensor:
         found[:, k] = torch.maximum(found[:, k], found[:, k - 1] + 1)
     top = torch.arange(longest - found.shape[1] + 1, longest + 1)
     return torch.minimum(found, top)
+
+
+# Windows from which the odds of changes of states are learned: what is rare is drawn more often than it occurs.
+# What a torsion in a rare state does next may be learned from as many windows as there are: its odds are conditional on
+# the state that it starts from, however often windows start there. Changes that are rare themselves may be drawn more
+# often, too, if each then counts less in the loss, in proportion, and so may windows chosen for another torsion's sake:
+# the loss stays what it was, but no longer rests on the few batches that happen to hold such a change.
+
+_POOL = 16_384
+# Changes are to be in this share of the windows that could hold them; nothing is drawn more than so much too often.
+_SOUGHT, _MOST = 0.05, 50.0
+# Of all windows, those drawn so; the others are drawn evenly, so that none counts many times.
+_FOR_RARE = 0.6
+_POOL_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class StateWindows:
+    """Windows of one sequence: frames `idx` (n, 1 + t), `times_ps` (n, t), how likely each is drawn, summed up (n,),
+    and what it then counts for each torsion, `share` (n, n_residues, MOST_TORSIONS)."""
+
+    idx: Tensor
+    times_ps: Tensor
+    cumulative: Tensor
+    share: Tensor
+
+    @staticmethod
+    def of(subject: PeptideSubject, config: PeptideConfig) -> StateWindows:
+        """Return windows drawn as `PeptideSubject.windows` does, and their odds."""
+        idx, times = subject.windows(_POOL, config, torch.Generator().manual_seed(_POOL_SEED))
+        stated = subject.chain.stated
+        states = subject.states(idx)[..., stated.residue.cpu(), stated.slot.cpu()]
+        started = balanced_starts(states[:, 0])
+        odds = rare_changes(states) * started.max(dim=1).values
+        odds = 1.0 - _FOR_RARE + _FOR_RARE * odds / odds.mean()
+        share = torch.zeros(len(idx), stated.n_residues, MOST_TORSIONS)
+        share[:, stated.residue, stated.slot] = (odds.sum() / started.sum(0) * started / odds[:, None]).float()
+        return StateWindows(idx, times, odds.cumsum(0), share)
+
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Return frames `(n, 1 + t)`, times `(n, t)` ps and what each counts `(n, n_residues, MOST_TORSIONS)`."""
+        place = torch.rand(n, generator=generator, dtype=torch.float64) * self.cumulative[-1]
+        at = torch.searchsorted(self.cumulative, place, right=True).clamp(max=len(self.cumulative) - 1)
+        return self.idx[at], self.times_ps[at], self.share[at]
+
+
+def balanced_starts(first: Tensor) -> Tensor:
+    """States `(n, torsions)` that windows start from -> how much more often `(n, torsions)`, float64, each should be
+    drawn for the rarer states of a torsion to be as frequent as its others."""
+    odds = torch.ones(first.shape, dtype=torch.float64)
+    for k in range(first.shape[1]):
+        _, which, counts = first[:, k].unique(return_inverse=True, return_counts=True)
+        odds[:, k] = (len(first) / (len(counts) * counts.double()))[which]
+    return odds.clamp(1.0, _MOST)
+
+
+def rare_changes(states: Tensor) -> Tensor:
+    """States `(n, 1 + t, torsions)` of windows -> how much more often `(n,)`, float64, each should be drawn for the
+    rarest change from one state to another that it holds."""
+    found = torch.ones(len(states), dtype=torch.float64)
+    before, after = states[:, :-1], states[:, 1:]
+    n_states = int(states.max()) + 1 if states.numel() else 0
+    for one in range(n_states):
+        for other in range(n_states):
+            if one == other:
+                continue
+            held = ((before == one) & (after == other)).any(1)  # (n, torsions)
+            could = (before == one).any(1).sum(0)
+            wanted = (_SOUGHT * could / held.sum(0).clamp(min=1)).clamp(1.0, _MOST).double()
+            found = torch.maximum(found, torch.where(held, wanted, 1.0).max(1).values)
+    return found

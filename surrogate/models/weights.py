@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from surrogate.data.tensor_checksums import tensor_checksum
-from surrogate.models.interface import Surrogate
-from surrogate.models.registry import architecture
+from surrogate.data.frames import TrainingFrames
+from surrogate.models.architecture import architecture
+from surrogate.models.propagator import Propagator
+from surrogate.training.loop import tensor_checksum
+from systems.chemistry.limits import limits_from_frames
+from systems.chemistry.validity import geometry_from_frames
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
@@ -79,7 +85,7 @@ class TrainingDomain:
 class Weights:
     """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
 
-    model: Surrogate
+    model: Propagator
     domain: TrainingDomain
     provenance: dict[str, Any]
     hash: str
@@ -110,7 +116,7 @@ def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
 
 
 def save_weights(
-    path: str | Path, model: Surrogate, domain: TrainingDomain, provenance: dict[str, Any], *,
+    path: str | Path, model: Propagator, domain: TrainingDomain, provenance: dict[str, Any], *,
     half: bool = False,
 ) -> None:  # fmt: skip
     """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
@@ -201,3 +207,52 @@ def load_weights(path: str | Path) -> Weights:
         hash=hashlib.sha256(data).hexdigest()[:16],
         path=path,
     )
+
+
+# Training domain and provenance of weights: what they cover, when, where and from what they were made.
+
+
+def training_domain(
+    frames: TrainingFrames, *, stride: int = 1, strides: Sequence[int] = (), n_geometry_frames: int = 20_000
+) -> TrainingDomain:
+    """Return the domain of weights trained on every `stride`-th of `frames`; its checks are measured on evenly spaced
+    training frames. `strides`: those of a model that takes the lag, from 1 on, for each of which jumps are measured."""
+    picked = frames.spread_starts(n_geometry_frames, stride + 1)
+    positions = frames.positions_nm(picked)
+    geometry = geometry_from_frames(frames.scene, positions)
+    limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + stride))
+    jumps = []
+    for wide in strides:
+        picked = frames.spread_starts(n_geometry_frames, wide + 1)
+        found = limits_from_frames(frames.scene, frames.positions_nm(picked), frames.positions_nm(picked + wide))
+        jumps.append((frames.lag_ps * wide, found.jump_min_nm, found.jump_max_nm))
+    return TrainingDomain(frames.scene, frames.lag_ps * stride, frames.conditions, geometry.to_dict(), limits.to_dict(),
+                          tuple(jumps))  # fmt: skip
+
+
+def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weights | None = None) -> dict[str, Any]:
+    """Return when, where and from what weights were made. `origin`: of the frames trained on (`TrainingFrames.origin`);
+    `settings`: of the training; `start`: the weights that it began with, of whose trajectories those are told that are
+    not among `origin`'s."""
+    earlier = {}
+    if start is not None:
+        known = {source["sha256"] for source in origin.get("sources", ()) if "sha256" in source}
+        earlier = {"from": {"hash": start.hash, **_beside(start.provenance, known)}}
+    return {
+        **earlier,
+        "trained": datetime.now(UTC).isoformat(timespec="seconds"),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        **origin,
+        **settings,
+    }
+
+
+def _beside(record: dict[str, Any], known: set[str]) -> dict[str, Any]:
+    """Return what earlier weights say of themselves, and those that they began with, of trajectories those that are not
+    `known`."""
+    left = [source for source in record.get("sources", ()) if source.get("sha256") not in known]
+    found = {**record, "sources": left} if "sources" in record else dict(record)
+    if isinstance(record.get("from"), dict):
+        found["from"] = _beside(record["from"], known | {source["sha256"] for source in left if "sha256" in source})
+    return found

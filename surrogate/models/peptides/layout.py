@@ -1,18 +1,22 @@
-"""Peptides as residues with internal coordinates (`models.peptides.chains`), and the scale of these in references."""
+"""How a peptide's atoms follow from internal coordinates, residue by residue, and the scale of these in references."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from typing import Any
 
 import networkx as nx
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
-from surrogate.data.poses import fitted_atoms
+from surrogate.data.frames import fitted_atoms
+from surrogate.models.architecture import build
 from surrogate.models.peptides.chains import (
     FREE_ENDS,
     RIGID,
@@ -38,14 +42,57 @@ from surrogate.models.peptides.torsion_states import (
 from systems.chemistry.geometry import torsion
 from systems.chemistry.geometry_rules import CLASH_AT_MOST_NM
 from systems.chemistry.graph import backbone_torsions, bonded_graph, exclusions, ring_bonds
-from systems.errors import InputError
+from systems.chemistry.matching import match_atoms
+from systems.chemistry.residues import template_for
+from systems.errors import InputError, OutOfDomainError, PreparationError
+from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 
-if TYPE_CHECKING:
-    from surrogate.models.peptides.model import PeptideConfig
+# A peptide under the names and in the atom order of `systems.prepare.peptide`, whichever program wrote its file.
+
+# Forms of a residue that differ in hydrogens alone, the commonest at pH 7 first.
+_FORMS = {"HIS": ("HIE", "HID", "HIP"), "ASP": ("ASP", "ASH"), "GLU": ("GLU", "GLH"), "LYS": ("LYS", "LYN")}
+# Hydrogens of a whole peptide tell most forms apart; of what is left, so many are tried.
+_MOST_TRIED = 8
+
+
+def standard_peptide(scene: Scene) -> tuple[Scene, npt.NDArray[np.int64]]:
+    """Return the peptide as `build_peptide` makes it, at the positions of `scene`, and the order of its atoms.
+
+    Its atom k is atom `order[k]` of `scene`, `order` (n_atoms,). The sequence is read from the residues' names, those
+    of Amber, CHARMM and GROMACS included; atoms are matched by their bonds and handedness, so that their names and
+    order play no part. Raises InputError for a scene that is no single chain of the twenty amino acids between their
+    usual ends, or has another handedness than L.
+    """
+    names = [template.name if (template := template_for(name)) else name for name in scene.residue_names]
+    hydrogens = sum(element == "H" for element in scene.elements)
+    refusal = ""
+    for forms in list(product(*(_FORMS.get(name, (name,)) for name in names)))[:_MOST_TRIED]:
+        try:
+            built = build_peptide("-".join(forms))
+        except PreparationError as error:
+            refusal = refusal or str(error)
+            continue
+        if sum(element == "H" for element in built.elements) != hydrogens:
+            continue
+        try:
+            order = match_atoms(scene, built)
+        except OutOfDomainError as error:
+            refusal = str(error)
+            continue
+        return built.with_positions(scene.positions_nm[order]), order
+    raise InputError(
+        f"{scene.name} is no chain of standard residues with usual ends: {refusal or 'its hydrogens fit no usual form'}"
+    )
+
+
+# Peptides as residues with internal coordinates (`models.peptides.chains`), and the scale of these in references.
 
 # A length that varies by less, by rounding alone, is one that the reference holds rigid.
 RIGID_NM = 2e-4
+# Before the first residue, and after the last.
+ENDS = ("<", ">")
+_LAGS_PER_DECADE = 8
 _LENGTH, _ANGLE, _DIHEDRAL = "length", "angle", "dihedral"
 # Where the first residue's atoms are placed from: caps (ACE), then amino acids.
 _ROOTS = (("CH3", "C", "O"), ("N", "CA", "C"))
@@ -219,6 +266,65 @@ class _Builder:
         if away == 0:
             return self.names[atom]
         return f"{'CA' if self.names[atom] == 'CH3' else self.names[atom]}{away:+d}"
+
+
+@dataclass(frozen=True)
+class PeptideConfig:
+    """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
+    shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
+    to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
+    beside a stiff one. `usual_steps`, `usual_solver`: of rollouts; those that the flow was taught, if it was distilled.
+    Flow times are logit-normal, as elsewhere."""
+
+    width: int = 128
+    n_layers: int = 6
+    n_heads: int = 4
+    chunk_frames: int = 16
+    shortest_ps: float = 1.0
+    longest_ps: float = 1000.0
+    innovation: bool = True
+    conditioning_noise: float = 0.03
+    turning_weight: float = 4.0
+    usual_steps: int = 6
+    usual_solver: str = "gaussian"
+    tau_location: float = 0.5
+    tau_scale: float = 1.4
+    types: tuple[str, ...] = ()
+    scale: ChainScale | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> PeptideConfig:
+        """Raises InputError for an unknown key, naming the nearest."""
+        return build(PeptideConfig, record)
+
+    @property
+    def forgotten_ps(self) -> float:
+        """A time that stands for one at which nothing is left of the given frame."""
+        return 10.0 * self.longest_ps
+
+    @property
+    def lags_ps(self) -> Tensor:
+        """The times at which correlations are kept."""
+        decades = math.log10(self.longest_ps / self.shortest_ps)
+        n = max(2, round(_LAGS_PER_DECADE * decades) + 1)
+        return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
+
+    def places(self, residues: tuple[str, ...]) -> Tensor:
+        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after.
+
+        Raises InputError for a type that training did not see.
+        """
+        known = {name: k for k, name in enumerate((*ENDS, *self.types))}
+        for name in residues:
+            if name not in known:
+                raise InputError(
+                    f"residue {name} is none that these weights were trained on ({', '.join(self.types)})."
+                )
+        row = [known[name] for name in (ENDS[0], *residues, ENDS[1])]
+        return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
 
 
 def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
