@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import math
+import re
 import statistics
 import sys
 import time
@@ -13,13 +14,21 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from surrogate.training.devices import average_gradients, bf16_pays, keep_freed_memory, open_fabric
+from surrogate.training.devices import (
+    average_gradients,
+    bf16_pays,
+    is_first_process,
+    keep_freed_memory,
+    open_fabric,
+    wait_for_all,
+)
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -191,6 +200,8 @@ SEEDS_APART = 1_000_003
 # Matrices with fewer rows or columns are no business of Muon's.
 LEAST_MATRIX = 8
 
+# generator of a batch's random numbers -> loss, and its parts by name
+LossFn = Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]]
 # (stage, share of the budget done, latest metrics) -> None
 ProgressFn = Callable[[str, float, dict[str, float]], None]
 
@@ -279,7 +290,7 @@ class StagePlace:
 def run_stage(
     module: nn.Module,
     config: StageConfig,
-    loss_fn: Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]],
+    loss_fn: LossFn,
     validate_fn: Callable[[], dict[str, float]],
     place: StagePlace,
     *,
@@ -366,6 +377,60 @@ def run_stage(
             progress(config.name, config.share_done(step, spent_s), {})
     ema.copy_to(module)
     return spent_s
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training: the `module` that it trains, and `config`, `loss` and `validate` as `run_stage` takes
+    them. `saves`: weights are written at each validation, not after the last stage alone."""
+
+    module: nn.Module
+    config: StageConfig
+    loss: LossFn
+    validate: Callable[[], dict[str, float]]
+    saves: bool = True
+
+
+def train_stages(
+    stages: Iterable[Stage],
+    out: Path,
+    write: Callable[[list[float]], None],
+    *,
+    device: torch.device,
+    resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> None:
+    """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
+    done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
+
+    The next stage is asked for when one has ended, so that a generator may prepare it from what that has learned, and
+    do what is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each
+    stage so far. Of several processes the first alone writes. Raises SimulationError when a loss stops being finite.
+    """
+    log, spent_s = out.with_suffix(".csv"), list[float]()
+    own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
+
+    def forget(*more: Path) -> None:
+        if is_first_process():
+            for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
+                path.unlink(missing_ok=True)
+
+    if not resume:
+        forget(log)
+    for stage in stages:
+        save = partial(_write_with, write, list(spent_s)) if stage.saves else None
+        place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
+        spent_s.append(
+            run_stage(stage.module, stage.config, stage.loss, stage.validate, place, progress=progress, on_save=save)
+        )
+    if is_first_process():
+        write(spent_s)
+    forget()
+    wait_for_all()
+
+
+def _write_with(write: Callable[[list[float]], None], before_s: list[float], spent_s: float) -> None:
+    write([*before_s, spent_s])
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:

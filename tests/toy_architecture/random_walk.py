@@ -14,7 +14,7 @@ from surrogate.data.references import References
 from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest, build
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from surrogate.models.weights import provenance_of, save_weights, training_domain
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
+from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.scene import Scene
 
 
@@ -103,13 +103,13 @@ class WalkTrainer(Trainer):
         def start(advance: AdvanceFn) -> Path:
             stage = StageConfig("walk", training.batch, training.learning_rate, training.budget_s, training.steps,
                                 warmup_steps=1, seed=training.seed, bf16=False)  # fmt: skip
-            state = request.out.with_suffix(".walk.train.safetensors")
-            run_stage(model, stage, loss_fn, validate,
-                      StagePlace(state, request.out.with_suffix(".csv"), torch.device("cpu")),
-                      progress=lambda name, share, metrics: advance(name, share))  # fmt: skip
-            state.unlink()
-            provenance = provenance_of(frames.origin, {"seed": training.seed})
-            save_weights(request.out, model, training_domain(frames), provenance)
+
+            def write(spent_s: list[float]) -> None:
+                provenance = provenance_of(frames.origin, {"seed": training.seed})
+                save_weights(request.out, model, training_domain(frames), provenance)
+
+            train_stages([Stage(model, stage, loss_fn, validate)], request.out, write, device=torch.device("cpu"),
+                         progress=lambda name, share, metrics: advance(name, share), resume=request.resume)  # fmt: skip
             return request.out
 
         return Prepared(frames.scene.name, start)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,8 +35,8 @@ from surrogate.models.lam_slide.network import (
 )
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
-from surrogate.training.devices import bf16_pays, is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
+from surrogate.training.devices import bf16_pays
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import whole_steps
 
@@ -249,7 +248,6 @@ class TrainingConfig:
     bf16: bool = True
     device: str = "cpu"
     validate_every_s: float = 60.0
-    snapshot_every_s: float | None = None
     # Compile stage two's network and the decoder; needs a C++ compiler on the machine.
     compile: bool = False
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
@@ -298,34 +296,27 @@ def train_lam_slide(
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
     subject = Subject.of(frames, model)
-    log_path = out.with_suffix(".csv")
-    states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
-    if not resume and is_first_process():
-        for path in (*states, log_path):
-            path.unlink(missing_ok=True)
-    places = [StagePlace(state, log_path, device, resume) for state in states]
     shown = _Shown(model, subject, strides)
     one, two = config.stages(with_autoencoder=start is None)
-    spent_one = 0.0
-    if start is None:
-        spent_one = _stage_one(shown, one, places[0], progress)
-        normalise_latents(model, subject, config.seed)
-    else:
+    if start is not None:
         _check_start(start, frames, model_config)
         model.load_state_dict(start.model.state_dict())
     domain = training_domain(frames, strides=strides if len(strides) > 1 else ())
     origin = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
 
-    def write(spent_s: float) -> None:
-        settings = _told(config) | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
+    def stages() -> Iterator[Stage]:
+        if start is None:
+            yield _stage_one(shown, one)
+            normalise_latents(model, subject, config.seed)
+        yield _stage_two(shown, config, two)
+
+    def write(spent_s: list[float]) -> None:
+        spent_one, spent_two = [0.0, *spent_s][-2:]
+        settings = {"seed": config.seed, "time_reversal": config.time_reversal, "stage_one_s": round(spent_one, 1),
+                    "stage_two_s": round(spent_two, 1)}  # fmt: skip
         save_weights(out, model, domain, provenance_of(origin, settings, start))
 
-    spent_two = _stage_two(shown, config, two, places[1], progress, write)
-    if is_first_process():
-        write(spent_two)
-        for path in states:
-            path.unlink(missing_ok=True)
-    wait_for_all()
+    train_stages(stages(), out, write, device=device, resume=resume, progress=progress)
     return out
 
 
@@ -368,7 +359,7 @@ class _Shown:
     strides: tuple[int, ...]
 
 
-def _stage_one(shown: _Shown, stage: StageConfig, place: StagePlace, progress: ProgressFn | None) -> float:
+def _stage_one(shown: _Shown, stage: StageConfig) -> Stage:
     model, subject = shown.model, shown.subject
     own = subject.frames.window_starts(1, validation=False)
 
@@ -381,7 +372,7 @@ def _stage_one(shown: _Shown, stage: StageConfig, place: StagePlace, progress: P
     def validate() -> dict[str, float]:
         return {"validation_rmsd_nm": subject.reconstruction_error_nm(model)}
 
-    return run_stage(model.autoencoder, stage, loss_fn, validate, place, progress=progress)
+    return Stage(model.autoencoder, stage, loss_fn, validate, saves=False)
 
 
 def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
@@ -396,10 +387,7 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
     return torch.where(backwards, idx.flip(1), idx)
 
 
-def _stage_two(
-    shown: _Shown, config: TrainingConfig, stage: StageConfig, place: StagePlace, progress: ProgressFn | None,
-    write: Callable[[float], None],
-) -> float:  # fmt: skip
+def _stage_two(shown: _Shown, config: TrainingConfig, stage: StageConfig) -> Stage:
     model, subject, strides = shown.model, shown.subject, shown.strides
     length, device = model.config.approximator.chunk_frames, model.latent_mean.device
     if len(strides) > 1:
@@ -442,16 +430,7 @@ def _stage_two(
             _, terms = loss_of(held, held_stride, tau, generator)
         return {f"validation_{key}": float(value) for key, value in terms.items()}
 
-    next_snapshot = [config.snapshot_every_s or float("inf")]
-
-    def on_save(spent_s: float) -> None:
-        write(spent_s)
-        if spent_s >= next_snapshot[0]:
-            out = place.state.with_name(place.state.name.replace(".flow.train.safetensors", ".safetensors"))
-            shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
-            next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
-
-    return run_stage(model.approximator, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
+    return Stage(model.approximator, stage, loss_fn, validate)
 
 
 def _held_windows(subject: Subject, length: int, strides: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
@@ -474,14 +453,6 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
         raise InputError(f"{name} was trained on {of.scene.name}, not on {frames.scene.name} in this atom order.")
     if not np.isclose(of.lag_ps, frames.lag_ps, rtol=1e-4):
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
-
-
-def _told(config: TrainingConfig) -> dict[str, Any]:
-    """Return what the weights' provenance says of the settings."""
-    return {
-        "seed": config.seed,
-        "time_reversal": config.time_reversal,
-    }
 
 
 # LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training.

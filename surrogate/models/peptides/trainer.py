@@ -10,7 +10,7 @@ residue's type and of its neighbours', to where this holds in the mean over the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -55,8 +55,7 @@ from surrogate.models.peptides.torsion_states import (
     told_states,
 )
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
-from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
 # Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
@@ -295,30 +294,18 @@ def train_peptides(
     several = len({f.scene.topology_hash for f in sets}) > 1
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=several)
 
-    def write(*spent_s: float) -> None:
+    def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
-    log = out.with_suffix(".csv")
-    states = [out.with_name(f"{out.stem}.{stage.name}.train.safetensors") for stage in stages]
-    if not resume and is_first_process():
-        for path in (*states, log):
-            path.unlink(missing_ok=True)
-    spent_s = 0.0
-    parts = ((model.flow, flow_loss), (model.jumps, jumps_loss))
-    for stage, (trained, loss_fn), state in zip(stages, parts, states, strict=True):
-        place = StagePlace(state, log, device, resume)
-        spent_s += run_stage(
-            trained, stage, loss_fn, partial(validate, stage), place, progress=progress, on_save=partial(write, spent_s)
-        )
-    balance_entries(model, subjects)
-    if is_first_process():
-        write(spent_s)
-        for path in states:
-            path.unlink(missing_ok=True)
-    wait_for_all()
+    def in_turn() -> Iterator[Stage]:
+        for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
+            yield Stage(trained, stage, loss_fn, partial(validate, stage))
+        balance_entries(model, subjects)
+
+    train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
 
 

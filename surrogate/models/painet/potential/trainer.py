@@ -22,12 +22,12 @@ from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
 from surrogate.training.devices import StepThreads, torch_threads
 from surrogate.training.loop import (
     ProgressFn,
+    Stage,
     StageConfig,
-    StagePlace,
     append_row,
     read_curves,
-    run_stage,
     tensor_checksum,
+    train_stages,
 )
 from systems.chemistry.graph import turn_torsions
 from systems.chemistry.limits import WIDENING, limits_from_frames
@@ -426,10 +426,8 @@ def learn_potential(
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
-    log, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.potential.train.safetensors")
     if not resume:
-        for path in (log, state, samples_path(out)):
-            path.unlink(missing_ok=True)
+        samples_path(out).unlink(missing_ok=True)
     # Frames change least in the own bath, with bonds as rigid as rollouts have them, and most when hot.
     moving = [
         truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed, constrain_hydrogens=rigid)
@@ -449,18 +447,18 @@ def learn_potential(
         if progress is not None:
             progress(_line(learner), share, metrics)
 
-    place = StagePlace(state, log, torch.device("cpu"), resume)
+    def write(spent_s: list[float]) -> None:
+        domain = domain_of(truth.scene, learner.samples, moving, model_config)
+        # No MD of the truth was made: what it answered is the reference.
+        origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
+        found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in learner.errors().items()}
+        settings = {"seed": config.seed, "training_s": round(sum(spent_s), 1), **found}
+        save_weights(out, model.eval(), domain, provenance_of(origin, settings))
+
     learner.begin(budget_s)
+    stages = [Stage(model, stage, learner.loss, learner.errors, saves=False)]
     with torch_threads(1):
-        spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
-    errors = learner.errors()
-    domain = domain_of(truth.scene, learner.samples, moving, model_config)
-    # No MD of the truth was made: what it answered is the reference.
-    origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
-    found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in errors.items()}
-    settings = {"seed": config.seed, "training_s": round(spent, 1), **found}
-    save_weights(out, model.eval(), domain, provenance_of(origin, settings))
-    state.unlink(missing_ok=True)
+        train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
     return out
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from peptide_distil import distil
 
 from small_scenes import with_phi_turned
 from surrogate.bench.cost_error.effective_samples import training_cost
@@ -16,7 +17,6 @@ from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
 from surrogate.models.peptides import peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.distil import distil
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
