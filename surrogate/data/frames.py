@@ -469,7 +469,7 @@ def at_rest(vectors: npt.NDArray[Any], masses_da: npt.NDArray[Any]) -> npt.NDArr
 
 def canonicalise(frames_nm: npt.NDArray[Any], template: Scene) -> npt.NDArray[Any]:
     """Superpose frames on the centred template by heavy atoms; all atoms where fewer than three are heavy."""
-    idx = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+    idx = fitted_atoms(template)
     target = template.positions_nm - template.positions_nm[idx].mean(axis=0)
     return superpose(frames_nm, target, idx=idx)
 

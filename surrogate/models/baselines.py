@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames
+from surrogate.data.frames import TrainingFrames, fitted_atoms
 from surrogate.data.references import References
 from surrogate.models.architecture import Architecture, Prepared, Settings, Trainer, TrainingRequest, build
 from surrogate.models.propagator import Chunk, Molecule, Propagator
@@ -320,7 +320,7 @@ def fit_markov_state_model(frames: TrainingFrames, n_new: int, rng: np.random.Ge
 
     scene = frames.scene
     starts = frames.window_starts(1, validation=False)
-    heavy = scene.heavy_idx if len(scene.heavy_idx) >= 3 else np.arange(scene.n_atoms)
+    heavy = fitted_atoms(scene)
     features = frames.positions_nm(starts)[:, heavy].reshape(len(starts), -1)
     n_states = max(1, min(N_STATES, len(starts) // 20))
     sample = features[np.sort(rng.permutation(len(features))[:20_000])]

@@ -39,7 +39,7 @@ class TrainingDomain:
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
-    `transferable`: other peptides of such residues are covered too (sampling.peptide_coverage).
+    `transferable`: other peptides of such residues are covered too (`sampling.domain`).
     """
 
     scene: Scene

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from surrogate.data.frames import fitted_atoms
 from surrogate.models.lean import with_compiled_parts, with_lean_parts
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Propagator, draw_noise
@@ -70,7 +71,7 @@ class ChunkSampler:
         self._compiled = with_compiled_parts(plain) if compile else None
         self._compiled_rows: int | None = None
         self._molecule = model.featurise(template)
-        self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+        self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
     @property

@@ -1,4 +1,4 @@
-"""Coverage of a scene by a training domain, and the ways in which one leaves it."""
+"""Comparison of a scene with the training domain of weights, before anything is computed."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from surrogate.models.potential import Potential
     from surrogate.models.propagator import Propagator
 from surrogate.models.weights import TrainingDomain, Weights
+
+# Coverage of a scene by a training domain, and the ways in which one leaves it.
 
 
 @dataclass(frozen=True)
@@ -223,8 +225,6 @@ def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
         weights, model=weights.model.at_lag(lag_ps), domain=replace(domain, lag_ps=lag_ps, limits=limits, jumps=())
     )
 
-
-# Comparison of a scene with the training domain of weights, before anything is computed.
 
 __all__ = [
     "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain",

@@ -1,4 +1,14 @@
-"""Guard of a rollout: checks every frame as it is made, before it is written or conditions the next chunk."""
+"""Chunks that can be trusted: drawn, checked, and helped where a guard catches a frame.
+
+flag: caught frames are marked. resample: from the first caught frame on, the chunk is drawn again with another seed,
+from the last valid frame; after four draws, from where the chunk began. repair: OpenMM restores bond lengths and
+relaxes caught frames under restraints; what is not valid then is drawn again. fallback: real MD runs from the last
+valid frame to the end of the chunk, and the surrogate takes over again.
+
+A model that has got no chunk through yet, gives one without a frame that passes, and another in a second draw, is not
+unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken
+(validity.INVALID) or stands still, and where, after some chunks or at its end, it has not got one through.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +44,7 @@ from systems.errors import SimulationError
 if TYPE_CHECKING:
     from surrogate.models.weights import TrainingDomain
 
+# Guard of a rollout: checks every frame as it is made, before it is written or conditions the next chunk.
 
 FloatArray = npt.NDArray[np.floating[Any]]
 Flags = npt.NDArray[np.uint16]
@@ -174,16 +185,6 @@ class Clock:
             self.seconds[what] = self.seconds.get(what, 0.0) + perf_counter() - started
 
 
-# Chunks that can be trusted: drawn, checked, and helped where a guard catches a frame.
-# flag: caught frames are marked. resample: from the first caught frame on, the chunk is drawn again with another seed,
-# from the last valid frame; after four draws, from where the chunk began. repair: OpenMM restores bond lengths and
-# relaxes caught frames under restraints; what is not valid then is drawn again. fallback: real MD runs from the last
-# valid frame to the end of the chunk, and the surrogate takes over again.
-# A model that has got no chunk through yet, gives one without a frame that passes, and another in a second draw, is not
-# unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops at a chunk whose every frame is broken
-# (validity.INVALID) or stands still, and where, after some chunks or at its end, it has not got one through.
-
-
 MOST_DRAWS = 8
 _DRAWS_FROM_LAST_VALID = 4
 MOST_MD_IN_A_ROW = 10
@@ -198,7 +199,7 @@ _WRONG_SHARE = 0.1
 
 @dataclass(eq=False)
 class Chunk:
-    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`account.MARKS`) and, where they were
+    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`MARKS`) and, where they were
     computed, what the energy check found in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
     that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
 

@@ -1,4 +1,4 @@
-"""Plan of a rollout: everything that is settled before the first chunk."""
+"""Rollouts in chunks to any length: replicas in one batch, frames checked as they are made, streamed, resumable."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ from systems.units import format_time_ps, whole_steps
 if TYPE_CHECKING:
     from surrogate.models.weights import Weights
 
+# Plan of a rollout: everything that is settled before the first chunk.
 
 # Farther from the origin float32 coordinates are too coarse for a molecule; frames are then written about it.
 _FAR_NM = 1000.0
@@ -291,8 +292,6 @@ def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path])
     return f"replica {row}, {at}: {reason}; {advice}"
 
 
-# Rollouts in chunks to any length: replicas in one batch, frames checked as they are made, streamed, resumable.
-
 __all__ = ["GUARDS", "RolloutConfig", "rollout"]
 
 # Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
@@ -320,7 +319,7 @@ def rollout(
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
     marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.limits) against the
-    training reference, and what was done about it (column `intervention`, `account.MARKS`); the record's
+    training reference, and what was done about it (column `intervention`, `interventions.MARKS`); the record's
     `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
     replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
     and SIGTERM stop between two chunks, with everything on disk: KeyboardInterrupt. Memory that does not suffice for

@@ -14,6 +14,7 @@ import torch
 
 from surrogate.bench.rolling import Roller
 from surrogate.bench.stress.frame_statistics import measure_bonds, measure_validity
+from surrogate.data.frames import fitted_atoms
 from surrogate.models.lean import with_compiled_parts
 from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
@@ -210,7 +211,7 @@ class _Inputs:
     def __init__(self, weights: Weights, rows: int, seed: int) -> None:
         template = weights.domain.scene
         self._molecule = weights.model.featurise(template)
-        fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+        fit = fitted_atoms(template)
         start = template.positions_nm - template.positions_nm[fit].mean(axis=0)
         model = weights.model
         self._last = torch.from_numpy(start).expand(rows, model.n_conditioning, -1, -1)

@@ -1,4 +1,4 @@
-"""The two stages' losses: reconstruction (stage one) and data-prediction flow matching (stage two)."""
+"""Train LaM-SLidE: stage one (autoencoder), then stage two (latent flow) on the frozen encoder's latents."""
 
 from __future__ import annotations
 
@@ -39,6 +39,8 @@ from surrogate.training.devices import bf16_pays
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import whole_steps
+
+# The two stages' losses: reconstruction (stage one) and data-prediction flow matching (stage two).
 
 # The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
 TAU_MAX = 0.995
@@ -224,8 +226,6 @@ def normalise_latents(model: LamSlide, subject: Subject, seed: int, n_frames: in
     model.latent_mean.copy_(z.mean(0))
     model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
 
-
-# Train LaM-SLidE: stage one (autoencoder), then stage two (latent flow) on the frozen encoder's latents.
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
 LATENT_CACHE_BYTES = 2_000_000_000

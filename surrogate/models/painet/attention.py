@@ -1,4 +1,9 @@
-"""Types of atoms derived from their bonded surroundings, in rounds of message passing."""
+"""Energy-descent all-pair attention with type matrices, dense and factored; the energy that it descends.
+
+With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
+phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
+with these weights is a descent step of `pair_energy`.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from surrogate.models.propagator import Molecule
+
+# Types of atoms derived from their bonded surroundings, in rounds of message passing.
 
 
 class Surroundings(nn.ModuleList):
@@ -108,11 +115,6 @@ def molecular_pairs(molecule: Molecule, *, all_pairs: bool) -> Pairs:
         signed, ends = signed.to(device), ends.to(device)
     return Pairs(pairs[:, 0].to(device), pairs[:, 1].to(device), shells.to(device), n_near, signed, ends)
 
-
-# Energy-descent all-pair attention with type matrices, dense and factored; the energy that it descends.
-# With rho_ij(s) = a_ij s - b_ij s^2 and embeddings of unit length, rho'(|h_i - h_j|^2) = phi_ij + psi_ij h_i.h_j, where
-# phi = a - 4 b and psi = 4 b (papers/PAINET, "Particle-type Adaptive Mapping"). The attention's mean over all particles
-# with these weights is a descent step of `pair_energy`.
 
 # Index lists of each type's atoms: what the factored form sums over.
 TypeGroups = list[Tensor]

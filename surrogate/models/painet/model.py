@@ -1,4 +1,4 @@
-"""PAINET's settings."""
+"""PAINET: latent steps of energy-descent attention, one per future frame, decoded in parallel by one EGNN."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K
 if TYPE_CHECKING:
     pass
 
+# PAINET's settings.
+
 
 @dataclass(frozen=True)
 class PainetConfig:
@@ -41,8 +43,8 @@ class PainetConfig:
     predicted frames, `temperature_k` and `friction_per_ps` of the bath that refreshes velocities between chunks; a
     training takes the three from its reference.
 
-    Ours: `n_modes` modes of motion over the whole molecule beside attention and decoder (`painet.modes`), 0 for none;
-    `free_rotation` takes the rotation of the whole out of what is learned (`painet.rotation`).
+    Ours: `n_modes` modes of motion over the whole molecule beside attention and decoder (`Modes`), 0 for none;
+    `free_rotation` takes the rotation of the whole out of what is learned.
 
     `decoder` 'egnn' (the paper's) or 'leapfrog' (ours: layers are steps of an integrator whose forces keep momentum,
     angular momentum and depend on positions alone), with `n_radial` functions of the distance per shell of pairs and
@@ -103,8 +105,6 @@ class PainetConfig:
         """Raises InputError for an unknown key, naming the nearest."""
         return build(PainetConfig, record)
 
-
-# PAINET: latent steps of energy-descent attention, one per future frame, decoded in parallel by one EGNN.
 
 # Atomic numbers up to xenon; 0 is a particle of a model system.
 N_TYPES = 55

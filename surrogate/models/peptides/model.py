@@ -1,14 +1,21 @@
-"""More random numbers than a chunk's noise holds, from numbers in it that nothing else uses.
+"""LaM-SLidE for peptides of any sequence: residues as entities, coded exactly, and a flow over residues and time.
 
-The conditioning frames' place in the noise (b, T, L, dim) is taken by their clean latents, so numbers of its first
-frame are free: pairs of them seed generators, a row's from its own, so that no row depends on those beside it.
+An entity's identifier is its residue's type, its neighbours' types and its place in the chain; its code are the
+internal coordinates of `models.peptides.chains`, so that no first stage is trained and nothing of an unseen sequence
+is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
+with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
+chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
+(`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Frames that
+leave these states a little, or in which atoms overlap as they never do in MD, are set right by small turns
+(`models.peptides.chains`); chunks with frames where that is not enough are drawn again, in the same states and then
+in others.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, cast
+from typing import ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +23,7 @@ from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import settle
+from surrogate.models.peptides.chains import ChainFeatures, settle
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.peptides.torsion_states import MOST_STATES, MOST_TORSIONS, StateJumps, times_apart, told_states
 from surrogate.models.propagator import Chunk, Molecule, Propagator
@@ -24,9 +31,9 @@ from systems.chemistry.geometry import superpose
 from systems.errors import InputError
 from systems.scene import Scene
 
-if TYPE_CHECKING:
-    from surrogate.models.peptides.chains import ChainFeatures
-
+# More random numbers than a chunk's noise holds, from numbers in it that nothing else uses.
+# The conditioning frames' place in the noise (b, T, L, dim) is taken by their clean latents, so numbers of its first
+# frame are free: pairs of them seed generators, a row's from its own, so that no row depends on those beside it.
 
 # Where the pair of numbers stands that seeds each use.
 REDRAWS, STATES = 1, 5
@@ -41,17 +48,6 @@ def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Genera
         found.append(torch.Generator().manual_seed(seed))
     return found
 
-
-# LaM-SLidE for peptides of any sequence: residues as entities, coded exactly, and a flow over residues and time.
-# An entity's identifier is its residue's type, its neighbours' types and its place in the chain; its code are the
-# internal coordinates of `models.peptides.chains`, so that no first stage is trained and nothing of an unseen sequence
-# is lost. The flow runs on innovations: of each coordinate at time t after the conditioning frame, what its correlation
-# with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which has unit variance at any t. Each frame of a
-# chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn
-# first (`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Frames
-# that leave these states a little, or in which atoms overlap as they never do in MD, are set right by small turns
-# (`models.peptides.chains`); chunks with frames where that is not enough are drawn again, in the same states and then
-# in others.
 
 # Residues further apart along the chain are alike far.
 _FAR = 6

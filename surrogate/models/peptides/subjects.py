@@ -1,10 +1,4 @@
-"""Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model.
-
-Runs seeded in rare states show these states too often. Forward windows need no weights, whatever they start from: a
-propagator is conditional. A window read backwards does: it starts where a run ended up, so that exits from a rare state
-become entries, and there would be as many of these as seeds. Weighted by how likely equilibrium is to be where the run
-came from, there are as many as detailed balance asks for (Wu et al., Proc. Natl. Acad. Sci. 113, E3221 (2016)).
-"""
+"""One peptide in training: its frames, how likely each is in equilibrium, and the windows drawn from them."""
 
 from __future__ import annotations
 
@@ -24,6 +18,13 @@ from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.torsion_states import FIRST_OF_SIDE_CHAIN, MOST_TORSIONS
 from systems.errors import InputError
+
+# Weights that turn frames of short runs from chosen starts into equilibrium, by a reversible Markov model.
+# Runs seeded in rare states show these states too often. Forward windows need no weights, whatever they start from: a
+# propagator is conditional. A window read backwards does: it starts where a run ended up, so that exits from a rare
+# state become entries, and there would be as many of these as seeds. Weighted by how likely equilibrium is to be where
+# the run came from, there are as many as detailed balance asks for (Wu et al., Proc. Natl. Acad. Sci. 113, E3221
+# (2016)).
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -114,8 +115,6 @@ def _of_cells(cells: Sequence[npt.NDArray[np.int32]], lag_frames: int) -> FloatA
     weights[visited] = model.fetch_model().stationary_distribution / n_frames[visited]
     return weights
 
-
-# One peptide in training: its frames, how likely each is in equilibrium, and the windows drawn from them.
 
 # Share of windows whose frames are evenly spaced, as in rollouts; the others' times are drawn one by one.
 _EVEN_SHARE = 0.5

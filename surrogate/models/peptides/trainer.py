@@ -1,11 +1,4 @@
-"""The odds of entering phi > 0, set to those of leaving it and to how likely it is.
-
-Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries, but
-only as well weighted as a few frames are, and a rate that is three times too high shows in no loss: nearly every window
-holds no entry. What is known well are the odds of leaving and the free energy of phi > 0 (umbrella sampling), and in
-equilibrium as many frames enter as leave. So after training the odds of entering are moved, by a level of each
-residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
-"""
+"""Train the model of peptides (`models.peptides.model`) on runs of many sequences: one flow, no first stage."""
 
 from __future__ import annotations
 
@@ -57,6 +50,13 @@ from surrogate.models.peptides.torsion_states import (
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
+
+# The odds of entering phi > 0, set to those of leaving it and to how likely it is.
+# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries,
+# but only as well weighted as a few frames are, and a rate that is three times too high shows in no loss: nearly every
+# window holds no entry. What is known well are the odds of leaving and the free energy of phi > 0 (umbrella sampling),
+# and in equilibrium as many frames enter as leave. So after training the odds of entering are moved, by a level of each
+# residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
 
 # Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
@@ -164,8 +164,6 @@ def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
         found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)
 
-
-# Train the model of peptides (`models.peptides.model`) on runs of many sequences: one flow, no first stage.
 
 _MEASURED_FRAMES = 4000
 _MEASURED_PAIRS = 4000

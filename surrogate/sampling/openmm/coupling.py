@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from surrogate.data.frames import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from systems.chemistry.geometry import superposition
@@ -70,7 +71,7 @@ class Coupling:
         self._steps_per_frame = whole_steps(
             self._lag_ps, self._conditions["timestep_ps"], "the weights' frame spacing in MD time steps"
         )
-        self._fit = self._scene.heavy_idx if len(self._scene.heavy_idx) >= 3 else np.arange(self._scene.n_atoms)
+        self._fit = fitted_atoms(self._scene)
 
     def relax(self, frame_nm: FloatArray) -> Relaxed:
         """Return a frame `(n_atoms, 3)` nm with its stiff bonds at rest and all else held near where it was.

@@ -1,4 +1,4 @@
-"""The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name."""
+"""A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context, checkpoints."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ from systems.takes import takes
 
 if TYPE_CHECKING:
     from surrogate.models.weights import Weights
+
+# The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name.
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +145,6 @@ class NoBox:
     def __str__(self) -> str:
         _no_box()
 
-
-# A surrogate behind the face of `openmm.app.Simulation`: topology, reporters, step, context, checkpoints.
 
 # positions (n_atoms, 3) nm -> potential energy in kJ/mol
 EnergyFn = Callable[[npt.NDArray[np.float64]], float]

@@ -1,4 +1,14 @@
-"""Settings of PAINET as a potential."""
+"""The potential energy that PAINET's energy-descent attention gives: a scalar, invariant and smooth.
+
+Embeddings start from types of atoms in their bonded surroundings. Each latent step looks at an atom's neighbourhood
+(sums of functions of distance and direction, and the invariants of these), then takes a step of the paper's descent
+(`EnergyAttention`), in which positions are carried along: the mean of all atoms' positions under positive weights that
+depend on embeddings and types is a vector that knows the whole molecule, at a cost linear in its atoms.
+
+The energy is read from the last embeddings, from a table of pair energies, and from the latent energy that attention
+descends, sum_ij rho_ij(|q_i - q_j|^2) with rho = a s - b s^2 (the paper's equation of E(H), and "Particle-type Adaptive
+Mapping").
+"""
 
 from __future__ import annotations
 
@@ -15,6 +25,8 @@ from surrogate.models.painet.attention import N_SHELLS, EnergyAttention, Surroun
 from surrogate.models.potential import IntegratorConfig
 from surrogate.models.propagator import Molecule
 from systems.errors import InputError
+
+# Settings of PAINET as a potential.
 
 
 @dataclass(frozen=True)
@@ -195,15 +207,6 @@ def products(v: Tensor) -> Tensor:
     x, y, z = v.unbind(-1)
     return torch.stack([x * x, y * y, z * z, _ROOT_TWO * x * y, _ROOT_TWO * y * z, _ROOT_TWO * x * z], dim=-1)
 
-
-# The potential energy that PAINET's energy-descent attention gives: a scalar, invariant and smooth.
-# Embeddings start from types of atoms in their bonded surroundings. Each latent step looks at an atom's neighbourhood
-# (sums of functions of distance and direction, and the invariants of these), then takes a step of the paper's descent
-# (`EnergyAttention`), in which positions are carried along: the mean of all atoms' positions under positive weights
-# that depend on embeddings and types is a vector that knows the whole molecule, at a cost linear in its atoms.
-# The energy is read from the last embeddings, from a table of pair energies, and from the latent energy that attention
-# descends, sum_ij rho_ij(|q_i - q_j|^2) with rho = a s - b s^2 (the paper's equation of E(H), and "Particle-type
-# Adaptive Mapping").
 
 # Atomic numbers up to radon, as GFN2-xTB has them.
 N_TYPES = 87

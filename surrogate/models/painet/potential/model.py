@@ -1,9 +1,4 @@
-"""The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
-
-`simd.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
-writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
-md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
-"""
+"""PAINET as a potential: energies and their exact gradient, by torch and by SIMD."""
 
 from __future__ import annotations
 
@@ -40,6 +35,10 @@ from systems.files.native import CompilerError, compiled_program
 if TYPE_CHECKING:
     pass
 
+# The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
+# `simd.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
+# writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
+# md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
 
 _SOURCE = Path(__file__).with_name("simd.cpp")
 _SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", "n_heads", "head_dim", "n_members")
@@ -236,9 +235,6 @@ def _aligned(n_floats: int) -> npt.NDArray[Any]:
     raw = np.empty(4 * n_floats + _ALIGNED, dtype=np.uint8)
     begin = -raw.ctypes.data % _ALIGNED
     return raw[begin : begin + 4 * n_floats].view(np.float32)
-
-
-# PAINET as a potential: energies, their exact gradient, and the molecule integrated on them.
 
 
 class PainetPotential(Potential):

@@ -1,4 +1,8 @@
-"""States with energies and forces: what a potential learns from, kept in a file of its own."""
+"""Training of PAINET as a potential: it asks a dear truth about the states it is least sure of, and learns.
+
+States come from hot MD and turned torsions (the teacher's `explore`), then from the model's own rollouts. Members of
+the potential learn from different samples; where their forces spread most, the truth is asked next.
+"""
 
 from __future__ import annotations
 
@@ -37,6 +41,8 @@ from systems.files.schema import parsed
 from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
+
+# States with energies and forces: what a potential learns from, kept in a file of its own.
 
 Array = Any
 # So far above the lowest state, for each atom, that no rollout comes there: the potential energy of 1,200 K.
@@ -133,10 +139,6 @@ def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: Potenti
     geometry = geometry_from_frames(scene, quiet)
     return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
 
-
-# Training of PAINET as a potential: it asks a dear truth about the states it is least sure of, and learns.
-# States come from hot MD and turned torsions (the teacher's `explore`), then from the model's own rollouts. Members of
-# the potential learn from different samples; where their forces spread most, the truth is asked next.
 
 # The share of the budget in which states are asked for; what is missing then is asked for at once, unless a pause or a
 # resumption has brought the training so far that it would hardly learn them.

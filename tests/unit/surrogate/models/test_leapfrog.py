@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.painet import pairs as pairs_module
+from surrogate.models.painet import attention as pairs_module
 from surrogate.models.painet.attention import molecular_pairs
 from surrogate.models.painet.decoders import RadialFunctions
 from surrogate.models.painet.model import Painet, PainetConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from surrogate.models.weights import Weights, load_weights
-from surrogate.sampling import choice
+from surrogate.sampling import domain as choice
 from surrogate.sampling.domain import choose_weights
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load

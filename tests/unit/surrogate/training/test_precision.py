@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from surrogate.data.shipped import weights_path
-from surrogate.models import precision
 from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.training import devices as precision
 from surrogate.training.devices import ProductSpeed, bf16_pays, bf16_unit, choose_precision, product_speed
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from surrogate.data import equilibrium
+from surrogate.models.peptides import subjects as equilibrium
 from surrogate.models.peptides.subjects import equilibrium_weights
 
 FloatArray = npt.NDArray[np.float64]

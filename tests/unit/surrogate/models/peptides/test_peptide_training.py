@@ -15,7 +15,7 @@ from small_scenes import with_phi_turned
 from surrogate.bench.cost_error.effective_samples import training_cost
 from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
 from surrogate.models.architecture import TrainingRequest
-from surrogate.models.peptides import peptide_subjects
+from surrogate.models.peptides import subjects as peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.layout import PeptideConfig, chain_features
 from surrogate.models.peptides.model import PeptideSlide

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from surrogate.models.peptides import settling
+from surrogate.models.peptides import chains as settling
 from surrogate.models.peptides.chains import ChainFeatures, dihedral, mirrored, settle
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, PSI, RING, THREEFOLD, StatedTorsions

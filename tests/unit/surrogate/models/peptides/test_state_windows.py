@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.models.peptides import state_windows
+from surrogate.models.peptides import subjects as state_windows
 from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 
