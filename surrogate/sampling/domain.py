@@ -19,6 +19,7 @@ from surrogate.data.shipped import shipped_weights
 from surrogate.models.architecture import architecture
 from surrogate.models.peptides.chains import FREE_ENDS
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
+from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.potential import Potential
 from surrogate.models.weights import load_weights, read_header
 from systems.chemistry.graph import bonded_graph, rotatable_torsions
@@ -349,7 +350,7 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
 
 
 def _peptides(model: Propagator) -> PeptideConfig | None:
-    return model.config if isinstance(model.config, PeptideConfig) else None
+    return model.config if isinstance(model, PeptideSlide) else None
 
 
 def _compare(

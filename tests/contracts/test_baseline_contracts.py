@@ -168,3 +168,11 @@ def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(
     assert (which == 0).mean() == pytest.approx((state == 0).mean(), abs=0.04)
     hops = (which[:, 1:] != which[:, :-1]).mean()
     assert hops == pytest.approx((state[1:] != state[:-1]).mean(), rel=0.15)
+
+
+@pytest.mark.parametrize(("arch", "at_random"), [("resampling", True), ("msm", True), ("normal-modes", False)])
+def test_frames_drawn_at_random_have_no_limit_of_jumps(
+    tmp_path: Path, harmonic_frames: TrainingFrames, arch: str, at_random: bool
+) -> None:
+    limits = load_weights(fit_baseline(arch, harmonic_frames, tmp_path / "w.safetensors")).domain.limits
+    assert limits is not None and (len(limits["jump_idx"]) == 0) == at_random

@@ -27,7 +27,6 @@ class Scripted(Propagator):
     """Trembles about the last frame by 0.0005 nm; what goes wrong is written in `fault`."""
 
     arch: ClassVar[str] = "scripted"
-    canonical = True
     n_conditioning = 1
     n_new = N_NEW
     largest_batch = 1000

@@ -35,7 +35,6 @@ class ExactSprings(Baseline):
     """The exact flow of independent harmonic wells; `heating` multiplies every chunk's last velocity."""
 
     arch: ClassVar[str] = "springs"
-    carries_velocities: ClassVar[bool] = True
 
     def __init__(self, scene: Scene, heating: float = 1.0) -> None:
         super().__init__(BaselineConfig(n_new=5))

@@ -11,6 +11,7 @@ import pytest
 import torch
 from peptide_distil import distil
 
+import surrogate as sm
 from small_scenes import with_phi_turned
 from surrogate.bench.cost_error.effective_samples import training_cost
 from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
@@ -304,7 +305,7 @@ def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, fra
     with pytest.raises(InputError, match=r"leave \[model\] of `config` out"):
         trainer.check(replace(request, model={"width": 64}))
     with pytest.raises(InputError, match="holds lam-slide-peptides, not lam-slide"):
-        trainer.check(replace(request, arch="lam-slide"))
+        sm.explain_training([tmp_path / "ref.h5"], arch="lam-slide", start_from=out, steps=2)
 
 
 def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
