@@ -130,13 +130,10 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
 
     start, arch = options.start_from, options.arch
     file = None if start is None else weights_path(start)
-    if file is not None:
+    if arch is None and file is not None:
         from surrogate.models.weights import read_header
 
-        found = read_header(file).arch
-        arch = arch or found
-        if found != arch:
-            raise InputError(f"{file} holds {found}, not {arch}.")
+        arch = read_header(file).arch
     if arch is not None:
         architecture(arch)
     return TrainingRequest(
@@ -151,6 +148,14 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
         model=options.model or {},
         training=options.training or {},
     )
+
+
+def _check_start(request: TrainingRequest) -> None:
+    """Raise InputError for weights to go on from that are of another architecture."""
+    from surrogate.models.weights import read_header
+
+    if request.start_from is not None and (found := read_header(request.start_from).arch) != request.arch:
+        raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
 
 
 def _trainer(name: str) -> Trainer:
@@ -169,6 +174,8 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
     """Find the references and choose what is not asked for."""
     from surrogate.data.references import References
 
+    if asked.arch:
+        _check_start(asked)
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
