@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from systems.elements import ATOMIC_NUMBERS, PARTICLE
 from systems.errors import InputError
+from systems.scene import ATOMIC_NUMBERS, PARTICLE
 
 if TYPE_CHECKING:
     from typing import Self

@@ -17,8 +17,7 @@ from surrogate.data.frames import TrainingFrames
 from surrogate.models.architecture import architecture
 from surrogate.models.propagator import Propagator
 from surrogate.training.loop import tensor_checksum
-from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.schema import built, parsed
@@ -35,7 +34,7 @@ class TrainingDomain:
     """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
     frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
     `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
-    far they go beyond that (systems.chemistry.limits.Limits; None in files of older versions).
+    far they go beyond that (systems.chemistry.validity.Limits; None in files of older versions).
 
     `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
     jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.

@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread
-from systems.chemistry.limits import Limits, check_limits
 from systems.chemistry.validity import (
     ANGLE,
     DRIFT,
@@ -36,7 +35,9 @@ from systems.chemistry.validity import (
     STILL,
     UNSURE,
     Geometry,
+    Limits,
     check_frames,
+    check_limits,
     flag_names,
 )
 from systems.errors import SimulationError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.frame_columns import FloatArray, squared_distance
+from systems.chemistry.geometry import FloatArray, squared_distance
 from systems.scene import Scene
 
 IntArray = npt.NDArray[np.int64]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from surrogate.judge.measure import hydrogen_bonds, puckers, secondary
 from surrogate.judge.measure.equal_atoms import equal_rows
 from surrogate.judge.measure.torsions import Torsion, find_torsions
-from systems.chemistry.frame_columns import bond_angle, column_blocks, squared_distance, torsion_angle
+from systems.chemistry.geometry import bond_angle, column_blocks, squared_distance, torsion_angle
 from systems.scene import Scene
 
 IntArray = npt.NDArray[np.int64]

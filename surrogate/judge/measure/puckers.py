@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.frame_columns import FloatArray
+from systems.chemistry.geometry import FloatArray
 from systems.scene import Scene
 
 Frames = npt.NDArray[np.floating]

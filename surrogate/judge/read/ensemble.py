@@ -20,9 +20,8 @@ from surrogate.judge.read.rounding import grid_of, rounded, rounding_note
 from surrogate.judge.read.stored_frames import StoredFrames
 from surrogate.judge.read.truth_asked import reweighting_notes
 from systems.errors import InputError, listed
-from systems.scene import Scene
-from systems.selection import part_of
-from systems.trajectory.joined_file import replicas_of
+from systems.scene import Scene, part_of
+from systems.trajectory.codec import replicas_of
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from surrogate.judge.read.common_atoms import Match, match_scenes, solute_atoms
 from surrogate.judge.read.stored_frames import StoredFrames, bond_tree
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
-from systems.scene import Scene
-from systems.selection import part_of
+from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
 from systems.units import format_time_ps
 

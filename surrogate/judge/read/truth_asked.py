@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.reweighting import DIFFERENCE_COLUMN, reweighting
+from systems.trajectory.codec import DIFFERENCE_COLUMN, reweighting
 
 FloatArray = npt.NDArray[np.float64]
 

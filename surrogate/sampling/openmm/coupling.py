@@ -14,9 +14,9 @@ from surrogate.data.frames import fitted_atoms
 from surrogate.models.potential import Potential
 from surrogate.models.propagator import Molecule
 from systems.chemistry.geometry import superposition
-from systems.chemistry.limits import WIDENING
+from systems.chemistry.validity import WIDENING
 from systems.errors import InputError, SimulationError, SurromdError
-from systems.reweighting import DIFFERENCE_COLUMN
+from systems.trajectory.codec import DIFFERENCE_COLUMN
 from systems.units import whole_steps
 
 if TYPE_CHECKING:

@@ -34,8 +34,7 @@ from surrogate.training.loop import (
     train_stages,
 )
 from systems.chemistry.graph import turn_torsions
-from systems.chemistry.limits import WIDENING, limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import WIDENING, geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SimulationError
 from systems.files.schema import parsed
 from systems.files.whole_file import create_whole

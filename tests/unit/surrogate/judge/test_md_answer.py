@@ -134,7 +134,7 @@ def test_wells_are_found_and_one_well_is_none() -> None:
 
 
 def test_a_molecule_without_torsions_is_one_line() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     water = prepare("smiles:C")
     with pytest.raises(InputError, match="no torsion turns"):

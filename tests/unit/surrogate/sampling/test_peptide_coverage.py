@@ -21,8 +21,7 @@ from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
-from systems.scene import Scene
-from systems.selection import reordered
+from systems.scene import Scene, reordered
 from systems.trajectory.codec import open_trajectory
 
 TRAINED = ("ACE-ALA-NME", "ACE-SER-NME", "ACE-ALA-SER-NME")

@@ -25,8 +25,7 @@ from surrogate.models.painet.potential.trainer import (
 from surrogate.models.propagator import Molecule, draw_noise
 from surrogate.models.weights import load_weights
 from surrogate.training import loop
-from systems.chemistry.limits import Limits, check_limits
-from systems.chemistry.validity import DRIFT
+from systems.chemistry.validity import DRIFT, Limits, check_limits
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene

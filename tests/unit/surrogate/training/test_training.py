@@ -18,7 +18,7 @@ from surrogate.models.lam_slide.trainer import FlowWindows, TrainingConfig, flow
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
 from systems.errors import InputError, SimulationError, WeightsError
-from systems.files.toml_file import read_toml
+from systems.options import read_toml
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
 

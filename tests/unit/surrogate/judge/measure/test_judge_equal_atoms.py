@@ -15,8 +15,8 @@ from surrogate.judge.rows.motion.lifetimes import lifetime_rows
 from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
 from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
 from surrogate.judge.rows.shape.shape_rows import shape_rows
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 
 ROOMS = (shape_rows, contact_rows, hydrogen_bond_rows, lifetime_rows)
 OPTIONS = Options(n_bootstrap=50, n_permutations=20)
