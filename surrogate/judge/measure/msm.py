@@ -26,7 +26,6 @@ _CLUSTERED_FRAMES = 10_000
 _KMEANS_SEED = 1
 # A process is slow, and separates states, when it outlives the lag by this factor.
 _SLOW_IN_LAGS = 1.0
-_LEAST_POPULATION = 2e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,17 +6,18 @@ from collections.abc import Iterable, Sequence
 
 from surrogate.judge.comparison import Comparison, Judgement
 from surrogate.judge.measure.statistics import Estimate
-from surrogate.judge.report.cards import cards, side_by_side
 from surrogate.judge.report.definitions import DEFINITIONS
 from surrogate.judge.report.wording import (
     GROUP_TITLES,
     MARKS,
     STATE_HEADS,
     STATUS_MARKS,
+    cards,
     interval,
     number,
     per_day,
     plain,
+    side_by_side,
     state_lines,
 )
 from surrogate.judge.rows.rows import GROUPS, Row

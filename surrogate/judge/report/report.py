@@ -9,27 +9,26 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
-from surrogate.judge.comparison import Comparison
-from surrogate.judge.report import figures
-from surrogate.judge.report.cards import cards, side_by_side
+from surrogate.judge.comparison import Account, Comparison
 from surrogate.judge.report.definitions import DEFINITIONS
+from surrogate.judge.report.figures import albums
 from surrogate.judge.report.markdown import to_markdown
-from surrogate.judge.report.pictures import albums, maps, timelines
 from surrogate.judge.report.wording import (
     GROUP_TITLES,
     MARKS,
     STATE_HEADS,
     STATUS_MARKS,
+    cards,
     interval,
     number,
     per_day,
     plain,
     setting,
     severity,
+    side_by_side,
     sort_key,
     state_lines,
 )
-from surrogate.judge.rows.account import Account
 from surrogate.judge.rows.rows import GROUPS
 from systems.errors import InputError, StorageError
 from systems.options import flag_of
@@ -104,10 +103,7 @@ def render(comparison: Comparison, *, command: str, foreword: Foreword | None = 
             "anchor": f"candidate-{i + 1}",
             "cards": cards(j),
             "groups": [(GROUP_TITLES.get(g, g.capitalize()), [r for r in j.rows if r.group == g]) for g in GROUPS],
-            "maps": maps(j, comparison.temperature_k),
-            "albums": albums(j, comparison.temperature_k),
-            "timelines": timelines(j),
-            "bonds": sorted(j.curves.bonds, key=lambda b: -abs(b.candidate_mean - b.reference_mean)),
+            "albums": albums(j.charts, comparison.temperature_k),
             "movie": comparison.movies[i] if i < len(comparison.movies) else None,
         }
         for i, j in enumerate(comparison.judgements)
@@ -126,7 +122,6 @@ def render(comparison: Comparison, *, command: str, foreword: Foreword | None = 
         severity=severity,
         command=command,
         foreword=foreword,
-        map_max=figures.MAP_MAX_KJ,
         embed=lambda value: Markup(_embed(value)),
         style=Markup("\n".join(text_of(name) for name in _STYLES)),
         script=Markup("\n".join(text_of(name) for name in _SCRIPTS)),

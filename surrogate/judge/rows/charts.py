@@ -17,8 +17,9 @@ from surrogate.judge.measure.statistics import Estimate
 
 FloatArray = npt.NDArray[np.float64]
 
-Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "experiment", "worth"]
+Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "worth"]
 Role = Literal["reference", "candidate", "replicate", "other"]
+ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
 
 def _plain(value: Any) -> Any:
@@ -38,8 +39,8 @@ class Curve:
     """Base of the records below."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {name: _plain(value) for name, value in vars(self).items()}
+        """Return JSON-able values, and under "type" which chart it is."""
+        return {name: _plain(value) for name, value in vars(self).items()} | {"type": type(self).__name__}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +92,9 @@ class LineChart(Curve):
 
 @dataclass(frozen=True, eq=False)
 class Landscape(Curve):
-    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies like the Ramachandran maps.
+    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies: φ and ψ of a residue, or two TICs.
 
-    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`.
+    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`; `captions` below the maps of reference, candidate and replicate.
     """
 
     section: Section
@@ -105,6 +106,7 @@ class Landscape(Curve):
     reference: FloatArray
     candidate: FloatArray
     replicate: FloatArray
+    captions: tuple[str, str, str] = ("Reference", "Candidate", "Replicate")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ import pytest
 from surrogate.judge import comparison
 from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.rare_states import Visits, visits_of, visits_p, without_positive_phi
 from surrogate.judge.rows.rows import Options
+from surrogate.judge.rows.torsion_rows import Visits, visits_of, visits_p, without_positive_phi
 
 Simulate = Callable[..., Ensemble]
 # The published recipe takes half of the time here, and no verdict rests on it.

@@ -11,8 +11,7 @@ import pytest
 
 from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.measure.statistics import Estimate
-from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.read.reading import time_axis
+from surrogate.judge.read.ensemble import Ensemble, load_ensemble, time_axis
 from surrogate.judge.report.wording import interval, number
 from surrogate.judge.rows.rows import Options
 from systems.errors import InputError

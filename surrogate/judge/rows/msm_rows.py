@@ -13,14 +13,23 @@ from surrogate.judge.measure import distributions, msm
 from surrogate.judge.measure.kinetics import WITHOUT_TICA, lagged_eigenvalue, noise_timescale, timescale
 from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import estimate
-from surrogate.judge.rows.charts import BarChart, Chart, Landscape, Line, LineChart, Role
-from surrogate.judge.rows.motion.relaxation_rows import speed_words
-from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, too_short
+from surrogate.judge.rows.charts import ROLES, BarChart, Chart, Landscape, Line, LineChart, Role
+from surrogate.judge.rows.relaxation_rows import speed_words
+from surrogate.judge.rows.rows import (
+    Measured,
+    Quantity,
+    Row,
+    Sample,
+    Skipped,
+    Trio,
+    distance_row,
+    observable_row,
+    too_short,
+)
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Skipped = tuple[str, str]
 
 _CHECKED_LAGS = 5
 # A process is of every state that carries this share of its variance in the reference.
@@ -28,7 +37,6 @@ _LEAST_SHARE = 0.25
 _DRAWN_LAGS = (0.2, 0.5, 1.0, 2.0, 3.0, 5.0)
 _LANDSCAPE_BINS = 50
 _BAND_DRAWS = 60
-ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,26 +52,26 @@ class _States:
     micro_counts: FloatArray
 
 
-def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
+def msm_rows(trio: Trio) -> Measured:
     """Return the rows and charts of a Markov state model fitted on the reference, and why there are none."""
     lag_ps = trio.reference.features.lag_ps
     lag = max(1, round(trio.options.tica_lag_ps / lag_ps))
     name = f"Markov state model at a lag of {format_time_ps(lag * lag_ps)}"
     features = [tica_features(s.features) for s in trio.samples]
     if not features[0][0].shape[1]:
-        return [], [], [(name, "the scene has no torsion to turn about")]
+        return Measured(skipped=[(name, "the scene has no torsion to turn about")])
     if short := too_short([s.features for s in trio.samples], lag):
-        return [], [], [(name, short)]
+        return Measured(skipped=[(name, short)])
     projection = msm.fit_projection(features[0], lag)
     if projection is None:
-        return [], [], [(name, WITHOUT_TICA)]
+        return Measured(skipped=[(name, WITHOUT_TICA)])
     coordinates = [[projection.project(x) for x in segments] for segments in features]
     model = msm.fit_model(projection, coordinates[0], lag)
     if model is None:
-        return [], [], [(name, "the reference visits too few states, or none that hold together")]
+        return Measured(skipped=[(name, "the reference visits too few states, or none that hold together")])
     noise_ps = lag_ps * noise_timescale(len(model.centres), lag, trio.reference.features.n_frames)
     if not len(model.timescales) or lag_ps * model.timescales[0] < noise_ps:
-        return [], [], [(name, "its slowest process cannot be told from noise")]
+        return Measured(skipped=[(name, "its slowest process cannot be told from noise")])
     states = [_states(model, s, x) for s, x in zip(trio.samples, coordinates, strict=True)]
     names = state_names(trio, states[0].macro, model.n_states)
     rows = [_population_row(trio, states)]
@@ -76,7 +84,7 @@ def msm_rows(trio: Trio) -> tuple[list[Row], list[Chart], list[Skipped]]:
     charts: list[Chart] = [*_landscape(trio, states), _free_energies(trio, model, states, names)]
     charts += [_check_chart(trio, model, s, role) for s, role in zip(states[:2], ROLES, strict=False)]
     charts.append(_timescale_chart(trio, model, states, names))
-    return rows, charts, skipped
+    return Measured(rows, charts, skipped)
 
 
 def _states(model: msm.Model, sample: Sample, coordinates: list[FloatArray]) -> _States:
@@ -185,7 +193,7 @@ def _timescale_rows(
         rows.append(
             observable_row(
                 trio,
-                Metric(f"msm_timescale:{k + 1}", "kinetics", metric, "ps", 0.2, relative=True),
+                Quantity(f"msm_timescale:{k + 1}", "kinetics", metric, "ps", 0.2, relative=True),
                 values,
                 draws,
                 lambda c, r, k=k: speed_words(f"process {k + 1} of the Markov state model decays", c, r),  # type: ignore[misc]
@@ -200,12 +208,14 @@ def _landscape(trio: Trio, states: Sequence[_States]) -> list[Chart]:
     edges = [
         distributions.reference_bins([c[:, k] for c in states[0].coordinates], _LANDSCAPE_BINS).edges for k in range(2)
     ]
-    counts = []
-    for s in states:
+
+    def counts(s: _States) -> FloatArray:
         x = np.concatenate(s.coordinates)
         x = x[np.isfinite(x).all(axis=1)]
-        counts.append(np.histogram2d(x[:, 0], x[:, 1], bins=edges)[0])
-    return [Landscape("distributions", "TICA landscape", "TIC 0", "TIC 1", edges[0], edges[1], *counts)]
+        return np.asarray(np.histogram2d(x[:, 0], x[:, 1], bins=edges)[0])
+
+    ref, cand, rep = map(counts, states)
+    return [Landscape("distributions", "TICA landscape", "TIC 0", "TIC 1", edges[0], edges[1], ref, cand, rep)]
 
 
 def _free_energies(trio: Trio, model: msm.Model, states: Sequence[_States], names: Sequence[str]) -> Chart:

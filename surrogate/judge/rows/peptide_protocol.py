@@ -22,7 +22,7 @@ from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import Blocks
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.rows.charts import BarChart, Chart, Line, LineChart
-from surrogate.judge.rows.rows import Row, Trio, too_short
+from surrogate.judge.rows.rows import Measured, Trio, too_short
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -149,27 +149,27 @@ def decorrelation(segments: Segments, n_lags: int) -> FloatArray:
     return (total - baseline) / (1.0 - baseline)
 
 
-def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, str]]]:
+def peptide_charts(trio: Trio) -> Measured:
     """Return the recipe's table as a bar chart and the decorrelation of each torsion, or why they were skipped."""
     name = f"The peptide papers' recipe (lag {format_time_ps(LAG_PS)}, {N_CLUSTERS} clusters, {N_STATES} states)"
     n = min(s.features.n_frames for s in trio.samples)
     reference, candidate, replicate = (s.features.frames(0, n) for s in trio.samples)
     if not trio.options.peptide_recipe:
-        return [], [], [(name, "not asked for")]
+        return Measured(skipped=[(name, "not asked for")])
     if not (len(trio.torsions.phi) or len(trio.torsions.psi)):
-        return [], [], [(name, "the scene has no φ or ψ torsion")]
+        return Measured(skipped=[(name, "the scene has no φ or ψ torsion")])
     lag = LAG_PS / reference.lag_ps
     if abs(lag - round(lag)) > 1e-6 or lag < 1:
-        return [], [], [(name, f"frames every {format_time_ps(reference.lag_ps)} do not divide the lag")]
+        return Measured(skipped=[(name, f"frames every {format_time_ps(reference.lag_ps)} do not divide the lag")])
     if short := too_short((reference, candidate, replicate), lag):
-        return [], [], [(name, short)]
+        return Measured(skipped=[(name, short)])
     if not all(np.isfinite(x).any() for f in (candidate, replicate) for x in (*f.phi, *f.psi)):
-        return [], [], [(name, "a segment holds no finite frame")]
+        return Measured(skipped=[(name, "a segment holds no finite frame")])
     if n not in trio.recipes:
         trio.recipes[n] = fit_recipe(reference)
     fit: Fit | None = trio.recipes[n]
     if fit is None:
-        return [], [], [(name, kinetics.WITHOUT_TICA)]
+        return Measured(skipped=[(name, kinetics.WITHOUT_TICA)])
     tables = [peptide_table(fit, reference, other).values() for other in (candidate, replicate)]
     known = np.isfinite(tables[1])
     n_states = "none" if fit.model is None else str(fit.model.n_states)
@@ -184,7 +184,7 @@ def peptide_charts(trio: Trio) -> tuple[list[Row], list[Chart], list[tuple[str, 
         candidate=tables[0][known],
         replicate=tables[1][known],
     )
-    return [], [bars, _decorrelation_chart(trio)], []
+    return Measured(charts=[bars, _decorrelation_chart(trio)])
 
 
 def _decorrelation_chart(trio: Trio) -> Chart:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.charts import Chart, Line, LineChart, Role
+from surrogate.judge.rows.rows import Measured, Trio
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,13 +93,17 @@ def forecasts(pairs: Pairs, role: Role = "candidate") -> list[Forecast]:
     return out
 
 
-def forecast_charts(
-    pairs: Pairs | None, beside: Pairs | None, lag_ps: float
-) -> tuple[list[Chart], list[tuple[str, str]]]:
-    """Return charts of FDE and ADE against time, or why there are none, of the candidate's pairs; `beside` are the
-    replicate's."""
+def forecast_charts(trio: Trio) -> Measured:
+    """Return charts of FDE and ADE against time of the candidate's pairs and the replicate's, or why there are none."""
+    if trio.trajectories is None:
+        return Measured()
+    reference, candidate, replicate = trio.trajectories
+    pairs = find_pairs(reference, candidate)
     if pairs is None:
-        return [], [(_NAME, "the reference and the candidate do not start from the same frame, or never part")]
+        why = "the reference and the candidate do not start from the same frame, or never part"
+        return Measured(skipped=[(_NAME, why)])
+    lag_ps = reference.lag_ps
+    beside = None if replicate is None else find_pairs(reference, replicate)
     found = forecasts(pairs)
     if beside is not None:
         found += forecasts(beside, "replicate")
@@ -115,7 +120,7 @@ def forecast_charts(
         charts.append(
             LineChart("forecast", title, caption, "time / ps", "error / Å", tuple(lines), log_x=n_times > 3, log_y=True)
         )
-    return charts, []
+    return Measured(charts=charts)
 
 
 def _line(found: Forecast, time_ps: FloatArray, values: FloatArray, *, banded: bool) -> Line:

@@ -13,14 +13,25 @@ from surrogate.judge.measure import distributions, kinetics
 from surrogate.judge.measure.slow_motion import SLOW_KINDS, tica_features
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, widening
 from surrogate.judge.measure.structure import Features
-from surrogate.judge.rows import curves
-from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, distance_row, observable_row, too_short
+from surrogate.judge.rows.charts import Chart, Line, LineChart
+from surrogate.judge.rows.rows import (
+    Measured,
+    Quantity,
+    Row,
+    Sample,
+    Skipped,
+    Trio,
+    distance_row,
+    histogram,
+    observable_row,
+    too_short,
+)
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
-Skipped = tuple[str, str]
 
 MAX_DRAWN_LAGS = 240
+_LEAST_DRAWN = 50
 _MIN_BOUNDARIES = 20
 _MOST_RELAXING = 6
 _SHARE_OF_WINDOW = 0.85
@@ -61,11 +72,11 @@ def turning(features: Features) -> list[tuple[str, str, list[FloatArray]]]:
     return [(s, label, [np.cos(x.astype(np.float64)) for x in c]) for (s, label), c in zip(names, columns, strict=True)]
 
 
-def correlation_rows(trio: Trio) -> tuple[list[Row], list[curves.CorrelationCurve], list[Skipped]]:
-    """Return, for each psi or rotatable torsion, rows of C(lag) at the chosen lags and of its integral; the curves;
-    what was skipped. Of more than `_MOST_RELAXING` torsions the slowest in the reference."""
+def correlation_rows(trio: Trio) -> Measured:
+    """Return, for each psi or rotatable torsion, the row of its relaxation time and the chart of C(lag). Of more than
+    `_MOST_RELAXING` torsions the slowest in the reference."""
     rows: list[Row] = []
-    drawn: list[curves.CorrelationCurve] = []
+    drawn: list[Chart] = []
     skipped: list[Skipped] = []
     moving = [turning(s.features) for s in trio.samples]
     labels = [
@@ -78,41 +89,28 @@ def correlation_rows(trio: Trio) -> tuple[list[Row], list[curves.CorrelationCurv
         chosen = sorted(np.argsort(-times)[:_MOST_RELAXING].tolist())
         skipped.append((f"Relaxation of {len(labels)} torsions", f"the {len(chosen)} slowest have rows"))
     lag_ps = trio.reference.features.lag_ps
-    wanted = sorted({max(1, round(x / lag_ps)) for x in trio.options.lags_ps if x >= 0.5 * lag_ps} or {1})
     for k in chosen:
         what, label = labels[k]
         series = [m[k][2] for m in moving]
         crossings = [kinetics.zero_crossing(s)[0] for s in series]
         longest = min(max(s.features.segment_lengths) for s in trio.samples)
-        n_lags = min(max(3 * max(crossings), wanted[-1]) + 1, longest, kinetics.MAX_LAG_FRAMES)
+        n_lags = min(max(3 * max(crossings), _LEAST_DRAWN) + 1, longest, kinetics.MAX_LAG_FRAMES)
         # The picture shows the decay of the reference and the replicate; a stuck candidate must not stretch it.
-        last_drawn = min(n_lags - 1, max(int(1.3 * max(crossings[0], crossings[2])), wanted[-1], 20))
-        shown = np.linspace(0, last_drawn, MAX_DRAWN_LAGS).astype(int)
-        kept = np.unique(np.concatenate([shown, [x for x in wanted if x < n_lags]])).astype(int)
+        last_drawn = min(n_lags - 1, max(int(1.3 * max(crossings[0], crossings[2])), _LEAST_DRAWN))
+        kept = np.unique(np.linspace(0, last_drawn, MAX_DRAWN_LAGS).astype(int))
         results = [_correlate(s, sample, n_lags, kept) for s, sample in zip(series, trio.samples, strict=True)]
-        for lag in wanted:
-            if lag < n_lags:
-                rows.append(_value_row(trio, results, lag, what, label))
-            else:
-                name = f"C({format_time_ps(lag * lag_ps)}) of {what}, {label}"
-                skipped.append((name, f"a trajectory holds {format_time_ps(longest * lag_ps)} without a break"))
         rows.append(_time_row(trio, results, what, label))
-        (ref_low, ref_high), (cand_low, cand_high) = results[0].band(), results[1].band()
+        x = kept * lag_ps
+        zero = Line("", "other", x[[0, -1]], np.zeros(2))
         reference, candidate, replicate = (r.curve[kept] for r in results)
-        drawn.append(
-            curves.CorrelationCurve(
-                f"{what} {label}",
-                kept * lag_ps,
-                reference,
-                ref_low,
-                ref_high,
-                candidate,
-                cand_low,
-                cand_high,
-                replicate,
-            )
+        lines = (
+            Line("reference", "reference", x, reference, *results[0].band()),
+            Line("replicate", "replicate", x, replicate),
+            Line("candidate", "candidate", x, candidate, *results[1].band()),
         )
-    return rows, drawn, skipped
+        title, caption = f"Autocorrelation of {what} {label}", "Bands are 95 % intervals."
+        drawn.append(LineChart("kinetics", title, caption, "lag / ps", "C(lag)", (zero, *lines)))
+    return Measured(rows, drawn, skipped)
 
 
 def _correlate(series: Sequence[FloatArray], sample: Sample, n_lags: int, kept: npt.NDArray[np.int_]) -> _Correlated:
@@ -168,23 +166,11 @@ def relaxation_of(sample: Sample, k: int = 0) -> tuple[Estimate, Estimate]:
     )
 
 
-def _value_row(trio: Trio, results: Sequence[_Correlated], lag: int, what: str, label: str) -> Row:
-    at = int(np.searchsorted(results[0].kept, lag))
-    time = format_time_ps(lag * trio.reference.features.lag_ps)
-    return observable_row(
-        trio,
-        Metric(f"correlation:{lag}:{label}", "kinetics", f"Autocorrelation of {what} at {time}, {label}", "", 0.05),
-        [float(r.curve[lag]) for r in results],
-        [r.draws[:, at] for r in results],
-        lambda c, r: f"{what} of {label} correlates {c:.2f} after {time} instead of {r:.2f}",
-    )
-
-
 def _time_row(trio: Trio, results: Sequence[_Correlated], what: str, label: str) -> Row:
     lag_ps = trio.reference.features.lag_ps
     return observable_row(
         trio,
-        Metric(
+        Quantity(
             f"correlation_time:{label}", "kinetics", f"Relaxation time of {what}, {label}", "ps", 0.2, relative=True
         ),
         [r.time * lag_ps for r in results],
@@ -205,19 +191,19 @@ def speed_words(what: str, candidate: float, reference: float) -> str:
     return f"{what} {words} ({candidate:.3g} ps instead of {reference:.3g} ps)"
 
 
-def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipped]]:
+def tica_rows(trio: Trio) -> Measured:
     """Return rows of TIC 0, fitted on the reference alone (distance, timescale); its histogram; what was skipped."""
     lag_ps = trio.reference.features.lag_ps
     lag = max(1, round(trio.options.tica_lag_ps / lag_ps))
     name = f"TICA at a lag of {format_time_ps(lag * lag_ps)}"
     features = [tica_features(s.features) for s in trio.samples]
     if not features[0][0].shape[1]:
-        return [], [], [(name, "the scene has no torsion to turn about")]
+        return Measured(skipped=[(name, "the scene has no torsion to turn about")])
     if short := too_short([s.features for s in trio.samples], lag):
-        return [], [], [(name, short)]
+        return Measured(skipped=[(name, short)])
     model = kinetics.fit_tica(features[0], lag)
     if model is None:
-        return [], [], [(name, kinetics.WITHOUT_TICA)]
+        return Measured(skipped=[(name, kinetics.WITHOUT_TICA)])
     projected = [[model.project(x) for x in segments] for segments in features]
     values, draws = [], []
     for sample, series in zip(trio.samples, projected, strict=True):
@@ -241,7 +227,7 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
         ),
         observable_row(
             trio,
-            Metric(
+            Quantity(
                 "tic0_timescale",
                 "kinetics",
                 f"Timescale of TIC 0 at a lag of {format_time_ps(lag * lag_ps)}",
@@ -258,17 +244,17 @@ def tica_rows(trio: Trio) -> tuple[list[Row], list[curves.Histogram], list[Skipp
     if values[0] < lag_ps * noise:
         rows.pop()
         skipped.append((f"Timescale of {name}", "it cannot be told from noise"))
-    return rows, [curves.histogram(trio, projected, bins, "TIC 0", "")], skipped
+    return Measured(rows, [histogram(trio, projected, bins, "TIC 0", "")], skipped)
 
 
-def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:
+def boundary_row(trio: Trio) -> Measured:
     """Return the row that shows seams: the step of all torsions where a chunk begins, over that inside chunks."""
     name = "Steps across chunk boundaries"
     sample = trio.candidate
     if sample.features.chunk_idx is None or not any((c >= 0).any() for c in sample.features.chunk_idx):
-        return [], [(name, "the candidate's file marks no chunks")]
+        return Measured(skipped=[(name, "the candidate's file marks no chunks")])
     if not (len(trio.torsions.phi) or len(trio.torsions.psi)):
-        return [], [(name, "the scene has no φ or ψ torsion")]
+        return Measured(skipped=[(name, "the scene has no φ or ψ torsion")])
     sums = np.zeros((4, sample.blocks.n_blocks))
     for piece in sample.blocks.pieces:
         window = slice(piece.start, piece.stop)
@@ -283,7 +269,8 @@ def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:
         sums[:, piece.block] += (squared[at_seam].sum(), at_seam.sum(), squared[within].sum(), within.sum())
     total = sums.sum(1)
     if total[1] < _MIN_BOUNDARIES or not total[3]:
-        return [], [(name, f"fewer than {_MIN_BOUNDARIES} boundaries, or no two frames in one chunk")]
+        why = f"fewer than {_MIN_BOUNDARIES} boundaries, or no two frames in one chunk"
+        return Measured(skipped=[(name, why)])
 
     def ratio(s: FloatArray) -> FloatArray:
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -292,21 +279,23 @@ def boundary_row(trio: Trio) -> tuple[list[Row], list[Skipped]]:
     n = sample.blocks.n_blocks
     found = estimate(float(ratio(total)), ratio((sample.weights @ sums.T).T), n, log=True)
     seamless = Estimate(1.0, 1.0, 1.0, 0.0, 0.0, n)
-    return [
-        Row(
-            key="chunk_step",
-            group="kinetics",
-            metric="φ/ψ step at chunk boundaries over the step inside chunks",
-            unit="",
-            kind="observable",
-            reference=seamless,
-            candidate=found,
-            replicate=None,
-            ratio=found,
-            p_value=difference_p(found, seamless, log=True),
-            p_replicate=math.nan,
-            tolerance=0.2,
-            tolerance_text="± 20 %",
-            statement=f"torsions jump {found.value:.2g} times as far where one chunk meets the next",
-        )
-    ], []
+    return Measured(
+        [
+            Row(
+                key="chunk_step",
+                group="kinetics",
+                metric="φ/ψ step at chunk boundaries over the step inside chunks",
+                unit="",
+                form="observable",
+                reference=seamless,
+                candidate=found,
+                replicate=None,
+                ratio=found,
+                p_value=difference_p(found, seamless, log=True),
+                p_replicate=math.nan,
+                tolerance=0.2,
+                tolerance_text="± 20 %",
+                statement=f"torsions jump {found.value:.2g} times as far where one chunk meets the next",
+            )
+        ]
+    )
