@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from surrogate.judge.measure.structure import Backbone, Features, Yardstick, fir
 from surrogate.judge.metrics import METRICS, measure_all
 from surrogate.judge.read.ensemble import Ensemble, alike
 from surrogate.judge.remarks import bonds_that_are_none, copied_from, jumps, refuse_wrong_topology
-from surrogate.judge.rows.charts import Chart
+from surrogate.judge.rows.charts import Chart, jsonable
 from surrogate.judge.rows.rows import Options, Row, Sample, Trio, by_group, make_sample
 from surrogate.judge.rows.torsion_rows import FEW_RESIDUES
 from surrogate.judge.rows.validity_rows import (
@@ -157,25 +156,8 @@ class Comparison:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; what is not finite becomes None."""
-        apart = ("judgements", "reference", "replicate", "options", "movies", "convergence")
-        plain: dict[str, Any] = _jsonable({k: v for k, v in vars(self).items() if k not in apart})
-        plain["reference"] = _jsonable(asdict(self.reference))
-        plain["replicate"] = None if self.replicate is None else _jsonable(asdict(self.replicate))
-        plain["options"] = _jsonable(asdict(self.options))
-        plain["convergence"] = None if self.convergence is None else _jsonable(asdict(self.convergence))
-        plain["judgements"] = []
-        for judgement in self.judgements:
-            nested = ("rows", "charts", "account", "faults", "worth", "left_open")
-            out = _jsonable({k: v for k, v in vars(judgement).items() if k not in nested})
-            out["account"] = _jsonable(asdict(judgement.account))
-            out["faults"] = [_jsonable(asdict(f)) for f in judgement.faults]
-            out["worth"] = [_jsonable(asdict(w)) for w in judgement.worth]
-            out["left_open"] = _jsonable(asdict(judgement.left_open))
-            out["rows"] = [r.to_dict() for r in judgement.rows]
-            out["charts"] = [c.to_dict() for c in judgement.charts]
-            plain["judgements"].append(out)
-        return plain
+        """Return JSON-able values of all but the movies; what is not finite becomes None."""
+        return {name: jsonable(value) for name, value in vars(self).items() if name != "movies"}
 
 
 def compare(
@@ -400,18 +382,6 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
-
-
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _jsonable(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_jsonable(v) for v in value]
-    if isinstance(value, np.generic):
-        return _jsonable(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
 
 
 def faults_of(sample: Sample, geometry: Geometry) -> Faults:

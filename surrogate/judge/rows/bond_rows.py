@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure import distributions
 from surrogate.judge.measure.probes import MOST_HISTOGRAMS, equal_rows, evenly, group_labels, over_groups
-from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, mean_estimate
 from surrogate.judge.measure.structure import CONSTRAINED_BELOW_NM, bond_label
 from surrogate.judge.read.stored_frames import angle_variance, length_error_nm
 from surrogate.judge.rows.block_means import Means, block_means, bounds, family_of, over_equal, shift_row
@@ -19,20 +18,19 @@ from surrogate.judge.rows.charts import BarChart
 from surrogate.judge.rows.rows import (
     Measured,
     Quantity,
-    Row,
     Sample,
     Trio,
-    distance_row,
     mean_distance,
     observable_row,
-    truth_of,
 )
 from systems.chemistry.validity import Geometry
 
 FloatArray = npt.NDArray[np.float64]
 
-BOND_TOLERANCE_ANGSTROM = 0.01
 BOND_RESOLUTION_ANGSTROM = 0.001
+_BOND_SHIFT = Quantity(
+    "bond_shift", "structure", "Largest shift of a mean bond length", "Å", 0.01, resolution=BOND_RESOLUTION_ANGSTROM
+)
 # The width of a harmonic bond goes with the root of the temperature: 5 % is 30 K at 300 K.
 BOND_WIDTH_TOLERANCE = 0.05
 _ANGLE_BINS = 50
@@ -59,7 +57,7 @@ def bond_rows(trio: Trio) -> Measured:
     )
     groups = equal_rows(np.asarray(pairs), classes)
     equal, names = [_over_groups(m, groups) for m in moments], group_labels(labels, groups)
-    rows = [_bond_shift_row(trio, equal, names)]
+    rows = [shift_row(trio, _BOND_SHIFT, [m.means() for m in equal], names, _bond_words)]
     for chosen, name, tolerance, words in (
         (~rigid, "Bond-length width, flexible bonds", None, "± 5 %"),
         (rigid, "Bond-length width, constrained bonds", 0.02, "± 0.02 Å"),
@@ -88,7 +86,9 @@ def bond_rows(trio: Trio) -> Measured:
         )
     flexible = evenly([g for g in groups if not rigid[g].any()], MOST_HISTOGRAMS)
     if flexible:
-        rows.append(_bond_distance_row(trio, flexible))
+        lengths = [s.features.bonds_nm for s in trio.samples]
+        bins = [distributions.normal_bins([x[:, g] for x in lengths[0]]) for g in flexible]
+        rows.append(mean_distance(trio, lengths, bins, "bond_jsd", "Flexible bond lengths", "structure", flexible))
     return Measured(rows, [_means_chart(equal, names)])
 
 
@@ -106,19 +106,37 @@ class _Moments:
     draws_std: FloatArray
     n_blocks: int
 
+    def means(self) -> Means:
+        """Return the means without the widths."""
+        return Means(self.mean, self.draws_mean, self.n_blocks)
 
-def _bond_moments(sample: Sample, geometry: Geometry) -> _Moments:
-    n_bonds = sample.features.bonds_nm[0].shape[1]
-    n, first, second = (np.zeros((sample.blocks.n_blocks, n_bonds)) for _ in range(3))
-    # Moments about the reference mean: plain ones would lose the width of a constrained bond to rounding.
-    centre = 10.0 * np.asarray(geometry.bond_mean_nm, dtype=np.float64)
+
+def _bond_words(label: str, candidate: float, reference: float) -> str:
+    percent = 100.0 * (candidate / reference - 1.0)
+    return f"{label} bonds are {abs(percent):.1f} % {'long' if percent > 0 else 'short'}"
+
+
+def _moment_sums(
+    sample: Sample, segments: Sequence[npt.NDArray[np.floating]], centre: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return per block `(n_blocks, k)` how many values there are, and the sums of them and of their squares, of values
+    about a `centre` and kept within limits."""
+    n, first, second = (np.zeros((sample.blocks.n_blocks, segments[0].shape[1])) for _ in range(3))
     for piece in sample.blocks.pieces:
-        lengths = sample.features.bonds_nm[piece.segment][piece.start : piece.stop].astype(np.float64)
-        finite = ~np.isnan(lengths)
-        part = np.where(finite, np.clip(10.0 * lengths - centre, -0.5, 0.5), 0.0)
+        values = segments[piece.segment][piece.start : piece.stop].astype(np.float64)
+        finite = ~np.isnan(values)
+        part = np.where(finite, np.clip(values, low, high) - centre, 0.0)
         n[piece.block] += finite.sum(0)
         first[piece.block] += part.sum(0)
         second[piece.block] += (part * part).sum(0)
+    return n, first, second
+
+
+def _bond_moments(sample: Sample, geometry: Geometry) -> _Moments:
+    # Moments about the reference mean: plain ones would lose the width of a constrained bond to rounding.
+    centre = 10.0 * np.asarray(geometry.bond_mean_nm, dtype=np.float64)
+    lengths = [10.0 * x.astype(np.float64) for x in sample.features.bonds_nm]
+    n, first, second = _moment_sums(sample, lengths, centre, centre - 0.5, centre + 0.5)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = first.sum(0) / n.sum(0)
         std = np.sqrt(np.maximum(second.sum(0) / n.sum(0) - mean**2, 0.0))
@@ -134,41 +152,6 @@ def _over_groups(moments: _Moments, groups: Sequence[npt.NDArray[np.intp]]) -> _
         over_groups(x, groups) for x in (moments.mean, moments.std, moments.draws_mean, moments.draws_std)
     )
     return _Moments(mean, std, draws_mean, draws_std, moments.n_blocks)
-
-
-def _bond_shift_row(trio: Trio, moments: Sequence[_Moments], labels: Sequence[str]) -> Row:
-    """The bond whose mean is farthest off; significance is corrected for having looked at all bonds."""
-    ref, cand, rep = moments
-    shift = np.abs(cand.mean - ref.mean)
-    if not np.isfinite(shift).any():
-        worst, value = 0, math.nan
-    else:
-        worst = int(np.nanargmax(shift))
-        value = float(shift[worst])
-    n_blocks = min(ref.n_blocks, cand.n_blocks)
-    signed = cand.draws_mean[:, worst] - ref.draws_mean[:, worst]
-    found = estimate(value, signed * np.sign(cand.mean[worst] - ref.mean[worst]), n_blocks)
-    p_value, p_replicate = _least_p(ref, cand, rep)
-    floor = np.abs(rep.mean - ref.mean)
-    at = int(np.nanargmax(floor)) if np.isfinite(floor).any() else 0
-    percent = 100.0 * (cand.mean[worst] / ref.mean[worst] - 1.0)
-    words = f"{labels[worst]} bonds are {abs(percent):.1f} % {'long' if percent > 0 else 'short'}"
-    return Row(
-        key="bond_shift",
-        group="structure",
-        metric=f"Largest shift of a mean bond length: {labels[worst]}",
-        unit="Å",
-        form="distance",
-        reference=None,
-        candidate=replace(found, low=max(found.low, 0.0)),
-        replicate=Estimate(float(floor[at]), error=float((rep.draws_mean - ref.draws_mean)[:, at].std())),
-        ratio=None,
-        p_value=p_value if math.isfinite(value) else math.nan,
-        p_replicate=p_replicate,
-        tolerance=BOND_TOLERANCE_ANGSTROM,
-        tolerance_text=f"≤ {BOND_TOLERANCE_ANGSTROM:g} Å",
-        statement=words,
-    )
 
 
 def _means_chart(moments: Sequence[_Moments], labels: Sequence[str]) -> BarChart:
@@ -189,36 +172,6 @@ def _means_chart(moments: Sequence[_Moments], labels: Sequence[str]) -> BarChart
         replicate=(rep.mean - ref.mean)[order],
         candidate_low=(shift + low)[order],
         candidate_high=(shift + high)[order],
-    )
-
-
-def _least_p(ref: _Moments, cand: _Moments, rep: _Moments) -> tuple[float, float]:
-    """The least p-value over bonds times their number, for the candidate and for the replicate."""
-    n_bonds = len(ref.mean)
-    least = [1.0, 1.0]
-    for b in range(n_bonds):
-        r, c, other = (mean_estimate(float(m.mean[b]), m.draws_mean[:, b], m.n_blocks) for m in (ref, cand, rep))
-        both = truth_of(r, other)
-        for k, (x, y) in enumerate(((c, both), (other, r))):
-            if abs(x.value - y.value) > BOND_RESOLUTION_ANGSTROM:
-                least[k] = min(least[k], difference_p(x, y) * n_bonds)
-    return least[0], least[1]
-
-
-def _bond_distance_row(trio: Trio, flexible: Sequence[npt.NDArray[np.intp]]) -> Row:
-    measured = [s.features.bonds_nm for s in trio.samples]
-    bins = [distributions.normal_bins([x[:, g] for x in measured[0]]) for g in flexible]
-    counts = [
-        np.stack([distributions.grouped_counts(v, g, own, s.blocks) for g, own in zip(flexible, bins, strict=True)], 1)
-        for s, v in zip(trio.samples, measured, strict=True)
-    ]
-    return distance_row(
-        trio,
-        counts,
-        key="bond_jsd",
-        group="structure",
-        metric=f"Bond-length distance, mean of {sum(map(len, flexible))} flexible bonds",
-        statement=lambda ratio: f"bond-length distributions are {ratio:.3g} times as far off as a replicate's",
     )
 
 
@@ -290,15 +243,8 @@ def _variances(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the variance of every column `(k,)` and its bootstrap draws `(n_draws, k)`, values kept within limits,
     less what `rounding` `(k,)` adds to it."""
-    n, first, second = (np.zeros((sample.blocks.n_blocks, segments[0].shape[1])) for _ in range(3))
     centre = 0.5 * (limits[0] + limits[1])
-    for piece in sample.blocks.pieces:
-        part = segments[piece.segment][piece.start : piece.stop].astype(np.float64)
-        finite = ~np.isnan(part)
-        kept = np.where(finite, np.clip(part, *limits) - centre, 0.0)
-        n[piece.block] += finite.sum(axis=0)
-        first[piece.block] += kept.sum(axis=0)
-        second[piece.block] += (kept**2).sum(axis=0)
+    n, first, second = _moment_sums(sample, segments, centre, *limits)
 
     def variance(w: FloatArray) -> FloatArray:
         with np.errstate(invalid="ignore", divide="ignore"):

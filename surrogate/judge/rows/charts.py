@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -22,25 +22,29 @@ Role = Literal["reference", "candidate", "replicate", "other"]
 ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
 
-def _plain(value: Any) -> Any:
-    """Arrays to lists, rounded to six digits; what is not finite to None."""
-    if isinstance(value, np.ndarray):
-        return [_plain(x) for x in value.tolist()]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    if isinstance(value, (list, tuple)):
-        return [_plain(x) for x in value]
-    if isinstance(value, Curve):
-        return value.to_dict()
-    return value
-
-
 class Curve:
     """Base of the records below."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values, and under "type" which chart it is."""
-        return {name: _plain(value) for name, value in vars(self).items()} | {"type": type(self).__name__}
+        return {name: jsonable(value) for name, value in vars(self).items()} | {"type": type(self).__name__}
+
+
+def jsonable(value: Any) -> Any:
+    """Return JSON-able values of dataclasses, arrays (six digits) and numbers; what is not finite becomes None."""
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {name: jsonable(x) for name, x in vars(value).items()}
+    if isinstance(value, dict):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(x) for x in value]
+    if isinstance(value, np.ndarray):
+        return jsonable([float(f"{x:.6g}") for x in value] if value.ndim == 1 else list(value))
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)

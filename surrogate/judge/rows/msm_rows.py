@@ -13,7 +13,7 @@ from surrogate.judge.measure import distributions, msm
 from surrogate.judge.measure.kinetics import WITHOUT_TICA, lagged_eigenvalue, noise_timescale, timescale
 from surrogate.judge.measure.slow_motion import tica_features
 from surrogate.judge.measure.statistics import estimate
-from surrogate.judge.rows.charts import ROLES, BarChart, Chart, Landscape, Line, LineChart, Role
+from surrogate.judge.rows.charts import ROLES, Chart, Landscape, Line, LineChart, Role, bar_chart
 from surrogate.judge.rows.relaxation_rows import speed_words
 from surrogate.judge.rows.rows import (
     Measured,
@@ -227,23 +227,10 @@ def _free_energies(trio: Trio, model: msm.Model, states: Sequence[_States], name
         with np.errstate(divide="ignore", invalid="ignore"):
             value = -thermal_kj * np.log(total[1:-1] / total[0])
             draws = -thermal_kj * np.log(drawn[:, 1:-1] / drawn[:, :1])
-        bars = [estimate(float(v), draws[:, k], s.sample.blocks.n_blocks) for k, v in enumerate(value)]
-        found.append([np.array([getattr(b, end) for b in bars]) for end in ("value", "low", "high")])
-    reference, candidate, replicate = found
-    return BarChart(
-        section="distributions",
-        title="Free energies of the metastable states",
-        caption=f"Above {names[0]}, at {trio.temperature_k:g} K: -RT ln of the ratio of populations, 95 % intervals.",
-        y_label="ΔG / kJ/mol",
-        names=tuple(names[1:]),
-        reference=reference[0],
-        candidate=candidate[0],
-        replicate=replicate[0],
-        reference_low=reference[1],
-        reference_high=reference[2],
-        candidate_low=candidate[1],
-        candidate_high=candidate[2],
-    )
+        found.append([estimate(float(v), draws[:, k], s.sample.blocks.n_blocks) for k, v in enumerate(value)])
+    title = "Free energies of the metastable states"
+    caption = f"Above {names[0]}, at {trio.temperature_k:g} K: -RT ln of the ratio of populations, 95 % intervals."
+    return bar_chart("distributions", title, caption, "ΔG / kJ/mol", names[1:], found)
 
 
 def _check_chart(trio: Trio, model: msm.Model, s: _States, role: Role) -> Chart:

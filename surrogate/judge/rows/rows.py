@@ -23,7 +23,7 @@ from surrogate.judge.measure.statistics import (
 )
 from surrogate.judge.measure.structure import Backbone, Features
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.charts import Chart, Histogram
+from surrogate.judge.rows.charts import Chart, Histogram, jsonable
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
@@ -134,17 +134,7 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""
-        out: dict[str, Any] = {}
-        for key, value in vars(self).items():
-            if isinstance(value, Estimate):
-                out[key] = value.to_dict()
-            elif isinstance(value, float):
-                out[key] = value if math.isfinite(value) else None
-            elif isinstance(value, tuple):
-                out[key] = [x if math.isfinite(x) else None for x in value]
-            else:
-                out[key] = value
-        return out
+        return {name: jsonable(value) for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, TORSION_BIN
 from surrogate.judge.measure.probes import MOST_HISTOGRAMS, evenly
 from surrogate.judge.measure.structure import Residue
 from surrogate.judge.measure.torsions import Kind as TorsionKind
-from surrogate.judge.rows.block_means import block_means, column, family_of, shift_row
+from surrogate.judge.rows.block_means import block_means, column, family_of, mean_row, shift_row
 from surrogate.judge.rows.charts import Chart, Landscape
 from surrogate.judge.rows.rows import (
     ONE_KJ_FACTOR,
@@ -45,7 +45,9 @@ AnyFloat = npt.NDArray[np.floating]
 FEW_RESIDUES = 12
 MOST_MAPS = 16
 _MOST_DRAWN = 24
-_POPULATION_TOLERANCE = 5.0
+_LARGEST = Quantity(
+    "population_shift", "populations", "Largest shift of a basin's population", "%", 5.0, resolution=0.1
+)
 _PHI_PSI: tuple[tuple[str, Callable[[Trio], tuple[str, ...]], Callable[[Sample], Sequence[AnyFloat]]], ...] = (
     ("φ", lambda trio: trio.torsions.phi_labels, lambda s: s.features.phi),
     ("ψ", lambda trio: trio.torsions.psi_labels, lambda s: s.features.psi),
@@ -80,83 +82,44 @@ def are_many(trio: Trio) -> bool:
 def population_rows(trio: Trio) -> Measured:
     """Return the populations of psi's beta basin and of phi > 0, in percent of all frames, where that is rare its free
     energy; of many residues only the one that is furthest off."""
+    found = [("ψ in the β basin", x) for x in trio.torsions.psi_labels]
+    found += [("φ > 0", x) for x in trio.torsions.phi_labels]
+    n_psi = len(trio.torsions.psi_labels)
+
+    def members(sample: Sample) -> list[FloatArray]:
+        parts = zip(sample.features.phi, sample.features.psi, strict=True)
+        return [
+            100.0 * np.concatenate([distributions.is_beta(psi), distributions.is_positive(phi)], axis=1)
+            for phi, psi in parts
+        ]
+
+    means = [block_means(s, members(s)) for s in trio.samples]
     if are_many(trio):
-        return Measured([_largest_population_shift(trio)])
+        return Measured([shift_row(trio, _LARGEST, means, [", ".join(x) for x in found], _instead)])
     rows, rare = [], rare_residues(trio)
-    for k, label in enumerate(trio.torsions.psi_labels):
-        rows.append(_population_row(trio, "psi", k, distributions.is_beta, "ψ in the β basin", label))
-    for k, label in enumerate(trio.torsions.phi_labels):
-        if k in rare:
-            rows.append(free_energy_row(trio, k, label))
-        else:
-            rows.append(_population_row(trio, "phi", k, distributions.is_positive, "φ > 0", label))
+    for k, (name, label) in enumerate(found):
+        if k - n_psi in rare:
+            rows.append(free_energy_row(trio, k - n_psi, label))
+            continue
+        share = float(means[0].values[k])
+        tolerance = min(share, 100.0 - share) * (1.0 - 1.0 / ONE_KJ_FACTOR)
+        key = f"population:{name}:{label}"
+        quantity = Quantity(key, "populations", f"{name}, {label}", "%", tolerance, "± 1 kJ/mol")
+        rows.append(mean_row(trio, quantity, means, k, _held(name, label)))
     return Measured(rows)
 
 
-def _largest_population_shift(trio: Trio) -> Row:
-    labels = [f"ψ in the β basin, {x}" for x in trio.torsions.psi_labels]
-    labels += [f"φ > 0, {x}" for x in trio.torsions.phi_labels]
-    means = [
-        block_means(
-            sample,
-            [
-                100.0 * np.concatenate([distributions.is_beta(psi), distributions.is_positive(phi)], axis=1)
-                for phi, psi in zip(sample.features.phi, sample.features.psi, strict=True)
-            ],
-        )
-        for sample in trio.samples
-    ]
-    return shift_row(
-        trio,
-        Quantity(
-            "population_shift",
-            "populations",
-            "Largest shift of a basin's population",
-            "%",
-            _POPULATION_TOLERANCE,
-            resolution=0.1,
-        ),
-        means,
-        labels,
-        lambda label, c, r: f"{label}: {c:.3g} % of frames instead of {r:.3g} %",
-    )
+def _instead(label: str, candidate: float, reference: float) -> str:
+    return f"{label}: {candidate:.3g} % of frames instead of {reference:.3g} %"
 
 
-def _population_row(
-    trio: Trio,
-    torsion: str,
-    k: int,
-    member: Callable[[npt.NDArray[np.floating]], npt.NDArray[np.bool_]],
-    name: str,
-    label: str,
-) -> Row:
-    values, draws = [], []
-    for sample in trio.samples:
-        series = sample.features.psi if torsion == "psi" else sample.features.phi
-        inside, total = distributions.block_occupancy([member(s[:, k]) for s in series], sample.blocks)
-        values.append(100.0 * float(inside.sum() / total.sum()))
-        draws.append(100.0 * (sample.weights @ inside) / (sample.weights @ total))
-    share = values[0] / 100.0
-
+def _held(name: str, label: str) -> Callable[[float, float], str]:
     def statement(candidate: float, reference: float) -> str:
         if candidate == 0.0:
             return f"{name} of {label} is never visited (reference {reference:.3g} %)"
         return f"{name} of {label} holds {candidate:.3g} % instead of {reference:.3g} %"
 
-    return observable_row(
-        trio,
-        Quantity(
-            f"population:{name}:{label}",
-            "populations",
-            f"{name}, {label}",
-            "%",
-            100.0 * min(share, 1.0 - share) * (1.0 - 1.0 / ONE_KJ_FACTOR),
-            tolerance_text="± 1 kJ/mol",
-        ),
-        values,
-        draws,
-        statement,
-    )
+    return statement
 
 
 def torsion_rows(trio: Trio) -> Measured:

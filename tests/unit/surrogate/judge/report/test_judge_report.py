@@ -19,8 +19,7 @@ from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.report import report, wording
 from surrogate.judge.report.figures import Album, albums
-from surrogate.judge.report.markdown import to_markdown
-from surrogate.judge.report.report import Foreword, write_report
+from surrogate.judge.report.report import Foreword, to_markdown, write_report
 from surrogate.judge.report.wording import side_by_side
 from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
