@@ -3,7 +3,8 @@
 Halves of one set share its start, so neither a replicate nor a bootstrap can see that a set still depends on it. Time
 can: equilibrium MD looks the same forwards and backwards, so that whatever grows along the replicas, more often than
 swapped signs of time would give, has not ended. What cannot drift because it never moves is counted: transitions,
-replicas that left their start, their length against the slowest relaxation.
+replicas that left their start, their length against the slowest relaxation. What an unconverged reference leaves open
+of a candidate's difference, and what differs all the same, is told by `explain`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; and one sentence for the whole."""
+"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; one sentence for the whole; and the
+three lines on top of a report: use it or not, for what, why."""
 
 from __future__ import annotations
 

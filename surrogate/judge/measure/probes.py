@@ -33,8 +33,8 @@ _MANY_ATOMS = 100
 _FLAT_RING_NM = 0.01
 _ROUNDS = 5
 _BACKBONE = ("N", "CA", "C", "O", "OXT")
-MAX_LENGTH_NM = 0.25
-MIN_ANGLE_COSINE = -0.5
+_HYDROGEN_BOND_NM = 0.25
+_HYDROGEN_BOND_COSINE = -0.5
 Frames = npt.NDArray[np.floating]
 COIL, HELIX, STRAND = 0, 1, 2
 # A turn of a 3-10 helix spans four residues, and two that follow each other make it a helix.
@@ -423,8 +423,8 @@ def is_formed(columns: FloatArray, triplets: IntArray) -> npt.NDArray[np.bool_]:
         along = np.zeros_like(to_acceptor)
         for axis in columns:
             along += (axis[donor] - axis[hydrogen]) * (axis[acceptor] - axis[hydrogen])
-        bent = along < MIN_ANGLE_COSINE * np.sqrt(to_acceptor * to_donor)
-        formed: npt.NDArray[np.bool_] = bent & (to_acceptor < MAX_LENGTH_NM**2)
+        bent = along < _HYDROGEN_BOND_COSINE * np.sqrt(to_acceptor * to_donor)
+        formed: npt.NDArray[np.bool_] = bent & (to_acceptor < _HYDROGEN_BOND_NM**2)
     return formed
 
 

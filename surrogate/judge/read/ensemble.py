@@ -1,4 +1,8 @@
-"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene."""
+"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene.
+
+It is read from files that are opened, matched to the reference's atoms, made whole and laid out in time, and holds what
+they say of themselves: settings, costs, what guards did.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Frames that stay in their file until they are asked for, whole molecules, in the atom order of the comparison."""
+"""Frames that stay in their file until they are asked for, whole molecules, in the atom order of the comparison; and
+what their coordinates are rounded to, as the file's header states or its numbers show.
+
+A coordinate that is rounded to a grid of spacing g is off by a uniform error of standard deviation g/√12, and the
+length of a bond, along which two of them subtract, by g/√6. All trajectories of a comparison are laid on the coarsest
+grid of any of them, so that what rounding does to lengths, angles and nearest distances it does to all alike.
+"""
 
 from __future__ import annotations
 

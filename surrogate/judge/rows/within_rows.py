@@ -1,4 +1,4 @@
-"""Rows of what moves fast, looked at within the states of what moves slowly, in blocks of its own."""
+"""Rows of what moves fast: torsions within the states of slower ones and steps from frame to frame, in own blocks."""
 
 from __future__ import annotations
 
