@@ -187,7 +187,7 @@ class Wells:
 def find_wells(torsion: str, *samples: Segments) -> Wells:
     """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts."""
     density = np.zeros(_BINS)
-    for segments in samples:
+    for segments in filter(len, samples):
         values = np.concatenate([np.asarray(x, dtype=np.float64) for x in segments])
         values = values[np.isfinite(values)]
         if len(values):
