@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from surrogate.api import *  # noqa: F403
     from surrogate.sampling.openmm.simulation import Simulation as Simulation
-    from systems.trajectory.converted import to_mdanalysis as to_mdanalysis
-    from systems.trajectory.converted import to_mdtraj as to_mdtraj
-    from systems.trajectory.frame_weights import frame_weights as frame_weights
+    from systems.trajectory.codec import frame_weights as frame_weights
+    from systems.trajectory.codec import to_mdanalysis as to_mdanalysis
+    from systems.trajectory.codec import to_mdtraj as to_mdtraj
 
 __version__ = "0.1.0"
 
 _ELSEWHERE = {
     "Simulation": "surrogate.sampling.openmm.simulation",
-    "frame_weights": "systems.trajectory.frame_weights",
-    "to_mdanalysis": "systems.trajectory.converted",
-    "to_mdtraj": "systems.trajectory.converted",
+    "frame_weights": "systems.trajectory.codec",
+    "to_mdanalysis": "systems.trajectory.codec",
+    "to_mdtraj": "systems.trajectory.codec",
 }
 
 

@@ -54,7 +54,7 @@ class FormatTable(SphinxDirective):
     """`{formats}`: the formats that are read, and what their files state."""
 
     def run(self) -> list[nodes.Node]:
-        from systems.trajectory.format_table import markdown
+        from systems.trajectory.foreign_scenes import markdown
 
         return self.parse_text_to_nodes(markdown())
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from md_reference.forces.spec import ForceFieldSpec
-from md_reference.forces.template_files import PROTEIN_FILES, cutoff_nm, water_file
+from md_reference.forces.spec import PROTEIN_FILES, ForceFieldSpec, cutoff_nm, water_file
 from systems.scene import Scene
 
 TEMPERATURE_K, FRICTION_PER_PS, TIMESTEP_PS = 300.0, 1.0, 0.002

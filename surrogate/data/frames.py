@@ -289,8 +289,7 @@ class _Survey:
 
 def _survey(paths: list[Path], held: list[Path], *, canonical: bool, velocities: bool) -> _Survey:
     """Return what the files say of themselves. Raises InputError when they do not go together."""
-    from systems.trajectory.codec import open_trajectory
-    from systems.trajectory.joined_file import refuse_joined
+    from systems.trajectory.codec import open_trajectory, refuse_joined
 
     if not paths:
         raise InputError("no trajectory given to train on.")

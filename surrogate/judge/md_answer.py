@@ -165,7 +165,7 @@ class _Torsions:
 
     def of(self, ensemble: Ensemble) -> list[FloatArray]:
         """Return angles `(n_frames, k)` rad per segment, times their fold; NaN where a frame is not finite."""
-        from systems.chemistry.frame_columns import column_blocks, torsion_angle
+        from systems.chemistry.geometry import column_blocks, torsion_angle
 
         out = []
         for segment in ensemble.segments:

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from surrogate.models.atom_features import AtomFeatures
 from surrogate.models.peptides.chains import ChainFeatures
-from systems.elements import ATOMIC_NUMBERS, PARTICLE
 from systems.errors import InputError
+from systems.scene import ATOMIC_NUMBERS, PARTICLE
 
 if TYPE_CHECKING:
     from systems.scene import Scene

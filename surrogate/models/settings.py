@@ -20,7 +20,7 @@ def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
 
 
 def toml_text(record: dict[str, Any], table: str = "") -> str:
-    """Return a record as the TOML of `systems.files.toml_file.read_toml`; keys whose value is None are left out.
+    """Return a record as the TOML of `systems.options.read_toml`; keys whose value is None are left out.
 
     Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
     """

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.limits import Limits, check_limits
 from systems.chemistry.validity import (
     ANGLE,
     DRIFT,
@@ -19,7 +18,9 @@ from systems.chemistry.validity import (
     STILL,
     UNSURE,
     Geometry,
+    Limits,
     check_frames,
+    check_limits,
 )
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.config import RolloutConfig
 from surrogate.sampling.domain import DomainMatch
 from systems.errors import InputError
-from systems.scene import Scene
-from systems.selection import select_atoms
+from systems.scene import Scene, select_atoms
 from systems.units import whole_steps
 
 if TYPE_CHECKING:

@@ -27,8 +27,7 @@ from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError
 from systems.files.outside import check_disk
 from systems.interrupts import deferred_interrupt
-from systems.scene import Scene
-from systems.selection import part_of
+from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
@@ -71,7 +70,7 @@ def rollout(
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
-    marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.limits) against the
+    marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.validity) against the
     training reference, and what was done about it (column `intervention`, `account.MARKS`); the record's
     `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
     replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C

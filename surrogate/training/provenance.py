@@ -11,8 +11,7 @@ import torch
 
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.weights import TrainingDomain, Weights
-from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 
 
 def training_domain(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import CampaignOptions, PathLike
-from systems.takes import takes
+from systems.options import takes
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from surrogate.verbs.options import CompareOptions, PathLike, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from systems.errors import InputError
-from systems.takes import takes
+from systems.options import takes
 
 if TYPE_CHECKING:
     import numpy as np

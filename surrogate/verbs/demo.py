@@ -11,7 +11,7 @@ from surrogate.verbs.options import DemoOptions, PathLike
 from surrogate.verbs.reference import reference
 from surrogate.verbs.rollout import rollout
 from systems.errors import InputError
-from systems.takes import takes
+from systems.options import takes
 
 if TYPE_CHECKING:
     from surrogate.judge.comparison import Comparison

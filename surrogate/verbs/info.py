@@ -60,7 +60,7 @@ def _run(folder: Path) -> dict[str, Any] | None:
 def _coverage(path: Path, scene: str) -> dict[str, Any]:
     from surrogate.data.weights import load_weights
     from surrogate.sampling.domain import match_domain
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     weights, prepared = load_weights(path), prepare(scene)
     try:

@@ -12,7 +12,7 @@ from surrogate.verbs.options import TrainOptions, Trajectories
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.errors import InputError
-from systems.preparation import Preparation
+from systems.options import Preparation
 from systems.scene import Scene
 
 if TYPE_CHECKING:

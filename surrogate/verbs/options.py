@@ -10,8 +10,7 @@ from typing import Any
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
 from md_reference.run.config import MDConfig
 from surrogate.sampling.config import RolloutConfig
-from systems.options import OptionRow, from_field, option, option_rows
-from systems.preparation import Preparation
+from systems.options import OptionRow, Preparation, from_field, option, option_rows
 from systems.units import Quantity, parse_time_ps
 
 PathLike = str | Path

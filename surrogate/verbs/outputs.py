@@ -12,7 +12,7 @@ from surrogate.verbs.options import Trajectories
 from systems.errors import InputError
 from systems.trajectory.checkpoint import checkpoint_path, frames_in
 from systems.trajectory.codec import WRITTEN
-from systems.trajectory.topology_file import refuse_foreign_topology
+from systems.trajectory.companion_writer import refuse_foreign_topology
 
 TRAJECTORY_SUFFIXES = WRITTEN
 
@@ -44,7 +44,7 @@ def check_outputs(
 
 def join_replicas(written: Sequence[Path], joined: Sequence[Path], *, overwrite: bool) -> list[Path]:
     """Return what a verb wrote, with the file `joined` of all replicas at the end, where there is to be one."""
-    from systems.trajectory.joined_file import join
+    from systems.trajectory.codec import join
 
     return [*written, *(join(written, out, overwrite=overwrite) for out in joined)]
 
@@ -111,8 +111,7 @@ def find_trajectories(spec: Trajectories, *, verify: bool = False) -> list[Path]
 
 def _counted_once(found: list[Path]) -> list[Path]:
     """Return files without those that join others of them, which would be counted twice."""
-    from systems.trajectory.codec import open_trajectory
-    from systems.trajectory.joined_file import KEY
+    from systems.trajectory.codec import KEY, open_trajectory
 
     kept = []
     for path in found:

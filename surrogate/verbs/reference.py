@@ -11,7 +11,7 @@ from surrogate.verbs.options import PlanOptions, ReferenceOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
-from systems.takes import takes
+from systems.options import takes
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig
@@ -47,14 +47,14 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
     `seed`, `seed + 1`, ..., and `join` writes them into NAME.h5, too, one after another, whose record says where each
     begins. Settings that are not given are those of `protocol` (a paper's, by name:
-    `systems.library.protocols`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
+    `systems.library.named_scenes`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
     4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
     for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
-    `systems.source.prepare`. `resume` goes on from the checkpoint beside `out`.
+    `systems.library.named_scenes.prepare`. `resume` goes on from the checkpoint beside `out`.
     Raises InputError, PreparationError (no parameters), SimulationError (the good frames stay) and StorageError.
     """
     from md_reference.run.replicas import simulate_replicas
-    from systems.trajectory.claim import replica_paths
+    from systems.files.whole_file import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
     joined = [Path(out)] if options.join and len(outs) > 1 else []
@@ -91,8 +91,7 @@ def settle_run(
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level
-    from md_reference.run.config import MDConfig, resolved
-    from md_reference.run.defaults import settle, to_config
+    from md_reference.run.config import MDConfig, resolved, settle, to_config
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}

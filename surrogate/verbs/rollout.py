@@ -12,8 +12,7 @@ from surrogate.verbs.options import RolloutOptions
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
-from systems.options import part_of
-from systems.takes import takes
+from systems.options import part_of, takes
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -42,11 +41,11 @@ def rollout(
     record (`interventions`) and in a column, frame by frame. `select` (MDTraj's language) and `atoms` ('all', 'heavy')
     say which atoms are written. `force` rolls a scene that leaves the training domain where that is possible.
     `temperature_k` is refused unless it is that of the weights; a learned potential takes any, and `friction_per_ps`,
-    `timestep_ps`, `hydrogen_mass_da` and `ensemble`. `ph` to `cap_breaks`: see `systems.source.prepare`.
+    `timestep_ps`, `hydrogen_mass_da` and `ensemble`. `ph` to `cap_breaks`: see `systems.library.named_scenes.prepare`.
     Raises OutOfDomainError for a molecule the weights do not cover, InputError, WeightsError, SimulationError (the
     guard cannot bring a chunk through), StorageError.
     """
-    from systems.trajectory.claim import replica_paths
+    from systems.files.whole_file import replica_paths
 
     outs = replica_paths(Path(out), options.replicas)
     joined = [Path(out)] if options.join and len(outs) > 1 else []

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.verbs.telling import tell
 from systems.chemistry.graph import molecule_key
-from systems.options import part_of
-from systems.preparation import Preparation
+from systems.options import Preparation, part_of
 
 if TYPE_CHECKING:
     from systems.scene import Scene
@@ -39,7 +38,7 @@ def _describe(name: str, *, whole: bool) -> dict[str, Any]:
     }
     if whole:
         from systems.chemistry.graph import backbone_torsions
-        from systems.library.protocols import find_protocol
+        from systems.library.named_scenes import find_protocol
 
         record |= {
             "n_bonds": len(scene.bonds),
@@ -69,12 +68,12 @@ def _written(settings: dict[str, Any]) -> dict[str, Any]:
 def prepare_scene(scene: str | Path | Scene, options: Preparation, *, quiet: bool) -> Scene:
     """Return a Scene for what a user may write, a path as such too; what had to be repaired is said on stderr.
 
-    Raises what `systems.source.prepare` raises.
+    Raises what `systems.library.named_scenes.prepare` raises.
     """
     if not isinstance(scene, str | Path):
         return scene
     scene = str(scene)
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     prepared = prepare(scene, options=part_of(options, Preparation))
     if not quiet:

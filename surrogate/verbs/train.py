@@ -16,8 +16,8 @@ from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from surrogate.verbs.telling import tell
 from systems.errors import InputError
-from systems.takes import takes
-from systems.trajectory.claim import Claim
+from systems.files.whole_file import Claim
+from systems.options import takes
 
 if TYPE_CHECKING:
     from surrogate.data.references import References

@@ -7,7 +7,7 @@ from pathlib import Path
 from surrogate.verbs.options import PathLike, Trajectories, WindowsOptions
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from systems.errors import InputError
-from systems.takes import takes
+from systems.options import takes
 
 
 @takes(WindowsOptions)

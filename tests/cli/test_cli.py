@@ -18,7 +18,7 @@ from command_line import refused, run
 from surrogate import api
 from systems.errors import SurromdError
 from systems.library.named_scenes import load
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 COMMANDS = ["demo", "run", "systems", "plan", "reference", "windows", "train", "rollout", "compare", "info"]
 SURROMD = [sys.executable, "-m", "surrogate.cli.main"]

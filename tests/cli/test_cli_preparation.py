@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from surrogate.cli.main import app
 from systems.library import named_scenes
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 RUNNER = CliRunner()
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"

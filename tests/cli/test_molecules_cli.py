@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from command_line import TWO_SOLVER_STEPS, run
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 from systems.trajectory.codec import open_trajectory, open_writer
 
 SMALL = "[model]\nwidth = 16\nn_layers = 1\nn_heads = 2\nchunk_frames = 4\n"

@@ -10,7 +10,7 @@ import pytest
 from command_line import run
 from systems.chemistry.graph import molecule_key
 from systems.library import named_scenes
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 # The order and the names of the Protein Data Bank: heavy atoms of a residue first.

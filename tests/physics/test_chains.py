@@ -14,19 +14,18 @@ import pytest
 from energies import energy_terms
 from md_reference.forces import nonstandard
 from md_reference.forces.forcefield import build_system, resolve
-from md_reference.forces.glycans import glycan_templates
 from md_reference.forces.regrouping import regroup
 from md_reference.forces.residue_templates import cap, make_template
-from md_reference.forces.small_molecules.ambertools import find_ambertools, run
 from md_reference.forces.small_molecules.gaff import POWER, SECONDS_AT_30_ATOMS, announced, expected_s
+from md_reference.forces.small_molecules.programs import find_ambertools, run
 from md_reference.forces.spec import ForceFieldSpec
+from md_reference.forces.templates import glycan_templates
 from systems.chemistry.bond_orders import perceive
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
-from systems.library.named_scenes import load
+from systems.library.named_scenes import load, prepare
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene
-from systems.source import prepare
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 

@@ -18,8 +18,7 @@ from md_reference.run.engine import Engine
 from systems.errors import InputError, PreparationError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
-from systems.scene import FloatArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, Scene, part_of
 
 TIP3P = ForceFieldSpec("ff14SB", "tip3p")
 AVOGADRO_NM3 = 602.214  # dalton per nm³ in one g/cm³

@@ -13,8 +13,8 @@ from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from systems.errors import PreparationError, UnknownNameError
+from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, Scene
-from systems.source import prepare
 
 ENERGY_TOLERANCE_KJ_MOL = 1e-3
 FORCE_TOLERANCE_KJ_MOL_NM = 1e-3

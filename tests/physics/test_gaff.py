@@ -16,13 +16,12 @@ import pytest
 from energies import energy_terms
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.small_molecules import gaff, parameter_cache
-from md_reference.forces.small_molecules.ambertools import find_ambertools
 from md_reference.forces.small_molecules.prmtop import Prmtop, load_openmm
+from md_reference.forces.small_molecules.programs import find_ambertools
 from md_reference.forces.spec import ForceFieldSpec
 from systems.errors import PreparationError
 from systems.prepare.molecule import scene_from_smiles
-from systems.scene import FloatArray, Scene
-from systems.selection import reordered
+from systems.scene import FloatArray, Scene, reordered
 
 needs_ambertools = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184
@@ -196,7 +195,7 @@ def test_shipped_parameters_need_no_ambertools(monkeypatch: pytest.MonkeyPatch, 
     from systems.library.named_scenes import load
 
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
-    monkeypatch.setattr("md_reference.forces.small_molecules.ambertools.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.small_molecules.programs.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
     scene = load("aspirin")
     assert Prmtop(gaff.parameters(scene)).n_atoms == scene.n_atoms

@@ -10,7 +10,7 @@ import pytest
 from known_answers import double_well_density, double_well_left_population
 from surrogate.judge.measure import kinetics, msm
 from surrogate.judge.measure.statistics import Estimate, block_length, bootstrap_weights, estimate, make_blocks
-from systems.library.model_systems import double_well
+from systems.library.named_scenes import double_well
 
 N_RUNS, N_FRAMES, N_DRAWS = 500, 4_000, 200
 # 500 intervals at 95 %: a standard error of 1 %, so these bounds are missed by chance once in some 200 times.

@@ -12,7 +12,7 @@ from known_answers import double_well_left_population, harmonic_answers
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
-from systems.library.model_systems import double_well, harmonic_oscillator, particles
+from systems.library.named_scenes import double_well, harmonic_oscillator, particles
 from systems.scene import FloatArray, Scene
 
 MODEL = ForceFieldSpec("model", "vacuum")

@@ -12,12 +12,11 @@ import pytest
 
 from energies import energy_terms
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.small_molecules.ambertools import find_ambertools, run
+from md_reference.forces.small_molecules.programs import find_ambertools, run
 from md_reference.forces.spec import ForceFieldSpec
-from systems.library.named_scenes import load
+from systems.library.named_scenes import load, prepare
 from systems.scene import FloatArray, Scene
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 pytestmark = pytest.mark.skipif(find_ambertools() is None, reason="AmberTools is not installed")
 KJ_PER_KCAL = 4.184

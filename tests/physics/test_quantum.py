@@ -15,8 +15,7 @@ import pytest
 from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
 from md_reference.forces.spec import ForceFieldSpec, at_level
-from md_reference.run.config import Conditions
-from md_reference.run.defaults import settle
+from md_reference.run.config import Conditions, settle
 from md_reference.run.engine import Engine
 from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import InputError, PreparationError, UnknownNameError

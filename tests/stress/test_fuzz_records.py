@@ -31,7 +31,7 @@ from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError, SurromdError
-from systems.files.checksums import sealed
+from systems.files.whole_file import sealed
 from systems.library.named_scenes import load
 from systems.scene import Scene
 from systems.trajectory.checkpoint import CheckpointFile, checkpoint_path, last_supported, new_header, read_checkpoints
@@ -302,7 +302,7 @@ def test_names_of_files_hold_no_nul(tmp_path: Path) -> None:
 DOORS = {
     r"h5py\.File\((?!.*\"w\"\))": ("systems/files/outside.py",),
     r"np\.load(txt)?\(": ("systems/files/outside.py",),
-    r"gzip\.(open|decompress)\(": ("systems/chemistry/components.py", "systems/trajectory/frame_orders.py"),
+    r"gzip\.(open|decompress)\(": ("systems/chemistry/residues.py", "systems/trajectory/xyz_file.py"),
     r"json\.loads?\(": ("systems/files/schema.py",),
     r"tomllib\.loads?\(": ("surrogate/models/registry.py",),
 }

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from systems.errors import SurromdError
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 from time_limits import time_limit
 
 SOURCES = ("alanine-dipeptide", "aspirin", "ethanol", "benzene", "ACE-TRP-NME", "ACE-PRO-NME", "ACE-CYS-NME", "toluene")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from systems.errors import TrajectoryError
+from systems.files.whole_file import Claim
 from systems.scene import Scene
-from systems.trajectory.claim import Claim
 from systems.trajectory.codec import open_trajectory, open_writer
 
 COMMAND = [sys.executable, "-m", "surrogate.cli.main", "reference", "double-well", "--time", "4ps", "--save-every",

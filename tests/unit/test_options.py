@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import with_options
 from systems.errors import InputError, UnitError, UnknownNameError
-from systems.options import MissingOptionError, check_options, gather, option, option_rows, options_of
-from systems.takes import takes
+from systems.options import MissingOptionError, check_options, gather, option, option_rows, options_of, takes
 
 
 @dataclass(frozen=True, kw_only=True)

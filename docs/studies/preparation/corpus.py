@@ -130,7 +130,7 @@ def try_row(row: Row, *, charges: bool = False, limit_s: int = 300) -> Outcome:
 
 def _try(row: Row, charges: bool) -> Outcome:
     from systems.errors import SurromdError
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     try:
         scene = prepare(row.spec)
@@ -151,7 +151,7 @@ def _forces(scene: Any, charges: bool) -> tuple[str, str, float | None]:
     import openmm
 
     from md_reference.forces.forcefield import build_system
-    from md_reference.forces.small_molecules.ambertools import find_ambertools
+    from md_reference.forces.small_molecules.programs import find_ambertools
     from md_reference.forces.spec import ForceFieldSpec
     from systems.errors import SurromdError
 

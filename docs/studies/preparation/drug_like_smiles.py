@@ -74,7 +74,7 @@ def cases() -> list[Case]:
 def run_case(case: Case, *, time_ps: float, timestep_ps: float, force_field: str) -> Outcome:
     """Prepare, parametrise and simulate one molecule; what refuses it ends in the outcome."""
     from surrogate import api
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
     from systems.trajectory.codec import open_trajectory
 
     start = time.perf_counter()

@@ -57,7 +57,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
     MDAnalysis with the same coordinates. `energy_spread`: in NVE, the standard deviation of the total energy over the
     mean kinetic one.
     """
-    from md_reference.run.defaults import settle, to_config
+    from md_reference.run.config import settle, to_config
     from md_reference.run.simulate import simulate
     from systems.chemistry.validity import INVALID, check_frames, geometry_from_scene
     from systems.library import named_scenes
@@ -114,7 +114,7 @@ def _elsewhere(path: Path, frames: Any) -> str:
     import MDAnalysis
     import mdtraj
 
-    from systems.trajectory.topology_file import topology_path
+    from systems.trajectory.companion_writer import topology_path
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

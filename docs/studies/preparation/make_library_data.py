@@ -12,9 +12,9 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
-from systems.library.catalogue import ENTRIES, Entry
+from systems.library.named_scenes import ENTRIES, Entry
 from systems.scene import Scene
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 
 def make(entry: Entry) -> list[Path]:

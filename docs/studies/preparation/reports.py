@@ -15,7 +15,7 @@ from pathlib import Path
 
 from surrogate.verbs.run.many_scenes import molecules_in
 from systems.errors import SurromdError
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 from systems.trajectory.codec import open_trajectory
 
 TOPOLOGIES = {"ref.h5", "ref.pdb", "eth.h5", "eth.pdb", "README.md"}

@@ -1,4 +1,4 @@
-"""Print the handedness of C1 to C5 of the sugars in md_reference/forces/glycans.py, from the dictionary's ideal
+"""Print the handedness of C1 to C5 of the sugars in md_reference/forces/templates.py, from the dictionary's ideal
 coordinates.
 
     python docs/studies/preparation/sugar_handedness.py
@@ -12,7 +12,7 @@ import sys
 
 import biotite.structure.info as info
 
-from md_reference.forces.glycans import CENTRES, SUGARS
+from md_reference.forces.templates import CENTRES, SUGARS
 from systems.chemistry.geometry import signed_volumes
 
 

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from molecule_windows import MoleculeWindows, pair_kinds, split_windows
 
-from systems.elements import ATOMIC_NUMBERS
 from systems.errors import InputError
 from systems.files.outside import arrays_in
 from systems.library import named_scenes
-from systems.scene import Scene
+from systems.scene import ATOMIC_NUMBERS, Scene
 
 if TYPE_CHECKING:
     from surrogate.progress import ProgressFn
@@ -39,7 +38,7 @@ def make_trajectories(
     files stay and interrupted ones go on. Raises InputError for files of other settings.
     """
     from md_reference.forces.forcefield import resolve
-    from md_reference.run.defaults import settle, to_config
+    from md_reference.run.config import settle, to_config
     from md_reference.run.simulate import simulate
 
     folder.mkdir(parents=True, exist_ok=True)

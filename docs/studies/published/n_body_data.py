@@ -15,7 +15,7 @@ from n_body_generator import N_BODY, generate_n_body
 from particle_sets import SPLITS, ParticleSet, append_systems, create_sets, n_complete
 
 from md_reference.run.machine import available_cores
-from systems.parent_watch import end_with_parent
+from systems.interrupts import end_with_parent
 
 if TYPE_CHECKING:
     from surrogate.progress import ProgressFn

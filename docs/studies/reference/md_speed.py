@@ -33,7 +33,7 @@ from surrogate.bench.machine import machine_facts
 from surrogate.bench.plain_openmm import FRICTION_PER_PS, TEMPERATURE_K, TIMESTEP_PS, Setup, plain
 from systems.errors import InputError, SimulationError, SurromdError, first_line, nearest
 from systems.files.whole_file import create_whole
-from systems.parent_watch import end_with_parent
+from systems.interrupts import end_with_parent
 from systems.scene import Scene
 from systems.units import parse_wall_s
 
@@ -58,7 +58,7 @@ class Case:
 
     def prepared(self) -> Scene:
         """Return the scene, solvated where the solvent is explicit. Raises PreparationError."""
-        from systems.source import prepare
+        from systems.library.named_scenes import prepare
 
         scene = prepare(self.scene)
         if not self.spec().is_explicit:

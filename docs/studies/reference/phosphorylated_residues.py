@@ -17,7 +17,7 @@ from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree
 
-from md_reference.forces.small_molecules.ambertools import ambertools, gaff2_table
+from md_reference.forces.small_molecules.programs import ambertools, gaff2_table
 
 KCAL = 4.184
 # Columns that the types of a term take.

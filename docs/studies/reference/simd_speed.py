@@ -23,8 +23,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name, platform_properties
 from md_reference.simd.force_field import SimdReplicas
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 
 CASES = (
     ("ethanol", None),

@@ -20,7 +20,7 @@ from surrogate.verbs.run.one_scene import describe_run
 from surrogate.verbs.run.run_record import RUN_NAME
 from systems.errors import SurromdError
 from systems.prepare.peptide import build_peptide
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 from systems.units import format_time_ps, format_wall
 
 MOLECULES = {

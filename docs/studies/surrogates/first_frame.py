@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from systems.library.named_scenes import load
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 SCENE = "alanine-dipeptide"
 HERE = Path(__file__).resolve().parents[3]

@@ -32,7 +32,7 @@ from surrogate.data.weights import load_weights, save_weights
 from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
 from surrogate.progress import training_bar
-from systems.trajectory.claim import replica_paths
+from systems.files.whole_file import replica_paths
 from systems.units import parse_wall_s
 
 SCENE = "alanine-dipeptide"

@@ -24,15 +24,15 @@ from peptide_seeds import Seeds, choose_seeds
 from processes import in_order, only_here
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.batch import simulate_batch
 from md_reference.run.config import SIMD, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
+from md_reference.run.replicas import simulate_batch
 from md_reference.simd.force_field import n_replicas
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.topology_file import topology_path
+from systems.trajectory.companion_writer import topology_path
 from systems.units import parse_wall_s
 
 DISCARD_PS, TEST_DISCARD_PS = 20.0, 1000.0

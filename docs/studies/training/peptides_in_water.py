@@ -26,16 +26,16 @@ from processes import in_order, only_here
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.batch import simulate_batch
 from md_reference.run.config import SIMD, Conditions, MDConfig
 from md_reference.run.engine import Engine
 from md_reference.run.machine import available_cores
+from md_reference.run.replicas import simulate_batch
 from md_reference.simd.force_field import SimdReplicas, n_replicas
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.prepare.peptide import build_peptide
 from systems.scene import FloatArray, IntArray, Scene
-from systems.trajectory.topology_file import topology_path
+from systems.trajectory.companion_writer import topology_path
 from systems.units import parse_wall_s
 
 WATER, IMPLICIT = ForceFieldSpec("ff14SB", "tip3p"), ForceFieldSpec("ff14SB", "obc2")

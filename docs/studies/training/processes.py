@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from systems.errors import SimulationError
-from systems.parent_watch import end_with_parent
+from systems.interrupts import end_with_parent
 
 
 def in_order(

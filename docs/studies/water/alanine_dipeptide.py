@@ -20,13 +20,13 @@ import numpy as np
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.batch import simulate_batch
 from md_reference.run.config import Conditions, MDConfig
 from md_reference.run.engine import Engine
+from md_reference.run.replicas import simulate_batch
 from md_reference.run.simulate import simulate
 from md_reference.simd.force_field import n_replicas
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 from systems.units import parse_length_nm, parse_time_ps
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")

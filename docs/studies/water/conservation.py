@@ -23,8 +23,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name
 from md_reference.simd.force_field import SimdReplicas
+from systems.library.named_scenes import prepare
 from systems.scene import FloatArray
-from systems.source import prepare
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")

@@ -26,8 +26,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name
 from md_reference.simd.force_field import SimdReplicas
+from systems.library.named_scenes import prepare
 from systems.scene import FloatArray
-from systems.source import prepare
 
 PEPTIDES = (
     *("ACE-ALA-NME", "ACE-GLY-NME", "ACE-VAL-NME", "ACE-SER-NME", "ACE-PHE-NME", "ACE-TRP-NME", "ACE-LEU-SER-NME"),

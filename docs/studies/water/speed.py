@@ -28,7 +28,7 @@ from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name
 from md_reference.simd import force_field
 from md_reference.simd.force_field import SimdReplicas, aligned
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
 PADDINGS_NM = (1.0, 1.5, 2.0, 2.2)

@@ -18,10 +18,9 @@ from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.domain import find_deviations, match_domain
 from systems.chemistry.validity import Geometry
 from systems.errors import OutOfDomainError, SurromdError
-from systems.scene import Scene
-from systems.selection import part_of, reordered
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.library.named_scenes import prepare
+from systems.scene import Scene, part_of, reordered
+from systems.trajectory.companion_writer import pdb_text
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights

@@ -75,7 +75,7 @@ def stress_weights(
 ) -> dict[str, Any]:  # fmt: skip
     """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
 
-    Weights of several peptides are tried on `scene`, as `systems.source` reads it, or the first that they were
+    Weights of several peptides are tried on `scene`, as `systems.library.named_scenes` reads it, or the first that they were
     trained on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that
     cannot be written; KeyboardInterrupt says what is kept.
     """
@@ -85,7 +85,7 @@ def stress_weights(
 
     loaded = load_weights(weights_path(weights))
     if scene is not None:
-        from systems.source import prepare
+        from systems.library.named_scenes import prepare
 
         loaded, _ = fit_weights(prepare(scene), loaded)
     elif loaded.domain.transferable:

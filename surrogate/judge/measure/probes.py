@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.torsions import Torsion, find_torsions
-from systems.chemistry.frame_columns import bond_angle, column_blocks, squared_distance, torsion_angle
+from systems.chemistry.geometry import bond_angle, column_blocks, squared_distance, torsion_angle
 from systems.scene import Scene
 
 IntArray = npt.NDArray[np.int64]

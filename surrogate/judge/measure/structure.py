@@ -155,7 +155,7 @@ class Yardstick:
 
     def measure(self, ensemble: Ensemble) -> Features:
         """Measure every frame of `ensemble`, block by block: no more than a block of positions is held at a time."""
-        from systems.chemistry.frame_columns import column_blocks, squared_distance, torsion_angle
+        from systems.chemistry.geometry import column_blocks, squared_distance, torsion_angle
         from systems.chemistry.validity import check_frames
 
         torsions, geometry, probes = self.torsions, self.geometry, self.probes

@@ -54,7 +54,7 @@ def match_scenes(scene: Scene, template: Scene) -> Match:
     Raises OutOfDomainError when they are different molecules.
     """
     from systems.chemistry.graph import match_atoms
-    from systems.selection import part_of
+    from systems.scene import part_of
 
     everything = np.arange(template.n_atoms)
     if scene.topology_hash == template.topology_hash:
@@ -135,7 +135,7 @@ def _called(scene: Scene, names: tuple[str, ...]) -> IntArray:
 
 def _by_graph(scene: Scene, ours: IntArray, template: Scene, theirs: IntArray, how: str) -> Match | None:
     from systems.chemistry.graph import match_atoms
-    from systems.selection import part_of
+    from systems.scene import part_of
 
     if len(ours) != len(theirs) or len(ours) < 3:
         return None

@@ -22,11 +22,9 @@ import numpy.typing as npt
 from surrogate.judge.read.common_atoms import Match, match_scenes, solute_atoms
 from surrogate.judge.read.stored_frames import StoredFrames, bond_tree, grid_of, rounded, rounding_note
 from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
-from systems.reweighting import DIFFERENCE_COLUMN, reweighting
-from systems.scene import Scene
-from systems.selection import part_of
+from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryReader
-from systems.trajectory.joined_file import replicas_of
+from systems.trajectory.codec import DIFFERENCE_COLUMN, replicas_of, reweighting
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.geometry import superposition
-from systems.chemistry.limits import WIDENING
+from systems.chemistry.validity import WIDENING
 from systems.errors import InputError, SurromdError
 from systems.units import whole_steps
 

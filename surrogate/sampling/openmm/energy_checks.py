@@ -12,7 +12,7 @@ import torch
 from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import PainetPotential
 from systems.errors import SimulationError, SurromdError
-from systems.reweighting import DIFFERENCE_COLUMN
+from systems.trajectory.codec import DIFFERENCE_COLUMN
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights

@@ -19,9 +19,8 @@ from surrogate.sampling.openmm.openmm_state import SurrogateState
 from systems.errors import InputError, SimulationError
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
-from systems.options import from_field
+from systems.options import from_field, takes
 from systems.scene import Scene
-from systems.takes import takes
 
 if TYPE_CHECKING:
     from surrogate.data.weights import Weights
@@ -294,7 +293,7 @@ _PROPERTIES = {
 
 def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Scene, Weights]:
     if isinstance(scene, str | Path):
-        from systems.source import prepare
+        from systems.library.named_scenes import prepare
 
         scene = prepare(str(scene))
     if isinstance(weights, str | Path):

@@ -32,7 +32,7 @@ from systems.errors import InputError, PreparationError, SimulationError
 from systems.files.outside import content
 from systems.files.whole_file import create_whole
 from systems.interrupts import deferred_interrupt
-from systems.preparation import Preparation
+from systems.options import Preparation
 from systems.units import format_wall
 
 if TYPE_CHECKING:

@@ -41,8 +41,8 @@ from surrogate.verbs.run.stages import STAGES, Site, load_beside, md_options
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
 from systems.errors import InputError, SimulationError, SurromdError
+from systems.files.whole_file import Claim
 from systems.trajectory.checkpoint import frames_in
-from systems.trajectory.claim import Claim
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig

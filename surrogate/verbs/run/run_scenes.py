@@ -12,7 +12,7 @@ from surrogate.verbs.run.one_scene import describe_run, plan_scene, run_scene
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.telling import tell
 from systems.errors import InputError
-from systems.takes import takes
+from systems.options import takes
 
 if TYPE_CHECKING:
     from systems.scene import Scene

@@ -24,7 +24,7 @@ from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.train import train
 from systems.errors import InputError, SimulationError
 from systems.files.whole_file import create_whole
-from systems.preparation import Preparation
+from systems.options import Preparation
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -85,7 +85,7 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
     """
 
     def outs(site: Site, replicas: int, mark: str = "") -> list[Path]:
-        from systems.trajectory.claim import replica_paths
+        from systems.files.whole_file import replica_paths
 
         return replica_paths(site.folder / f"{place}{mark}.{site.options.format if name == 'md' else 'h5'}", replicas)
 
@@ -247,7 +247,7 @@ def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 def _rolled_paths(site: Site, rolls: Rolls) -> list[Path]:
-    from systems.trajectory.claim import replica_paths
+    from systems.files.whole_file import replica_paths
 
     return replica_paths(site.folder / f"trajectory/surrogate.{site.options.format}", rolls.replicas)
 
@@ -312,7 +312,7 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
     where it tells nothing."""
     from surrogate.judge.md_answer import md_answer
     from surrogate.judge.read.ensemble import load_ensemble
-    from systems.trajectory.frame_weights import write_weights
+    from systems.trajectory.codec import write_weights
 
     is_md = _rates_and_decision(record)[1].way == "md"
     files = [site.folder / file for file in (*(record.trajectory if is_md else ()), *record.held_out)]

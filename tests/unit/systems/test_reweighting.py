@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from systems.reweighting import reweighting
+from systems.trajectory.codec import reweighting
 
 
 def test_frames_of_a_wrong_spring_are_reweighted_to_the_right_one() -> None:

@@ -10,8 +10,7 @@ import numpy as np
 from surrogate.data.weights import TrainingDomain
 from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.samples import Samples
-from systems.chemistry.limits import WIDENING, limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import WIDENING, geometry_from_frames, limits_from_frames
 from systems.scene import Scene
 
 

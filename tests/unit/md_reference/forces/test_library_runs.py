@@ -14,17 +14,14 @@ from library_runs import run_scene
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import Conditions
-from md_reference.run.defaults import defaults, settle, to_config
+from md_reference.run.config import Conditions, defaults, settle, to_config
 from md_reference.run.engine import Engine
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import check_frames, geometry_from_scene
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.library.catalogue import MOLECULES
-from systems.library.protocols import find_protocol
+from systems.library.named_scenes import MOLECULES, find_protocol, prepare
 from systems.scene import Scene
-from systems.source import prepare
 
 MD17 = named_scenes.groups()[MOLECULES]
 GAFF = ForceFieldSpec("gaff2", "vacuum", hydrogen_mass_da=None, constrain_hydrogens=False)
@@ -38,7 +35,7 @@ def no_ambertools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         raise AssertionError("a program was started")
 
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path))
-    monkeypatch.setattr("md_reference.forces.small_molecules.ambertools.find_ambertools", lambda: None)
+    monkeypatch.setattr("md_reference.forces.small_molecules.programs.find_ambertools", lambda: None)
     monkeypatch.setattr(gaff, "find_ambertools", lambda: None)
     monkeypatch.setattr(subprocess, "run", refused)
     monkeypatch.setattr(subprocess, "Popen", refused)

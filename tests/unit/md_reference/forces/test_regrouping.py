@@ -15,11 +15,10 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.simulate import MDConfig, simulate
 from systems.errors import PreparationError
-from systems.scene import IntArray, Scene
-from systems.selection import reordered
-from systems.source import prepare
+from systems.library.named_scenes import prepare
+from systems.scene import IntArray, Scene, reordered
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 SPECS = {
     "ff14SB": ForceFieldSpec(),

@@ -11,10 +11,9 @@ import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import batch
-from md_reference.run.batch import simulate_batch
 from md_reference.run.config import MDConfig
 from md_reference.run.plan import make_plan
-from md_reference.run.replicas import simulate_replicas
+from md_reference.run.replicas import simulate_batch, simulate_replicas
 from systems.errors import InputError, SimulationError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.checkpoint import checkpoint_path

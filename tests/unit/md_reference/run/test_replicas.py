@@ -18,9 +18,9 @@ import pytest
 from md_reference.run.replicas import simulate_replicas
 from md_reference.run.simulate import MDConfig, checkpoint_path
 from systems.errors import SimulationError, TrajectoryError
+from systems.files.whole_file import replica_paths
 from systems.scene import Scene
 from systems.trajectory.checkpoint import read_checkpoints
-from systems.trajectory.claim import replica_paths
 from systems.trajectory.codec import open_trajectory, open_writer
 
 SHORT = MDConfig(time_ps=0.8, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")

@@ -30,11 +30,11 @@ from systems.errors import (
     UnitError,
     UnknownNameError,
 )
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 from systems.trajectory.checkpoint import read_checkpoints
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import topology_bytes
+from systems.trajectory.companion_writer import topology_bytes
 
 SHORT = MDConfig(time_ps=4.0, save_every_ps=0.2, equilibrate_ps=0.4, seed=7, platform="Reference")
 # About a second of work on a fast core: long enough to be killed three times on the way.

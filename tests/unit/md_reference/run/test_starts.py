@@ -64,7 +64,7 @@ def test_without_simd_openmm_heats(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_cannot_turn_begins_in_one_structure() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     methane = prepare("smiles:C")
     found = many_starts(methane, conditions(methane), 3)

@@ -13,8 +13,8 @@ import pytest
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run import platforms, timing
 from md_reference.run.config import Conditions
+from md_reference.run.machine import Timing, cache_file, recall, remember, size_class
 from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
-from md_reference.run.timing import Timing, cache_file, recall, remember, size_class
 from systems.library.named_scenes import load
 from systems.scene import Scene
 

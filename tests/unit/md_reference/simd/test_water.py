@@ -17,14 +17,14 @@ import pytest
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.solvation import solvate
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.batch import simulate_batch
 from md_reference.run.config import MDConfig
+from md_reference.run.replicas import simulate_batch
 from md_reference.simd import force_field
 from md_reference.simd.force_field import SimdReplicas
 from md_reference.simd.system_terms import SimdUnavailableError
 from systems.errors import InputError, SimulationError, UnknownNameError
+from systems.library.named_scenes import prepare
 from systems.scene import FloatArray, Scene
-from systems.source import prepare
 from systems.trajectory.codec import open_trajectory
 
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")

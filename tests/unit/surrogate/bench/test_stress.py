@@ -21,8 +21,7 @@ from surrogate.data.weights import Weights
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import Geometry, geometry_from_frames
 from systems.errors import InputError
-from systems.scene import Scene
-from systems.selection import reordered
+from systems.scene import Scene, reordered
 
 
 @pytest.fixture(scope="module")

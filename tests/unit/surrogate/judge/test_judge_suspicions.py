@@ -93,7 +93,7 @@ def test_a_check_that_could_not_be_made_is_not_zero(
     simulate: Callable[..., Ensemble], alanine_dipeptide: Scene
 ) -> None:
     """Without the atoms beside it a stereocentre cannot be told: no count, and the reason says why."""
-    from systems.selection import part_of
+    from systems.scene import part_of
 
     three = [simulate(k, 200) for k in (51, 52, 53)]
     backbone = np.array([i for i, n in enumerate(alanine_dipeptide.atom_names) if n in ("N", "CA", "C", "O", "CH3")])
@@ -109,7 +109,7 @@ def test_a_mirror_image_without_its_hydrogens_is_seen(
     simulate: Callable[..., Ensemble], alanine_dipeptide: Scene
 ) -> None:
     """Three neighbours of a centre tell its handedness; negative control: the fair run has none inverted."""
-    from systems.selection import part_of
+    from systems.scene import part_of
 
     three = [simulate(k, 200) for k in (51, 52, 53)]
     heavy = alanine_dipeptide.heavy_idx

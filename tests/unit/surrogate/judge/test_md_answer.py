@@ -129,7 +129,7 @@ def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
 
 def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
     """Butane's torsion: anti and both gauche, of known shares, named by their mean angles; one well is no state."""
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     scene = prepare("smiles:CCCC")
     graph, rng = bonded_graph(scene), np.random.default_rng(0)
@@ -153,7 +153,7 @@ def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
 
 
 def test_a_molecule_without_torsions_is_one_line() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     water = prepare("smiles:C")
     with pytest.raises(InputError, match="no torsion turns"):

@@ -14,8 +14,7 @@ from scripted_model import (
 )
 from surrogate.data.weights import TrainingDomain
 from systems.chemistry.geometry import superpose
-from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import geometry_from_frames
+from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 from systems.scene import Scene
 
 

@@ -10,8 +10,7 @@ from surrogate.data.weights import Weights, load_weights
 from surrogate.sampling import choice
 from surrogate.sampling.choice import choose_weights
 from systems.errors import OutOfDomainError
-from systems.library.named_scenes import load
-from systems.source import prepare
+from systems.library.named_scenes import load, prepare
 
 
 def test_a_molecule_that_was_trained_on_gets_its_weights() -> None:

@@ -11,9 +11,8 @@ from surrogate.data.weights import Weights
 from surrogate.sampling.domain import bond_types, find_deviations, match_domain, match_scene, torsion_environments
 from systems.chemistry.geometry import signed_volumes
 from systems.errors import OutOfDomainError
-from systems.library.named_scenes import load
+from systems.library.named_scenes import load, prepare
 from systems.scene import Scene
-from systems.source import prepare
 
 
 def kinds(scene: Scene, weights: Weights, **asked: float) -> dict[str, bool]:

@@ -29,8 +29,7 @@ from surrogate.sampling.guards import CAUGHT
 from surrogate.sampling.interventions import _Advance, none_through
 from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, REPAIRED, Tally
 from surrogate.sampling.runner import RolloutConfig, rollout
-from systems.chemistry.limits import limits_from_frames
-from systems.chemistry.validity import CHIRALITY, CLASH, INVALID
+from systems.chemistry.validity import CHIRALITY, CLASH, INVALID, limits_from_frames
 from systems.errors import SimulationError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import frames_in

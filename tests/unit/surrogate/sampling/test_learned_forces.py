@@ -27,8 +27,7 @@ from systems.chemistry.matching import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames
 from systems.errors import InputError, OutOfDomainError, SurromdError
 from systems.prepare.molecule import scene_from_smiles
-from systems.reweighting import DIFFERENCE_COLUMN
-from systems.trajectory.codec import open_trajectory
+from systems.trajectory.codec import DIFFERENCE_COLUMN, open_trajectory
 
 SMALL = PotentialConfig(width=16, n_radial=8, n_scalars=4, n_vectors=3, n_tensors=2, n_heads=2, head_dim=4,
                         timestep_ps=0.001, hydrogen_mass_da=None)  # fmt: skip

@@ -24,8 +24,7 @@ from surrogate.sampling.runner import RolloutConfig, rollout
 from surrogate.training.provenance import training_domain
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
-from systems.scene import Scene
-from systems.selection import reordered
+from systems.scene import Scene, reordered
 from systems.trajectory.codec import open_trajectory
 
 TRAINED = ("ACE-ALA-NME", "ACE-SER-NME", "ACE-ALA-SER-NME")

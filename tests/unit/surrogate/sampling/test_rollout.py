@@ -145,7 +145,7 @@ def test_frames_that_are_not_finite_are_marked_and_stop_the_rollout(tmp_path: Pa
 
 
 def test_a_molecule_outside_the_domain_is_refused_with_what_to_do(tmp_path: Path, small_weights: Weights) -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     with pytest.raises(OutOfDomainError, match=r"cover alanine-dipeptide .*22 atoms.*surromd reference"):
         rollout(prepare("sequence:ACE-GLY-NME"), small_weights, [tmp_path / "a.h5"], CONFIG)

@@ -19,8 +19,7 @@ from surrogate.models.painet.potential.config import PotentialConfig
 from surrogate.models.painet.potential.covered import domain_of
 from surrogate.models.painet.potential.samples import Samples
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
-from systems.chemistry.limits import Limits, check_limits
-from systems.chemistry.validity import DRIFT
+from systems.chemistry.validity import DRIFT, Limits, check_limits
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import Scene

@@ -21,7 +21,7 @@ from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, 
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
 from surrogate.training.provenance import provenance_of
 from systems.errors import InputError, SimulationError, WeightsError
-from systems.files.toml_file import read_toml
+from systems.options import read_toml
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
 

@@ -13,7 +13,7 @@ import surrogate as sm
 from systems.errors import InputError, UnitError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 from systems.units import PARSERS
 
 VERBS: dict[str, tuple[Any, ...]] = {

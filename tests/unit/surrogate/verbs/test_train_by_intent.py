@@ -23,11 +23,11 @@ from surrogate.models.settings import toml_text
 from surrogate.sampling.domain import match_domain
 from surrogate.training.trainer import TrainingRequest
 from systems.errors import InputError, OutOfDomainError
+from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.source import prepare
 from systems.trajectory.codec import open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 MD = {"kind": "reference", "temperature_k": 300.0, "force_field": "ff14SB", "solvent": "obc2"}
 

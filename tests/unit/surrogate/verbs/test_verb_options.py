@@ -10,13 +10,12 @@ from typer.testing import CliRunner
 
 import surrogate
 from md_reference.campaign.campaign_file import key_of, read_settings
-from md_reference.run.defaults import defaults
+from md_reference.run.config import defaults
 from surrogate import api
 from surrogate.cli import main
 from surrogate.verbs.options import PlanOptions, ReferenceOptions, RolloutOptions
-from systems.options import options_of
-from systems.preparation import Preparation
-from systems.source import prepare
+from systems.library.named_scenes import prepare
+from systems.options import Preparation, options_of
 
 FLAGS = {name: each for name, each in options_of(PlanOptions).items() if name != "time_ps"}
 # How many runs there are, whose settings, and what makes the box: no fields of MDConfig or ForceFieldSpec.

@@ -34,8 +34,7 @@ from systems.chemistry.graph import (
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load
 from systems.prepare.molecule import scene_from_smiles
-from systems.scene import Scene
-from systems.selection import part_of
+from systems.scene import Scene, part_of
 
 ALA2 = load("alanine-dipeptide")
 MAKE = Callable[..., Scene]

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry.components import component, hydrogens_of, known_template
 from systems.chemistry.graph import backbone_torsions, molecule_key
-from systems.chemistry.residues import template_for
+from systems.chemistry.residues import component, hydrogens_of, known_template, template_for
 from systems.errors import PreparationError
+from systems.library.named_scenes import prepare
 from systems.prepare.molecule import scene_from_smiles
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
-from systems.source import prepare
 
 INSIDE = {"N": 1, "C": 1}
 
@@ -56,7 +55,7 @@ def test_links_and_ends_take_and_give_hydrogens() -> None:
 
 
 def test_every_component_can_be_read() -> None:
-    from systems.chemistry.components import _lines
+    from systems.chemistry.residues import _lines
 
     for name in list(_lines())[::12]:
         found = component(name)

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry.limits import Limits, check_limits, limits_from_frames
-from systems.chemistry.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL
+from systems.chemistry.validity import ANGLE, DRIFT, JUMP, PLANARITY, STILL, Limits, check_limits, limits_from_frames
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory

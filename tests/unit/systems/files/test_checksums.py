@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from systems.errors import SurromdError, TrajectoryError
-from systems.files.checksums import frame_checksums, sealed, unsealed
+from systems.files.whole_file import frame_checksums, sealed, unsealed
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 

@@ -9,14 +9,14 @@ import h5py
 import numpy as np
 import pytest
 
-from md_reference.forces.small_molecules.parameter_cache import Entry, _read, store
+from md_reference.forces.small_molecules.gaff import Entry, _read, store
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import MDConfig, check_run
 from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.errors import InputError, PreparationError, TrajectoryError
 from systems.files.outside import content, printable
+from systems.files.whole_file import replica_paths
 from systems.scene import Scene
-from systems.trajectory.claim import replica_paths
 from systems.trajectory.codec import open_trajectory, open_writer
 
 

@@ -12,9 +12,7 @@ from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key
 from systems.chemistry.validity import check_frames, geometry_from_scene
 from systems.errors import UnknownNameError
 from systems.library import named_scenes
-from systems.library.catalogue import ENTRIES
-from systems.library.protocols import PROTOCOLS, find_protocol
-from systems.source import prepare
+from systems.library.named_scenes import ENTRIES, PROTOCOLS, find_protocol, prepare
 
 MD17 = {"aspirin": ("C9H8O4", 21), "benzene": ("C6H6", 12), "ethanol": ("C2H6O", 9), "malonaldehyde": ("C3H4O2", 9),
         "naphthalene": ("C10H8", 18), "salicylic-acid": ("C7H6O3", 16), "toluene": ("C7H8", 15),

@@ -11,10 +11,10 @@ import pytest
 from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key, rotatable_torsions, stereocentres
 from systems.chemistry.validity import NOT_FINITE, check_frames, geometry_from_frames, geometry_from_scene
 from systems.errors import InputError, OutOfDomainError
-from systems.library.model_systems import double_well, harmonic_oscillator, particles
+from systems.library.named_scenes import double_well, harmonic_oscillator, particles
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 SCENES = {"harmonic": harmonic_oscillator, "double-well": double_well}
 

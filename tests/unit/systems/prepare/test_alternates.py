@@ -10,9 +10,9 @@ import pytest
 
 from systems.errors import PreparationError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 SSBOND = "SSBOND   1 CYS A    2    CYS B    2                          1555   1555  2.05\n"

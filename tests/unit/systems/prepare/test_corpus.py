@@ -42,7 +42,7 @@ def test_a_file_is_taken_and_every_alteration_noticed(corpus: ModuleType, reposi
     row = _row(corpus, path)
     taken = corpus.try_row(row)
     assert (taken.state, taken.n_atoms, taken.faults) == ("ok", 22, ())
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     scene = prepare(str(path))
     moved = scene.positions_nm.copy()

@@ -10,9 +10,9 @@ import pytest
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 
 def _without(scene: Scene, numbers: tuple[str, ...], folder: Path, *, hydrogens: bool = True) -> str:

@@ -10,11 +10,11 @@ import pytest
 from systems.chemistry.element_data import element_symbol, ion_symbol
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
 from systems.prepare.heterogens import is_water
 from systems.prepare.read.records import AtomRecord
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 PEPTIDE = "".join(f"{line}\n" for line in pdb_text(ALA2).splitlines() if line.startswith("ATOM"))

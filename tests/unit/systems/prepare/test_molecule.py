@@ -17,10 +17,10 @@ from small_scenes import n_unpaired_electrons
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.prepare.molecule import scene_from_mol_file, scene_from_smiles, to_rdkit
 from systems.prepare.read.smiles import refuse_changed_stereo, stereo_labels
 from systems.scene import Scene
-from systems.source import prepare
 
 ACCEPTED = [c for c in cases() if not c.refusal]
 REFUSED = [c for c in cases() if c.refusal]

@@ -11,11 +11,11 @@ from systems.chemistry.element_data import element_symbol
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
-from systems.prepare.clashes import check_contacts
+from systems.library.named_scenes import prepare
+from systems.prepare.checks import check_contacts
 from systems.prepare.read.records import AtomRecord
 from systems.scene import Scene
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 ROWS = [

@@ -16,9 +16,9 @@ from systems.chemistry.geometry import signed_volumes, superpose, torsion
 from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key
 from systems.errors import InputError, OutOfDomainError, PreparationError, SurromdError, UnknownNameError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 RESIDUES = [ALA2.residue_names[r] for r in ALA2.residue_of_atom]

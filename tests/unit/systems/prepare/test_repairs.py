@@ -12,17 +12,15 @@ from systems.chemistry.geometry import signed_volumes
 from systems.chemistry.graph import molecule_key
 from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
-from systems.prepare.handedness import compare, handedness, say_inverted
+from systems.prepare.checks import compare, handedness, say_inverted
 from systems.prepare.heterogens import ligand_atoms
 from systems.prepare.protonation import protonation_account
-from systems.prepare.read.hybrid36 import decode, encode
-from systems.prepare.read.modified_residues import standardise
-from systems.prepare.read.records import AtomRecord
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.read.records import AtomRecord, standardise
+from systems.prepare.read.structure_text import decode, encode, read_structure
 from systems.prepare.repair import _with_usual_lengths, complete
-from systems.source import prepare
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 WATER = "HETATM  900  O   HOH A 101      20.000  20.000  20.000  1.00  0.00           O\n"

@@ -10,9 +10,9 @@ import pytest
 from systems.chemistry.geometry import superposition, torsion
 from systems.chemistry.residues import amino_acid_names, template_for
 from systems.errors import PreparationError
+from systems.library.named_scenes import prepare
 from systems.prepare import repair
 from systems.prepare.rotamers import _conformers, _tree, residue_shape, settle_side_chains
-from systems.source import prepare
 
 
 @pytest.mark.parametrize("name", [n for n in amino_acid_names() if n not in ("GLY", "ALA", "PRO")])

@@ -10,8 +10,8 @@ from rdkit import Chem
 from rdkit.Chem import rdDistGeom
 
 from systems.errors import PreparationError
+from systems.library.named_scenes import prepare
 from systems.prepare.molecule import to_rdkit
-from systems.source import prepare
 
 
 @pytest.mark.parametrize(

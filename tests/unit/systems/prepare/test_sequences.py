@@ -9,8 +9,8 @@ from systems.chemistry.geometry import signed_volumes, torsion
 from systems.chemistry.graph import backbone_torsions, match_atoms, molecule_key, stereocentres
 from systems.errors import PreparationError
 from systems.library import named_scenes
+from systems.library.named_scenes import prepare
 from systems.prepare.peptide import parse_sequence
-from systems.source import prepare
 
 ALA2 = named_scenes.load("alanine-dipeptide")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from systems.errors import InputError
-from systems.source import prepare
+from systems.library.named_scenes import prepare
 
 
 @pytest.fixture

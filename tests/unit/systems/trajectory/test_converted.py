@@ -11,10 +11,15 @@ import pytest
 
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.converted import to_mdanalysis, to_mdtraj
-from systems.trajectory.frame_weights import frame_weights, write_weights
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.codec import (
+    frame_weights,
+    open_trajectory,
+    open_writer,
+    to_mdanalysis,
+    to_mdtraj,
+    write_weights,
+)
+from systems.trajectory.companion_writer import pdb_text
 
 
 def write(path: Path, scene: Scene, times: np.ndarray) -> np.ndarray:

@@ -9,11 +9,11 @@ import h5py
 import numpy as np
 import pytest
 
-from systems.chemistry.cell_shape import box_vectors, lengths_and_angles
+from systems.chemistry.cell import box_vectors, lengths_and_angles
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 N = 5
 # A truncated octahedron's kind of cell: three lengths, three angles, all different.

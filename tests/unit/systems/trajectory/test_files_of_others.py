@@ -21,8 +21,8 @@ import pytest
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.format_table import FORMATS, format_of
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
+from systems.trajectory.foreign_scenes import FORMATS, format_of
 
 # Program, file, its name here, topology, frames, atoms, time between frames (ps; None: not stated), edge a of the cell
 # (nm; None: no cell).

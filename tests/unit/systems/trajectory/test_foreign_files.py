@@ -13,7 +13,7 @@ from chain_files import RECORD, SUFFIXES, chain, frames, read
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

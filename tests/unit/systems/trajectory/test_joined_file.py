@@ -10,8 +10,7 @@ import pytest
 
 from chain_files import RECORD, SUFFIXES, TOLERANCES, chain, frames, left_behind
 from systems.errors import InputError, TrajectoryError
-from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.joined_file import KEY, join, replicas_of
+from systems.trajectory.codec import KEY, join, open_trajectory, open_writer, replicas_of
 
 N_ATOMS = 12
 

@@ -12,10 +12,10 @@ import pytest
 from systems.errors import InputError, TrajectoryError
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
-from systems.trajectory.dcd_layout import AKMA_PS, cells_of_blocks
-from systems.trajectory.foreign_details import trr_positions
-from systems.trajectory.format_table import EVERY, FORMATS, NONE, OTHER, format_of, markdown
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
+from systems.trajectory.dcd_file import AKMA_PS, cells_of_blocks
+from systems.trajectory.foreign_readers import trr_positions
+from systems.trajectory.foreign_scenes import EVERY, FORMATS, NONE, OTHER, format_of, markdown
 
 mdtraj = pytest.importorskip("mdtraj")
 mda = pytest.importorskip("MDAnalysis")

@@ -11,11 +11,10 @@ import pytest
 
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs
 from systems.errors import SimulationError, TrajectoryError
-from systems.scene import Scene
-from systems.selection import part_of, reordered
+from systems.scene import Scene, part_of, reordered
 from systems.trajectory.checkpoint import claimed_outputs
 from systems.trajectory.codec import open_trajectory, open_writer
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 SUFFIXES = (".h5", ".dcd")
 

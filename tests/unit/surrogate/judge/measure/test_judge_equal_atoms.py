@@ -14,8 +14,8 @@ from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.bond_rows import angle_rows
 from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
 from surrogate.judge.rows.shape_rows import contact_rows, hydrogen_bond_rows, shape_rows
+from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.source import prepare
 
 METRICS = (shape_rows, angle_rows, contact_rows, hydrogen_bond_rows)
 OPTIONS = Options(n_bootstrap=50, n_permutations=20)

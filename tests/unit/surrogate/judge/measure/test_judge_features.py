@@ -184,7 +184,7 @@ def test_equivalent_positions_are_one(peptide: Scene, bond: tuple[str, str], fol
 
 
 def test_small_molecules_have_every_rotatable_torsion() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     kinds = {name: sorted((t.kind, t.fold) for t in find_torsions(prepare(f"smiles:{smiles}")))
              for name, smiles in (("aspirin", "CC(=O)Oc1ccccc1C(=O)O"), ("ethanol", "CCO"), ("benzene", "c1ccccc1"),
@@ -263,7 +263,7 @@ def test_the_mean_structure_is_free_of_rotation(simulate: Callable[..., Ensemble
 
 
 def test_what_is_left_of_a_molecule_keeps_its_torsions(peptide: Scene) -> None:
-    from systems.selection import part_of
+    from systems.scene import part_of
 
     heavy = peptide.heavy_idx
     part = part_of(peptide, heavy)

@@ -47,7 +47,7 @@ def coiled(scene: Scene) -> npt.NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def peptide() -> Scene:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     return prepare("sequence:ACE-" + "ALA-" * 8 + "NME")
 
@@ -85,7 +85,7 @@ def test_a_candidate_that_unfolds_is_named_residue_by_residue(peptide: Scene) ->
 
 
 def test_four_residues_have_none() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     scene = prepare("sequence:ACE-ALA-ALA-ALA-ALA-NME")
     assert read(scene, scene.positions_nm[None]).shape == (1, 0)
@@ -98,7 +98,7 @@ def test_real_structures_are_read_as_mdtraj_reads_them(shared_data: Path, name: 
     path = shared_data / "structures" / name
     loaded = mdtraj.load(str(path))
     letters = mdtraj.compute_dssp(loaded)[0]
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     scene = prepare(path)
     found = read(scene, scene.positions_nm[None])[0]

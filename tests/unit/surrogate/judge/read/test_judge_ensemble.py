@@ -17,8 +17,7 @@ from surrogate.verbs.run.stages import worth_saying
 from systems.chemistry.geometry import torsion
 from systems.errors import InputError, OutOfDomainError, TrajectoryError
 from systems.scene import Scene
-from systems.trajectory.codec import open_writer
-from systems.trajectory.joined_file import join
+from systems.trajectory.codec import join, open_writer
 
 Save = Callable[..., Path]
 

@@ -19,13 +19,12 @@ from surrogate.judge.read.ensemble import Ensemble, alike, load_ensemble
 from surrogate.judge.read.stored_frames import StoredFrames, bond_tree, make_whole
 from surrogate.judge.rows.rows import Options
 from systems.errors import InputError, OutOfDomainError
+from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide
-from systems.scene import Scene
-from systems.selection import part_of
-from systems.source import prepare
+from systems.scene import Scene, part_of
 from systems.trajectory.codec import open_writer
+from systems.trajectory.companion_writer import pdb_text
 from systems.trajectory.foreign_scenes import scene_from_structure
-from systems.trajectory.topology_file import pdb_text
 
 BOX = np.array([[2.4, 0.0, 0.0], [0.7, 2.2, 0.0], [-0.6, 0.5, 2.1]])
 

@@ -14,7 +14,7 @@ from surrogate.judge.comparison import Comparison, Judgement, compare
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
 from surrogate.judge.read.stored_frames import angle_variance, length_error_nm, rounded
 from surrogate.judge.rows.rows import Options
-from systems.trajectory.topology_file import pdb_text
+from systems.trajectory.companion_writer import pdb_text
 
 OPTIONS = Options(peptide_recipe=False, n_bootstrap=100, n_permutations=300)
 N = 3_000

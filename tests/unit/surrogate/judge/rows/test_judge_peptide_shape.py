@@ -32,7 +32,7 @@ def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
 
 
 def test_ends_are_those_of_the_chain() -> None:
-    from systems.source import prepare
+    from systems.library.named_scenes import prepare
 
     scene = prepare("sequence:ACE-LYS-ALA-ARG-NME")
     ends = _ends(scene)
@@ -41,8 +41,8 @@ def test_ends_are_those_of_the_chain() -> None:
 
 def test_a_long_side_chain_is_no_end_of_a_short_chain() -> None:
     """Lysine between caps: longest along its side chain; its ends are the caps'. A drug has no side chains."""
+    from systems.library.named_scenes import prepare
     from systems.prepare.peptide import build_peptide
-    from systems.source import prepare
 
     scene = build_peptide("ACE-LYS-NME")
     ends = _ends(scene)
