@@ -31,12 +31,12 @@ from systems.scene import Scene, part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
-    CheckpointFile,
     checkpoint_path,
     claimed_outputs,
-    last_supported,
     new_header,
-    read_checkpoints,
+    read_checkpoint,
+    supported_checkpoint,
+    write_checkpoint,
     writer_at,
 )
 from systems.trajectory.codec import open_trajectory
@@ -94,7 +94,7 @@ def rollout(
     precision = config.precision
     if resume and precision == "auto" and state_path.exists():
         # A rollout that goes on keeps it, whatever another processor would choose.
-        precision = "bf16" if read_checkpoints(state_path)[0][0]["settings"]["bf16"] else "fp32"
+        precision = "bf16" if read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(
         weights,
         solver_steps=config.solver_steps,
@@ -111,13 +111,12 @@ def rollout(
         stack.enter_context(claimed_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
-        kept = last_supported(state_path, outs) if resume and state_path.exists() else None
+        kept = supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
             state = _start(plan, sampler, len(outs), asked_to_stop)
         else:
             state = progress_of(state_path, kept, plan.settings)
         header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
-        checkpoint = CheckpointFile(state_path, kept)
         if plan.n_frames < header.get("n_frames_wanted", 0):
             raise InputError(
                 f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
@@ -139,7 +138,7 @@ def rollout(
 
         def save() -> None:
             header["progress"], arrays = packed_progress(state)
-            checkpoint.write(header, arrays)
+            write_checkpoint(state_path, header, arrays)
 
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.
