@@ -1,12 +1,17 @@
 """Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
 
-From that declaration follow the command line, the signature and the documentation of the Python call, the keys of a
-`config` file, their checks, and the manual's tables. A name ends in its unit (`time_ps`), which the command line and
-files leave out: there a value carries it (`time = "10ns"`). Imports no library, so that the command's help is quick.
+From that declaration follow the command line, the signature and the documentation of the Python call (`takes`), the
+keys of a `config` file, their checks, and the manual's tables. A name ends in its unit (`time_ps`), which the command
+line and files leave out: there a value carries it (`time = "10ns"`). Imports no library, so that the command's help is
+quick.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
+import textwrap
+import tomllib
 import types
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
@@ -17,6 +22,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from systems.errors import InputError, UnknownNameError, nearest
+from systems.files.outside import content
+from systems.files.schema import parsed
 from systems.units import format_quantity, is_openmm_quantity, openmm_number, parser_of, quantity, stem_of, unit_of
 
 T = TypeVar("T")
@@ -250,7 +257,6 @@ def gather(
 
 def read_options(kind: type, file: str | Path) -> dict[str, Any]:
     """Return the options that a TOML file gives, by name, in our units. Raises InputError, which names file and key."""
-    from systems.files.toml_file import read_toml
 
     known = options_of(kind)
     sections = {found.section for found in known.values()} - {""}
@@ -327,3 +333,112 @@ def flag_of(name: str) -> str:
     True
     """
     return f"--{stem_of(name).replace('_', '-')}"
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return a TOML file's record. Raises InputError when it is missing or malformed."""
+    try:
+        return dict(parsed(content(Path(path)).decode(), tomllib.loads))
+    except FileNotFoundError:
+        raise InputError(f"configuration {path} does not exist.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"configuration {path} is not valid TOML: {error}.") from error
+
+
+# ---- functions that take options ------------------------------------------------------------------------------------
+
+
+R = TypeVar("R")
+
+
+def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
+
+    Its signature lists them one by one, as an editor or `help` shows it, and its documentation says what each does.
+    `options=` takes the dataclass itself, `config=` the path of a TOML file; keywords come before both. A quantity is a
+    number in the unit that its name ends in, or a text with its own. Any other keyword is a TypeError, as always, which
+    names the nearest.
+    """
+    known = options_of(kind)
+
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        plain = inspect.signature(function)
+        own = [parameter for name, parameter in plain.parameters.items() if name != "options"]
+        inputs = inspect.Signature(own)
+        whole = plain.replace(parameters=[*own, *_keywords(kind, known)])
+
+        @functools.wraps(function)
+        def call(*args: Any, options: Any = None, config: str | Path | None = None, **keywords: Any) -> R:
+            given = {name: keywords.pop(name) for name in known if name in keywords}
+            for name in keywords:
+                if name not in inputs.parameters:
+                    meant = nearest(name, [*known, *inputs.parameters, "options", "config"])
+                    raise TypeError(f"{function.__name__}() got an unexpected keyword argument {name!r}.{meant}")
+            try:
+                bound = inputs.bind(*args, **keywords)
+                if options is not None:
+                    if not isinstance(options, kind):
+                        raise TypeError(f"options must be a {kind.__name__}, not {type(options).__name__}")
+                    given = {name: getattr(options, name) for name in known} | given
+                settled: Any = gather(kind, given, file=config)
+            except MissingOptionError as error:
+                raise TypeError(f"{function.__name__}() {error.needs}") from None
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}() {error}") from None
+            return function(*bound.args, **bound.kwargs, options=settled)
+
+        call.__signature__ = whole  # type: ignore[attr-defined]
+        call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\n{_documented(known)}\n"
+        return call
+
+    return decorate
+
+
+def _keywords(kind: type, known: dict[str, Option]) -> list[inspect.Parameter]:
+    """Return the parameters that options come in by."""
+
+    def keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+        return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+    needed = inspect.Parameter.empty
+    return [
+        *(keyword(o.name, needed if o.default is MISSING else o.default, o.hint) for o in known.values()),
+        keyword("options", None, kind | None),
+        keyword("config", None, str | Path | None),
+    ]
+
+
+def _documented(known: dict[str, Option]) -> str:
+    """Return what each option does, one after the other, as a docstring says it."""
+    lines = ["Options, by keyword or in the TOML file `config`:", ""]
+    for option in known.values():
+        default = "required" if option.required else f"default {shown}" if (shown := option.shown_default) else ""
+        said = [option.unit, " | ".join(option.said.choices), default]
+        about = ", ".join(word for word in said if word)
+        lines.append(f"{option.name}{f' ({about})' if about else ''}")
+        lines += textwrap.wrap(option.help, 112, initial_indent="    ", subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+# ---- how a scene is prepared ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """How a Scene is made of what a user names: options of `systems.library.named_scenes.prepare`."""
+
+    ph: float = option("pH at which missing hydrogens of peptides are added.", 7.0, within=(0.0, 14.0))
+    keep_ligand: bool = option("Keep ligands and ions beside a peptide.", False)
+    drop_ligand: bool = option("Remove ligands and ions beside a peptide.", False)
+    drop_water: bool = option("Remove crystal waters (the default).", False)
+    keep_water: bool = option("Keep crystal waters (explicit solvent only).", False)
+    cap_breaks: bool = option("Cap chain breaks with ACE and NME.", False)
+
+    def refuse_contradictions(self) -> None:
+        """Raise InputError where something shall be both kept and left out."""
+        for what in ("ligand", "water"):
+            if getattr(self, f"keep_{what}") and getattr(self, f"drop_{what}"):
+                raise InputError(f"`keep_{what}` and `drop_{what}` exclude each other; choose one.")

@@ -13,14 +13,12 @@ from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_type_hi
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.config import MDConfig
-from md_reference.run.defaults import settle_by_name, to_config
+from md_reference.run.config import MDConfig, settle_by_name, to_config
 from systems.errors import InputError, SurromdError, nearest
 from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
-from systems.library.protocols import find_protocol
-from systems.options import Option, options_of
-from systems.preparation import Preparation
+from systems.library.named_scenes import find_protocol
+from systems.options import Option, Preparation, options_of
 from systems.units import parse_temperature_k, parse_wall_s, parser_of
 
 T = TypeVar("T")

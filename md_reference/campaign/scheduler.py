@@ -34,8 +34,8 @@ from md_reference.campaign.manifest import (
 )
 from md_reference.run.config import flat_settings
 from systems.errors import InputError, TrajectoryError
+from systems.files.whole_file import Claim
 from systems.interrupts import deferred_interrupt
-from systems.trajectory.claim import Claim
 
 _TICK_S = 0.1
 _WRITE_EVERY_S = 2.0

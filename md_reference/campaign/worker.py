@@ -1,6 +1,6 @@
 """Tasks of a campaign's workers: prepare a scene once, for all its replicas; simulate a run from wherever it stands.
 
-A run's file belongs to one task at a time (systems.trajectory.claim), and a task stops by itself, with a checkpoint,
+A run's file belongs to one task at a time (systems.files.whole_file), and a task stops by itself, with a checkpoint,
 when the campaign that started it has not been heard of for a minute.
 """
 
@@ -30,14 +30,12 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
-from systems.files.whole_file import create_whole
-from systems.options import options_of
-from systems.preparation import Preparation
+from systems.files.whole_file import Claim, create_whole
+from systems.library.named_scenes import prepare
+from systems.options import Preparation, options_of
 from systems.scene import Scene
-from systems.source import prepare
-from systems.trajectory.claim import Claim
 from systems.trajectory.codec import companions, open_trajectory
-from systems.trajectory.topology_file import topology_path
+from systems.trajectory.companion_writer import topology_path
 
 T = TypeVar("T")
 

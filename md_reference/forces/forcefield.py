@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,17 +10,65 @@ import numpy as np
 
 from md_reference.forces import implicit_solvent
 from md_reference.forces.mixture import is_water, merge, molecules_of
-from md_reference.forces.model_forces import build_model_system
 from md_reference.forces.nonstandard import build_chain, find_chain
 from md_reference.forces.quantum import build_quantum_system
 from md_reference.forces.small_molecules.gaff import parameters
 from md_reference.forces.small_molecules.prmtop import load_openmm
-from md_reference.forces.spec import MODEL, PROTEIN_FORCE_FIELDS, QUANTUM, ForceFieldSpec
-from md_reference.forces.template_files import cutoff_nm
+from md_reference.forces.spec import MODEL, PROTEIN_FORCE_FIELDS, QUANTUM, ForceFieldSpec, cutoff_nm
 from md_reference.forces.templates import build_templated, uncovered_residue
-from systems.errors import PreparationError
-from systems.scene import IntArray, Scene, once_per_scene
-from systems.selection import part_of
+from systems.errors import InputError, PreparationError
+from systems.library.named_scenes import check_law
+from systems.scene import IntArray, Scene, once_per_scene, part_of
+
+
+def build_model_system(scene: Scene) -> Any:
+    """Return the `openmm.System` of a scene with `interactions`: particles with the scene's masses, one custom force.
+
+    No constraints, no cell, no centre-of-mass removal. Raises InputError for a law that is unknown or incomplete.
+    """
+    from openmm import System
+
+    law = scene.interactions
+    if law is None:
+        raise InputError(f"scene {scene.name!r} is no model system: it has no `interactions`.")
+    check_law(law)
+    system = System()
+    for mass_da in scene.masses_da.tolist():
+        system.addParticle(mass_da)
+    force = _FORCES[law["kind"]](law, scene)
+    force.setName(f"{law['kind']} law")
+    system.addForce(force)
+    return system
+
+
+def _harmonic(law: dict[str, Any], scene: Scene) -> Any:
+    names = dict(zip(("kx", "ky", "kz"), law["force_constants_kj_mol_nm2"], strict=True))
+    return _external_force("0.5*(kx*x^2+ky*y^2+kz*z^2)", names, scene.n_atoms)
+
+
+def _double_well(law: dict[str, Any], scene: Scene) -> Any:
+    energy = "barrier_kj_mol*((x/minimum_nm)^2-1)^2 + tilt_kj_mol_nm*x + 0.5*transverse_kj_mol_nm2*(y^2+z^2)"
+    return _external_force(energy, {key: value for key, value in law.items() if key != "kind"}, scene.n_atoms)
+
+
+def _external_force(energy: str, constants: dict[str, float], n_particles: int) -> Any:
+    from openmm import CustomExternalForce
+
+    force = CustomExternalForce(energy)
+    for name, value in constants.items():
+        force.addGlobalParameter(name, value)
+    for k in range(n_particles):
+        force.addParticle(k, [])
+    return force
+
+
+_FORCES: dict[str, Callable[[dict[str, Any], Scene], Any]] = {
+    "harmonic": _harmonic,
+    "double-well": _double_well,
+}
+
+
+# ---- the force field of a scene -------------------------------------------------------------------------------------
 
 
 @once_per_scene

@@ -10,8 +10,7 @@ import numpy as np
 
 from md_reference.forces.regrouping import permuted, regroup
 from md_reference.forces.residue_templates import ResidueTemplate, cap, make_template
-from md_reference.forces.spec import ForceFieldSpec
-from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
+from md_reference.forces.spec import CHAIN_FILES, ForceFieldSpec, force_field_of, unmatched_residues
 from systems.errors import PreparationError
 from systems.scene import IntArray, Scene
 

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from md_reference.forces.mixture import moved_site
 from systems.chemistry.graph import backbone_torsions
 from systems.errors import PreparationError
-from systems.scene import Scene
-from systems.selection import reordered
+from systems.scene import Scene, reordered
 
 IntArray = npt.NDArray[np.int64]
 

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse.csgraph import shortest_path
 
-from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.forces.template_files import cutoff_nm
+from md_reference.forces.spec import ForceFieldSpec, WaterBox, cutoff_nm
 from systems.chemistry.element_data import atomic_weight_da, covalent_radius_nm
 from systems.errors import InputError, PreparationError
 from systems.scene import FloatArray, Scene

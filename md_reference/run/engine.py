@@ -20,8 +20,7 @@ from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.geometry import signed_volumes
 from systems.chemistry.graph import stereocentres
 from systems.errors import PreparationError, SimulationError, first_line, listed
-from systems.scene import FloatArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, Scene, part_of
 from systems.units import GAS_CONSTANT_KJ_MOL_K, hottest_k
 
 _VELOCITY_TOLERANCE = 1e-8

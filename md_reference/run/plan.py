@@ -15,12 +15,10 @@ from md_reference.forces.nonstandard import lacking_residues
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import SIMD, MDConfig, resolved
 from md_reference.run.engine import Engine
-from md_reference.run.machine import available_cores
+from md_reference.run.machine import as_records, available_cores
 from md_reference.run.platforms import PlatformChoice, choose_platform, measured_platform, simd_choice
-from md_reference.run.timing import as_records
 from md_reference.simd.force_field import SimdReplicas, n_replicas
-from systems.scene import FloatArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, Scene, part_of
 from systems.units import format_time_ps, format_wall
 
 # Above this step a hydrogen of natural mass is integrated badly even with its bond constrained.

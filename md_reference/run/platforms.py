@@ -11,8 +11,7 @@ import numpy as np
 from md_reference.forces.forcefield import build_system
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.config import SIMD, Conditions
-from md_reference.run.machine import platforms
-from md_reference.run.timing import Timing, measuring_allowed, recall, remember, size_class, time_platforms
+from md_reference.run.machine import Timing, measuring_allowed, platforms, recall, remember, size_class, time_platforms
 from md_reference.simd.force_field import n_replicas
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.scene import Scene

@@ -1,30 +1,252 @@
-"""Several independent replicas of one run, one process and one thread each."""
+"""Several independent replicas of one run: one process and one thread each, or up to sixteen at once in one core's
+vector registers (`md_reference.simd`).
+
+Files, records, equilibration and resuming are those of `run.simulate`; of replicas in one core one checkpoint, beside
+the first file, stands for all.
+"""
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import queue
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from md_reference.run.batch import simulate_batch
-from md_reference.run.config import SIMD, MDConfig, check_run
+from md_reference.forces.forcefield import build_system
+from md_reference.run.config import SIMD, MDConfig, check_run, check_same_run, settings_of
+from md_reference.run.engine import Engine, refuse_damaged
 from md_reference.run.machine import available_cores
 from md_reference.run.plan import plan_line
 from md_reference.run.platforms import measured_platform, simd_choice
-from md_reference.run.simulate import ProgressFn, checkpoint_path, simulate, tell_preparing
+from md_reference.run.run_summary import summarise
+from md_reference.run.simulate import (
+    ProgressFn,
+    already_complete,
+    record_of,
+    simulate,
+    stand_of,
+    tell_preparing,
+)
 from md_reference.run.starts import many_starts
-from md_reference.simd.force_field import n_replicas
-from systems.errors import SimulationError, SurromdError
-from systems.interrupts import deferred_interrupt
-from systems.parent_watch import end_with_parent
-from systems.scene import Scene
+from md_reference.simd.force_field import SimdReplicas, n_replicas
+from systems.errors import InputError, SimulationError, SurromdError
+from systems.interrupts import deferred_interrupt, end_with_parent
+from systems.scene import Scene, part_of
+from systems.trajectory.base import TrajectoryWriter
+from systems.trajectory.checkpoint import (
+    Checkpoint,
+    checkpoint_path,
+    claimed_outputs,
+    new_header,
+    supported_checkpoint,
+    write_checkpoint,
+    writer_at,
+)
+from systems.units import format_time_ps
+
+# Frames are computed for about so long, then written and checkpointed.
+_BLOCK_S = 2.0
+
+
+def simulate_batch(
+    scene: Scene,
+    config: MDConfig,
+    outs: Sequence[Path],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: ProgressFn | None = None,
+    starts_nm: npt.NDArray[np.floating] | None = None,
+    notes: Sequence[dict[str, Any]] = (),
+) -> None:
+    """Run a replica for each of `outs`, at most `n_replicas()`; all have `config.seed` and their number in the batch.
+
+    They start from the scene, its energy minimised, or from `starts_nm` (n, n_atoms, 3) as they stand; `notes` are
+    added to their records.
+
+    Frames and checkpoint are written about every two seconds; `resume` goes on from there, as it would have gone on.
+    Ctrl-C and SIGTERM stop with a checkpoint: KeyboardInterrupt. `progress` counts the frames of all replicas.
+    Raises SimdUnavailableError for what the platform cannot do, SimulationError when a replica blows up (the frames
+    before stay in the files, which say `completed: false`), and what `simulate` raises for settings and files.
+    """
+    config = check_run(scene, config, outs[0])
+    if config.ensemble != "nvt" or config.columns:
+        raise InputError("platform simd runs in a bath (nvt) and keeps positions alone; take another platform.")
+    if len(outs) > n_replicas():
+        raise InputError(f"{len(outs)} replicas are more than the {n_replicas()} of a batch.")
+    state_path = checkpoint_path(outs[0])
+    with deferred_interrupt() as asked_to_stop, claimed_outputs(list(outs), may_exist=resume or overwrite):
+        if resume and not state_path.exists() and any(out.exists() for out in outs):
+            for out in outs:
+                already_complete(out, config)
+            return
+        kept = supported_checkpoint(state_path, list(outs)) if resume and state_path.exists() else None
+        batch = _Batch(scene, config, outs, kept, overwrite=overwrite)
+        batch.start(starts_nm, asked_to_stop, progress)
+        record = record_of(scene, config, simd_choice())
+        with ExitStack() as stack:
+            writers = []
+            for k, out in enumerate(outs):
+                own = {**record, "replica": k, "of_replicas": len(outs), **(notes[k] if notes else {})}
+                writer = writer_at(out, batch.written, own, batch.header, k, resumed=batch.resumed)
+                writers.append(stack.enter_context(writer))
+            batch.produce(writers, asked_to_stop, progress)
+        state_path.unlink(missing_ok=True)
+
+
+class _Batch:
+    """Replicas on their way: what is done, since when, and where their checkpoint goes."""
+
+    def __init__(
+        self, scene: Scene, config: MDConfig, outs: Sequence[Path], kept: Checkpoint | None, *, overwrite: bool
+    ) -> None:
+        self.scene, self.config, self.outs = scene, config, outs
+        self.resumed = kept is not None
+        self.header, self.blob = kept or (new_header(len(outs), overwrite=overwrite), b"")
+        self.stand = stand_of(self.header, outs[0])
+        if kept is not None:
+            check_same_run(self.stand.config, config, outs[0])
+        self.began = time.monotonic()
+        self.done = int(self.header["files"][0]["n_frames"])
+        solute = config.kept_atoms(scene)
+        self.atoms = np.arange(scene.n_atoms) if solute is None else solute
+        self.written = scene if solute is None else part_of(scene, solute)
+        self.system = build_system(scene, config.force)
+        self.simd = SimdReplicas(
+            self.system,
+            temperature_k=config.temperature_k,
+            friction_per_ps=config.friction_per_ps,
+            timestep_ps=config.timestep_ps,
+            seed=config.seed,
+        )
+
+    @property
+    def wall_s(self) -> float:
+        return self.stand.wall_s + time.monotonic() - self.began
+
+    def start(
+        self, starts_nm: npt.NDArray[np.floating] | None, asked_to_stop: Callable[[], bool],
+        progress: ProgressFn | None,
+    ) -> None:  # fmt: skip
+        """Go to where the batch was left, or to the starts, and equilibrate.
+
+        Raises SimulationError, KeyboardInterrupt.
+        """
+        if self.resumed:
+            self.simd.restore(self.blob)
+            return
+        tell_preparing(progress, 0.0)
+        if starts_nm is None:
+            # The Reference platform has no neighbour lists.
+            platform = "Reference" if self.scene.cell_nm is None else "CPU"
+            with Engine(self.scene, replace(self.config, platform=platform), system=self.system) as engine:
+                engine.minimise()
+                starts_nm = engine.positions()[None]
+                refuse_damaged(self.scene, starts_nm[0])
+        self.simd.check(self.system, starts_nm[0])
+        # SimdReplicas left over repeat the last start; they cost nothing and are not kept.
+        self.simd.set_positions(starts_nm[np.minimum(np.arange(self.simd.n_replicas), len(starts_nm) - 1)])
+        self.simd.thermalise()
+        n_steps = math.ceil(round(self.config.equilibrate_ps / self.config.timestep_ps, 6))
+        piece = max(1, min(1000, n_steps))
+        for done in range(0, n_steps, piece):
+            if asked_to_stop():
+                raise KeyboardInterrupt
+            self.simd.step(min(piece, n_steps - done))
+            tell_preparing(progress, min(1.0, (done + piece) / n_steps))
+        self.save()
+
+    def save(self) -> None:
+        said = {"config": settings_of(self.config), "wall_s": self.wall_s, "platform": SIMD}
+        self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said}
+        write_checkpoint(checkpoint_path(self.outs[0]), self.header, self.simd.checkpoint())
+
+    def produce(
+        self, writers: Sequence[TrajectoryWriter], asked_to_stop: Callable[[], bool], progress: ProgressFn | None
+    ) -> None:
+        """Append frames until all are there. Raises SimulationError, StorageError, KeyboardInterrupt."""
+        config, n = self.config, len(writers)
+        while self.done < config.n_frames:
+            frames, failure = self._frames(asked_to_stop)
+            if frames:
+                positions, energies, temperatures = (np.stack(x, axis=1) for x in zip(*frames, strict=True))
+                cell = self.scene.cell_nm
+                cells = None if cell is None else np.repeat(cell[None], len(frames), axis=0)
+                times = (self.done + 1 + np.arange(len(frames))) * config.save_every_ps
+                for k, writer in enumerate(writers):
+                    scalars = {"potential_kj_mol": energies[k], "temperature_k": temperatures[k]}
+                    writer.append(positions[k], times, scalars=scalars, cell_nm=cells)
+                self.done += len(frames)
+                self.header["files"] = [{"n_frames": self.done, "digest": w.digest()} for w in writers]
+            if failure:
+                for writer in writers:
+                    writer.update_record({"completed": False, "failure": failure, "cost": self.cost()})
+                raise SimulationError(
+                    f"{self.scene.name}: {failure} after {format_time_ps(self.done * config.save_every_ps)}; "
+                    f"{self.done} good frames are in {self.outs[0]} and each other file of this batch."
+                )
+            if self.done < config.n_frames:
+                self.save()
+            if progress is not None:
+                progress(n * self.done, n * config.n_frames)
+            if asked_to_stop() and self.done < config.n_frames:
+                for writer in writers:
+                    writer.update_record({"cost": self.cost()})
+                raise KeyboardInterrupt
+        for writer in writers:
+            time_ps, scalars = writer.series()
+            summary = summarise(
+                time_ps,
+                scalars,
+                mass_da=float(self.scene.masses_da.sum()),
+                ensemble=config.ensemble,
+                temperature_k=config.temperature_k,
+                n_dof=self.simd.n_dof,
+            )
+            writer.update_record(
+                {"completed": True, "time_ps": config.time_ps, "cost": self.cost(), "summary": summary}
+            )
+
+    def _frames(self, asked_to_stop: Callable[[], bool]) -> tuple[list[tuple[Any, Any, Any]], str]:
+        """Return the frames of the next seconds, each positions, energies and temperatures of all replicas."""
+        found: list[tuple[Any, Any, Any]] = []
+        until = time.monotonic() + _BLOCK_S
+        while self.done + len(found) < self.config.n_frames and not (found and time.monotonic() > until):
+            if asked_to_stop() and found:
+                break
+            try:
+                self.simd.step(self.config.steps_per_frame)
+            except SimulationError as error:
+                return found, str(error)
+            positions = self.simd.positions_nm[:, self.atoms].astype(np.float32)
+            found.append((positions, self.simd.energies(), self.simd.temperatures_k()))
+        return found, ""
+
+    def cost(self) -> dict[str, float]:
+        """Return each replica's share of the cost; a core runs all of them at once."""
+        simulated_ps = self.done * self.config.save_every_ps
+        wall_s = self.wall_s / len(self.outs)
+        return {
+            "wall_s": wall_s,
+            "energy_evaluations": self.done * self.config.steps_per_frame,
+            "ns_per_day": simulated_ps * 1e-3 / wall_s * 86400.0,
+        }
+
+
+# ---- processes ------------------------------------------------------------------------------------------------------
+
+
+# The exit status of a process that would start replicas while it imports the script which has started it.
+_UNGUARDED = 79
 
 
 @dataclass(frozen=True)
@@ -56,9 +278,11 @@ def simulate_replicas(
     measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
     run, which it may raise to end them too; `progress` counts the frames of all replicas.
     Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
-    by themselves. Raises SimulationError with the first replica's reason when the others have ended; finished replicas
-    stay on disk.
+    by themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
+    with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(_UNGUARDED)  # this is one of the processes, which has not come further than the user's script
     given = None if isinstance(scene, Scene) else list(scene)
     scene = scene if isinstance(scene, Scene) else scene[0]
     for out in outs:
@@ -106,8 +330,9 @@ def simulate_replicas(
                     of_job = [configs[i] for i in jobs[k]], [outs[i] for i in jobs[k]]
                     once = {id(scenes[i]): scenes[i].to_dict() for i in jobs[k]}
                     args = ([once[id(scenes[i])] for i in jobs[k]], *of_job, how, board, k)
-                    running[k] = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
-                    running[k].start()
+                    process = context.Process(target=_replicas, args=args, name=f"replica-{jobs[k][0]}")
+                    process.start()
+                    running[k] = process
                 time.sleep(0.1)
                 if asked_to_stop():
                     raise KeyboardInterrupt
@@ -119,6 +344,11 @@ def simulate_replicas(
                 for k in [k for k, process in running.items() if not process.is_alive()]:
                     process = running.pop(k)
                     process.join()
+                    if process.exitcode == _UNGUARDED:
+                        raise InputError(
+                            "each replica's process imports this script, which starts replicas again; put what starts "
+                            "them below `if __name__ == '__main__':`."
+                        )
                     if process.exitcode != 0:
                         _collect(board.errors, reasons, k)
                         failures[k] = reasons.get(k, f"exit code {process.exitcode}")

@@ -20,17 +20,16 @@ from md_reference.run.run_summary import summarise
 from systems.errors import InputError, SimulationError
 from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
-from systems.scene import FloatArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, Scene, part_of
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
-    CheckpointFile,
     checkpoint_path,
     claimed_outputs,
-    last_supported,
     new_header,
+    supported_checkpoint,
+    write_checkpoint,
     writer_at,
 )
 from systems.trajectory.codec import open_trajectory
@@ -92,7 +91,7 @@ def simulate(
         if resume and out.exists() and not chk.exists():
             already_complete(out, config)
             return out
-        kept = last_supported(chk, [out]) if resume and chk.exists() else None
+        kept = supported_checkpoint(chk, [out]) if resume and chk.exists() else None
         run = _Run(scene, config, out, checkpoint_every_s, kept, overwrite=overwrite)
         run.asked_to_stop = asked_to_stop
         run.progress = progress
@@ -143,7 +142,6 @@ class _Run:
         self.stand = stand_of(self.header, out)
         if kept is not None:
             check_same_run(self.stand.config, config, out)
-        self.checkpoint = CheckpointFile(checkpoint_path(out), kept)
         self.asked_to_stop: Callable[[], bool] = lambda: False
         self.progress: ProgressFn | None = None
         self.done = int(self.header["files"][0]["n_frames"])
@@ -242,7 +240,7 @@ class _Run:
             "threads": engine.threads,
         }
         self.header = {**{key: self.header[key] for key in ("run_id", "overwrite", "files")}, **said, **more}
-        self.checkpoint.write(self.header, engine.checkpoint())
+        write_checkpoint(checkpoint_path(self.out), self.header, engine.checkpoint())
         self.saved_at = time.monotonic()
 
     def produce(self, engine: Engine, writer: TrajectoryWriter) -> None:
@@ -368,6 +366,12 @@ def already_complete(out: Path, config: MDConfig) -> None:
         record, n_frames = reader.record, reader.n_frames
     # The record names the platform that ran, which "auto" leaves open.
     check_same_run(record, config, out, ignoring=("platform",))
+    if record.get("completed") and n_frames < config.n_frames:
+        raise InputError(
+            f"{out} is a finished run of {n_frames} frames, and this one has {config.n_frames}: a run that is finished "
+            "cannot be made longer, as its last velocities are not kept; start a longer one under another name, or "
+            "more replicas with other seeds."
+        )
     if not record.get("completed") or n_frames != config.n_frames:
         raise InputError(
             f"{out} holds {n_frames} of {config.n_frames} frames but its checkpoint is gone; start again with "

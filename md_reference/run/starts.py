@@ -26,8 +26,7 @@ from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import CHIRALITY, NOT_FINITE, OMEGA, RING, check_frames, geometry_from_scene
 from systems.errors import PreparationError, SimulationError
 from systems.interrupts import stop_if_asked
-from systems.scene import FloatArray, IntArray, Scene
-from systems.selection import part_of
+from systems.scene import FloatArray, IntArray, Scene, part_of
 
 HOT_K, HOT_PS, FRICTION_PER_PS = 500.0, 100.0, 5.0
 # Of the time it was hot.

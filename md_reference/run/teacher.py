@@ -23,7 +23,7 @@ from systems.chemistry.distance_bonds import changed_bond
 from systems.chemistry.geometry_rules import changed_stereo
 from systems.chemistry.graph import turn_torsions
 from systems.errors import PreparationError, SimulationError
-from systems.parent_watch import end_with_parent
+from systems.interrupts import end_with_parent
 from systems.scene import FloatArray, Scene
 
 

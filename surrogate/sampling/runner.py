@@ -33,12 +33,12 @@ from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
-    CheckpointFile,
     checkpoint_path,
     claimed_outputs,
-    last_supported,
     new_header,
-    read_checkpoints,
+    read_checkpoint,
+    supported_checkpoint,
+    write_checkpoint,
     writer_at,
 )
 from systems.trajectory.codec import open_trajectory
@@ -317,7 +317,7 @@ def rollout(
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
-    marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.validity) against the
+    marked with its chunk, its validity flags (systems.chemistry.validity) against the
     training reference, and what was done about it (column `intervention`, `interventions.MARKS`); the record's
     `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
     replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
@@ -341,7 +341,7 @@ def rollout(
     precision = config.precision
     if resume and precision == "auto" and state_path.exists():
         # A rollout that goes on keeps it, whatever another processor would choose.
-        precision = "bf16" if read_checkpoints(state_path)[0][0]["settings"]["bf16"] else "fp32"
+        precision = "bf16" if read_checkpoint(state_path)[0]["settings"]["bf16"] else "fp32"
     sampler = ChunkSampler(
         weights,
         solver_steps=config.solver_steps,
@@ -358,13 +358,12 @@ def rollout(
         stack.enter_context(claimed_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
-        kept = last_supported(state_path, outs) if resume and state_path.exists() else None
+        kept = supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
         if kept is None:
             state = _start(plan, sampler, len(outs), asked_to_stop)
         else:
             state = progress_of(state_path, kept, plan.settings)
         header = kept[0] if kept else new_header(len(outs), overwrite=overwrite)
-        checkpoint = CheckpointFile(state_path, kept)
         if plan.n_frames < header.get("n_frames_wanted", 0):
             raise InputError(
                 f"{outs[0]} was started for {header['n_frames_wanted']} frames and cannot become shorter; resume with "
@@ -386,7 +385,7 @@ def rollout(
 
         def save() -> None:
             header["progress"], arrays = packed_progress(state)
-            checkpoint.write(header, arrays)
+            write_checkpoint(state_path, header, arrays)
 
         if not state.steps:
             # Before there are files, so that a rollout killed at any later moment can be gone on with.

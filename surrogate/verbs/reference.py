@@ -46,8 +46,8 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
 
     `out` ends in .h5, .dcd or .xtc; with several replicas NAME.h5 becomes NAME_r0.h5, NAME_r1.h5, ..., with seeds
     `seed`, `seed + 1`, ..., and `join` writes them into NAME.h5, too, one after another, whose record says where each
-    begins. Settings that are not given are those of `protocol` (a paper's, by name:
-    `systems.library.named_scenes`), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
+    begins. Settings that are not given are those of `protocol` (a paper's, by
+    name), else ff14SB in OBC2 for peptides and GAFF2 in vacuum for other molecules, 300 K, 1/ps,
     4 fs, 3 Da, 100 ps of equilibration that is not written, nvt, frames every ps, whatever name the molecule is asked
     for by; model systems bring their own. `hydrogen_mass_da=None` keeps natural masses. `ph` to `cap_breaks`: see
     `systems.library.named_scenes.prepare`. `resume` goes on from the checkpoint beside `out`.

@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from systems.chemistry.element_data import covalent_radius_nm, is_metal
 from systems.chemistry.geometry import near_pairs
-from systems.elements import PARTICLE
 from systems.errors import PreparationError
-from systems.scene import Scene
+from systems.scene import PARTICLE, Scene
 
 _TOLERANCE_NM = 0.04
 # A bond longer than so many sums of covalent radii is none.

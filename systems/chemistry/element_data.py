@@ -6,8 +6,8 @@ from functools import cache
 from typing import Any
 
 from systems.chemistry.residues import template_for
-from systems.elements import ATOMIC_NUMBERS
 from systems.interrupts import deferred_interrupt
+from systems.scene import ATOMIC_NUMBERS
 
 # Standard atomic weights in Da, IUPAC 2021 abridged. gemmi's are older (sulfur 32.065, not 32.06), and the masses of
 # these elements are inputs of shipped weights.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.frame_columns import column_blocks, signed_volume, squared_distance, torsion_cosine
+from systems.chemistry.geometry import column_blocks, signed_volume, squared_distance, torsion_cosine
 from systems.errors import InputError
 from systems.scene import Scene
 

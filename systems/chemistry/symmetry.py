@@ -18,8 +18,7 @@ import networkx as nx
 import numpy as np
 
 from systems.chemistry.geometry import signed_volumes, torsion
-from systems.elements import ATOMIC_NUMBERS
-from systems.scene import FloatArray, Scene, once_per_scene
+from systems.scene import ATOMIC_NUMBERS, FloatArray, Scene, once_per_scene
 
 _LARGEST_RING = 12
 _CC_DOUBLE_NM = 0.141

@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.components import component, known_template
 from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.chemistry.geometry import near_pairs
-from systems.chemistry.residues import canonical_heavy_name, template_for
+from systems.chemistry.residues import canonical_heavy_name, component, known_template, template_for
 from systems.errors import PreparationError, listed
-from systems.prepare.bonded_residues import Bonding, Residue
-from systems.prepare.missing_atoms import note_missing
-from systems.prepare.read.records import AtomRecord
+from systems.prepare.protonation import note_missing
+from systems.prepare.read.records import AtomRecord, Bonding, Residue
 from systems.prepare.structure import atom_label
 
 _PEPTIDE_NM = 0.20

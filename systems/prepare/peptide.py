@@ -12,7 +12,7 @@ from systems.chemistry.geometry import extend, signed_volumes, superposition, to
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
 from systems.prepare.protonation import protonation_account
-from systems.prepare.read.modified_residues import D_RESIDUES
+from systems.prepare.read.records import D_RESIDUES
 from systems.prepare.repair import fixed_random_numbers, records_from_openmm
 from systems.prepare.rotamers import residue_shape
 from systems.prepare.structure import scene_from_records

@@ -16,9 +16,8 @@ import numpy.typing as npt
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError, first_line, listed
-from systems.prepare.bonded_residues import Bonding, Residue
 from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_account
-from systems.prepare.read.records import AtomRecord
+from systems.prepare.read.records import AtomRecord, Bonding, Residue
 from systems.prepare.rotamers import settle_side_chains
 from systems.prepare.structure import atom_label
 

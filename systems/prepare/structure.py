@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.bond_orders import ValenceError, perceive
-from systems.chemistry.components import component
 from systems.chemistry.element_data import atomic_weight_da
-from systems.chemistry.residues import template_for
+from systems.chemistry.residues import component, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.read.records import AtomRecord
 from systems.prepare.read.structure_text import read_structure

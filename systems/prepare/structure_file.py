@@ -9,26 +9,46 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
+import numpy.typing as npt
 
 from systems.chemistry.geometry import near_pairs
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError, listed
-from systems.preparation import Preparation
-from systems.prepare.bonded_residues import Bonding, Residue
+from systems.options import Preparation
 from systems.prepare.bonding import find_bonds, links_residues
-from systems.prepare.clashes import check_contacts
-from systems.prepare.gaps import caps_of, find_gaps, refuse_gaps
-from systems.prepare.handedness import Handedness, compare, handedness, heavy_of_records, say_inverted
-from systems.prepare.heterogens import agent_atoms, ligand_atoms, refuse_bare_ligands, settle_ligands, settle_solvent
-from systems.prepare.read.file_text import suffix_of
+from systems.prepare.checks import (
+    Handedness,
+    caps_of,
+    check_contacts,
+    find_gaps,
+    handedness,
+    heavy_of_records,
+    made_whole,
+    refuse_changed,
+    refuse_gaps,
+    say_inverted,
+)
+from systems.prepare.heterogens import (
+    agent_atoms,
+    complete_waters,
+    ligand_atoms,
+    refuse_bare_ligands,
+    settle_ligands,
+    settle_solvent,
+)
 from systems.prepare.read.mmcif_file import is_component
-from systems.prepare.read.modified_residues import describe_residue, standardise
-from systems.prepare.read.peptide_mol2 import read_peptide_mol2
-from systems.prepare.read.records import AtomRecord, StructureFile
+from systems.prepare.read.mol2_file import read_peptide_mol2
+from systems.prepare.read.records import (
+    AtomRecord,
+    Bonding,
+    Residue,
+    StructureFile,
+    describe_residue,
+    standardise,
+    suffix_of,
+)
 from systems.prepare.read.structure_text import is_mmcif, read_structure, structure_text
-from systems.prepare.structure import scene_from_records
-from systems.prepare.waters import complete_waters
-from systems.prepare.whole import made_whole
+from systems.prepare.structure import atom_label, scene_from_records
 from systems.scene import Scene
 
 # Of a standard residue's atoms in any protonation, bonds to hydrogen among them.
@@ -37,9 +57,9 @@ _COMPLETE_WITHOUT_HYDROGEN = {"C", "F", "Cl", "Br", "I", "O", "N", "S"}
 
 
 def prepare_file(path: Path, options: Preparation) -> Scene:
-    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues; see `systems.source.prepare`."""
+    """Return the scene of a PDB or mmCIF file, or of a MOL2 file of standard residues."""
     if is_mmcif(path) and is_component(text := structure_text(path)):
-        from systems.prepare.component_file import scene_from_component
+        from systems.prepare.molecule import scene_from_component
 
         return scene_from_component(text, path)
     try:
@@ -90,6 +110,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     repairs += _disulfides(bonding, structure.atoms)
     atoms, bonds = list(structure.atoms), bonding.bonds
     before = _handedness(bonding, atoms)
+    clashes = _clashing_hydrogens(atoms, bonds)
     if not bonding.is_complete:
         _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
@@ -99,10 +120,13 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
         after = heavy_of_records(atoms)
         names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
         hands = handedness((key, names[key], heavy) for key, heavy in after.items() if key in names)
-        compare(before, hands)
+        refuse_changed(before, hands)
     else:
         hands = before
         _refuse_bare_skeletons(bonding.residues, atoms)
+    if clashes and _overfull(atoms, bonds):
+        raise clashes[0]
+    if bonding.is_complete:
         _refuse_surplus_hydrogens(bonding, atoms)
     say_inverted(hands, repairs)
     if ligands and stays:
@@ -255,6 +279,26 @@ def _refuse_beyond_repair(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None
                 f"{residue.label}{describe_residue(residue.key[2])} lacks {' '.join(built)}; atoms are built for "
                 f"standard residues alone: add all its heavy atoms{instead}."
             )
+
+
+def _overfull(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> set[int]:
+    """Return the atoms with more bonds than their element can have."""
+    n_bonds = np.bincount(bonds.ravel(), minlength=len(atoms)).tolist()
+    return {i for i, n in enumerate(n_bonds) if n > _MOST_BONDS.get(atoms[i].element, n)}
+
+
+def _clashing_hydrogens(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[PreparationError]:
+    """Say which hydrogens of one residue stand at an atom of another that has all it can have: to be raised where
+    placing hydrogens anew does not part them."""
+    found, overfull = [], _overfull(atoms, bonds)
+    for i, j in (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ():
+        if j in overfull and atoms[i].element == "H" and atoms[i].residue_key != atoms[j].residue_key:
+            gap = np.linalg.norm(np.subtract(atoms[i].position_angstrom, atoms[j].position_angstrom))
+            found.append(PreparationError(
+                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart, and no bond can join them: "
+                "the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
+            ))  # fmt: skip
+    return found
 
 
 def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:

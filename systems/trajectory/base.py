@@ -13,11 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
-from systems.files.checksums import Checksums, frames_digest
+from systems.files.whole_file import Checksums, Claim, frames_digest
 from systems.scene import Scene
-from systems.trajectory.claim import Claim
-from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
-from systems.trajectory.frame_store import FrameStore
+from systems.trajectory.frame_store import Float32Array, Float64Array, FrameBlock, FrameStore
 
 _VERIFIED_AT_ONCE = 4096
 

@@ -1,4 +1,4 @@
-"""Checkpoints: what a run goes on from, its last two states, believed only as far as its trajectories support them."""
+"""Checkpoints: what a run goes on from, believed only as far as its trajectories support it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError
-from systems.files.checksums import packed, unpacked
 from systems.files.schema import built
-from systems.files.whole_file import create_whole, refuse_existing, storage_error
+from systems.files.whole_file import Claim, create_whole, packed, refuse_existing, storage_error, unpacked
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
-from systems.trajectory.claim import Claim
 from systems.trajectory.codec import companions, open_trajectory, open_writer
 
 _MAGIC = b"surromd checkpoint 3\n"
@@ -54,24 +52,12 @@ class _Common:
     n_frames_wanted: Annotated[int, range(2**63)] = 0
 
 
-class CheckpointFile:
-    """The checkpoint of a run: its last state, and the last before its trajectories had the frames that they have now.
+def write_checkpoint(path: Path, header: dict[str, Any], blob: bytes) -> None:
+    """Replace the checkpoint as a whole; it is on the medium when this returns, as are the frames that it has seen.
 
-    That one is gone on from when the power fails and the medium turns out to be one append behind.
+    `header`: a `new_header` kept up to date, and more that is JSON. Raises StorageError: the old one stays.
     """
-
-    def __init__(self, path: Path, kept: Checkpoint | None) -> None:
-        self.path = path
-        self._states = [] if kept is None else [(kept[0]["files"], packed(*kept))]
-
-    def write(self, header: dict[str, Any], blob: bytes) -> None:
-        """Replace the file as a whole; it is on the medium when this returns. Raises StorageError: the old one stays.
-
-        `header`: a `new_header` kept up to date, and more that is JSON.
-        """
-        before = [state for state in self._states if state[0] != header["files"]][:1]
-        self._states = [(header["files"], packed(header, blob)), *before]
-        create_whole(self.path, _MAGIC + b"".join(part for _, part in self._states))
+    create_whole(path, _MAGIC + packed(header, blob))
 
 
 def refuse_foreign(path: Path) -> None:
@@ -85,39 +71,32 @@ def refuse_foreign(path: Path) -> None:
                 )
 
 
-def read_checkpoints(path: Path) -> list[Checkpoint]:
-    """Return the states `(header, blob)` in a checkpoint, the last one first. Raises InputError when it is damaged."""
-    found: list[Checkpoint] = []
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Return the state `(header, blob)` in a checkpoint. Raises InputError when it is damaged."""
     try:
-        rest = path.read_bytes()
-        if not rest.startswith(_MAGIC):
+        content = path.read_bytes()
+        if not content.startswith(_MAGIC):
             raise ValueError("it is of another version of surromd, or no checkpoint")
-        rest = rest[len(_MAGIC) :]
-        while rest or not found:
-            header, blob, rest = unpacked(rest)
-            built(_Common, {f.name: header[f.name] for f in fields(_Common) if f.name in header})
-            found.append((header, blob))
+        header, blob, _ = unpacked(content[len(_MAGIC) :])  # earlier versions wrote the state before behind the last
+        built(_Common, {f.name: header[f.name] for f in fields(_Common) if f.name in header})
     except (OSError, ValueError) as error:
         raise InputError(f"checkpoint {path} cannot be read ({error}); start again with `overwrite=True`.") from error
-    return found
+    return header, blob
 
 
-def last_supported(path: Path, outs: Sequence[Path]) -> Checkpoint:
-    """Return the last state in a checkpoint that the frames in the run's trajectories support, all of them read.
+def supported_checkpoint(path: Path, outs: Sequence[Path]) -> Checkpoint:
+    """Return the state in a checkpoint, if the frames in the run's trajectories support it, all of them read.
 
     Raises InputError when the checkpoint is damaged, or a trajectory is gone, damaged, or not the one this run wrote.
     """
-    states = read_checkpoints(path)
-    if any(len(header["files"]) != len(outs) for header, _ in states):
+    header, blob = read_checkpoint(path)
+    if len(header["files"]) != len(outs):
         raise InputError(f"checkpoint {path} is not of {len(outs)} trajectories; take as many as it was begun with.")
-    reasons = []
-    for header, blob in states:
-        begun = header is not states[0][0] or any(entry["n_frames"] for entry in header["files"])
-        found = [_unsupported(out, header, k, begun=begun) for k, out in enumerate(outs)]
-        if not any(found):
-            return header, blob
-        reasons += [reason for reason in found if reason]
-    raise InputError(f"{reasons[0]}; restore it, or start again with `overwrite=True`.")
+    begun = any(entry["n_frames"] for entry in header["files"])
+    for k, out in enumerate(outs):
+        if reason := _unsupported(out, header, k, begun=begun):
+            raise InputError(f"{reason}; restore it, or start again with `overwrite=True`.")
+    return header, blob
 
 
 def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str, Any], k: int = 0, *, resumed: bool,

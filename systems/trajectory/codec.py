@@ -1,19 +1,26 @@
-"""The one trajectory codec: HDF5 (the full record), DCD and XTC (what others read), streaming, append, resume."""
+"""The one trajectory codec: HDF5 (the full record), DCD and XTC (what others read), streaming, append, resume.
+
+And what is made of whole trajectories: one file of several replicas, MDTraj's and MDAnalysis' objects, weights of
+frames.
+"""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from systems.errors import InputError, TrajectoryError
-from systems.files.atomic_file import journal_path
-from systems.scene import Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter
-from systems.trajectory.claim import Claim
-from systems.trajectory.format_table import XYZ_SUFFIXES
-from systems.trajectory.frame_block import FrameBlock
+from systems.files.whole_file import Claim, journal_path
+from systems.scene import PARTICLE, Scene
+from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
+from systems.trajectory.frame_store import WEIGHTS, FrameBlock, FrameStore, open_hdf5
+from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
 
@@ -41,7 +48,7 @@ def open_writer(
     what it records stays, new keys of `record` are added, and an append that a crash interrupted is cut off. `record`
     must be JSON-able. `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell
     of a periodic scene is kept in any case. `run_id`: whose file it is. The writer holds the file's claim
-    (systems.trajectory.claim), unless its caller does (`claimed`).
+    (systems.files.whole_file), unless its caller does (`claimed`).
     Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
     `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
     process; StorageError when the folder is missing, not writable or full.
@@ -93,7 +100,7 @@ def refuse_columns(path: Path, columns: Sequence[str]) -> None:
 def companions(path: Path) -> tuple[Path, ...]:
     """Return the paths of what is written beside a trajectory."""
     from systems.trajectory import companion_writer
-    from systems.trajectory.topology_file import topology_path
+    from systems.trajectory.companion_writer import topology_path
 
     if path.suffix.lower() not in _WITH_COMPANIONS:
         return topology_path(path), journal_path(path)
@@ -121,7 +128,7 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
         if not is_plain_h5md(path):
             return Hdf5Reader(path, top)
     if is_hdf5 or path.suffix.lower() == ".h5md":
-        from systems.trajectory.h5md_file import H5mdReader
+        from systems.trajectory.hdf5_file import H5mdReader
 
         return H5mdReader(path, top)
     if path.suffix.lower() == ".dcd":
@@ -129,16 +136,18 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
 
         return DcdReader(path, top)
     if path.suffix.lower() == ".xtc":
-        from systems.trajectory.topology_file import is_our_topology, topology_path
+        from systems.trajectory.companion_writer import is_our_topology, topology_path
         from systems.trajectory.xtc_file import XtcReader, is_ours
 
         if is_ours(path):
             return XtcReader(path, top)
         top = topology_path(path) if top is None and is_our_topology(topology_path(path)) else top
     if path.suffix.lower() == ".traj":
-        from systems.trajectory.ase_file import AseReader
+        from systems.trajectory.xyz_file import AseReader
 
         return AseReader(path, top)
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES
+
     if path.name.lower().endswith(XYZ_SUFFIXES):
         from systems.trajectory.xyz_file import XyzReader
 
@@ -152,3 +161,248 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     from systems.trajectory.foreign_readers import MdanalysisReader
 
     return MdanalysisReader(path, top)
+
+
+# ---- several replicas in one file -----------------------------------------------------------------------------------
+
+
+KEY = "joined"
+_AT_ONCE = 2048
+
+
+def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
+    """Write the frames of replicas into one file, in the order of `paths`, and return its path.
+
+    Kept are positions, cells, flags, chunks and scalars, and velocities and forces where all replicas and the format
+    hold them. Times are each replica's own, moved behind those before it.
+    Raises InputError where the replicas differ in atoms or save interval, TrajectoryError, StorageError.
+    """
+    with ExitStack() as stack:
+        readers = [stack.enter_context(open_trajectory(path)) for path in paths]
+        first = readers[0]
+        if first.scene is None:
+            raise InputError(f"{first.path} holds no topology; it cannot be joined.")
+        for reader in readers[1:]:
+            if reader.scene is None:
+                raise InputError(f"{reader.path} holds no topology; it cannot be joined.")
+            check_same_topology(reader.path, reader.scene, first.scene)
+        intervals = [float(np.median(np.diff(r.time_ps))) for r in readers if r.n_frames > 1]
+        stated = first.record.get("save_every_ps")
+        interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
+        if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
+            raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
+        columns = [
+            name
+            for name, read in (("velocities", "read_velocities"), ("forces", "read_forces"))
+            if out.suffix.lower() not in (".dcd", ".xtc") and all(getattr(r, read)(0, 1) is not None for r in readers)
+        ]
+        starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
+        replicas = [
+            {"file": r.path.name, "first_frame": begin, "n_frames": r.n_frames, "record": r.record}
+            for r, begin in zip(readers, starts, strict=False)
+        ]
+        complete = all(r.record.get("completed") is not False for r in readers)
+        common = {key: value for key, value in first.record.items() if all(r.record.get(key) == value for r in readers)}
+        record = common | {KEY: {"replicas": replicas}, "completed": False}
+        end_ps = 0.0
+        with open_writer(out, first.scene, record, overwrite=overwrite, columns=columns) as writer:
+            for reader in readers:
+                if not reader.n_frames:
+                    continue
+                shift_ps = 0.0 if writer.last_time_ps is None else end_ps + interval_ps - float(reader.time_ps[0])
+                for start in range(0, reader.n_frames, _AT_ONCE):
+                    _copy(reader, slice(start, min(start + _AT_ONCE, reader.n_frames)), writer, shift_ps, columns)
+                end_ps = float(reader.time_ps[-1]) + shift_ps
+            writer.update_record({"completed": complete})
+    return out
+
+
+def replicas_of(record: Mapping[str, Any], n_frames: int) -> list[tuple[slice, dict[str, Any]]]:
+    """Return the frames of each replica in a file and what it says of itself: of one that is not joined, all.
+
+    Raises TrajectoryError where the record does not fit the file.
+    """
+    if KEY not in record:
+        return [(slice(0, n_frames), dict(record))]
+    found, at = [], 0
+    for replica in record[KEY]["replicas"]:
+        begin, n = int(replica["first_frame"]), int(replica["n_frames"])
+        if begin != at or begin + n > n_frames:
+            raise TrajectoryError(
+                f"the record of a joined file names {begin + n} frames or more, it holds {n_frames}; join again."
+            )
+        at = begin + n
+        if n:
+            found.append((slice(begin, at), dict(replica["record"])))
+    return found
+
+
+def refuse_joined(reader: TrajectoryReader) -> None:
+    """Raise InputError for a joined file, where time must be unbroken."""
+    if KEY in reader.record:
+        names = [str(replica["file"]) for replica in reader.record[KEY]["replicas"]]
+        raise InputError(f"{reader.path} joins {len(names)} replicas; give them as files ({names[0]}, ...).")
+
+
+def _copy(reader: TrajectoryReader, part: slice, writer: Any, shift_ps: float, columns: Sequence[str]) -> None:
+    extra: dict[str, npt.NDArray[Any] | None] = {"cell_nm": reader.read_cells(part.start, part.stop)}
+    if "velocities" in columns:
+        extra["velocities_nm_ps"] = reader.read_velocities(part.start, part.stop)
+    if "forces" in columns:
+        extra["forces_kj_mol_nm"] = reader.read_forces(part.start, part.stop)
+    writer.append(
+        reader.read(part.start, part.stop),
+        reader.time_ps[part] + shift_ps,
+        flags=None if reader.flags is None else reader.flags[part],
+        chunk_idx=None if reader.chunk_idx is None else reader.chunk_idx[part],
+        scalars={name: values[part] for name, values in reader.scalars.items()},
+        **extra,
+    )
+
+
+# ---- objects of MDTraj and MDAnalysis, through memory ---------------------------------------------------------------
+
+
+def to_mdtraj(
+    source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
+) -> Any:
+    """Return frames `start:stop:stride` of a trajectory, a path or one that is open, as an `mdtraj.Trajectory`.
+
+    Positions, times, bonds and the cell are taken over. Raises InputError for a file without topology,
+    TrajectoryError for a damaged one.
+    """
+    import mdtraj
+
+    from systems.chemistry.cell import lengths_and_angles
+
+    scene, positions, times, cells = _read(source, start, stop, stride)
+    lengths, angles = (None, None) if cells is None else lengths_and_angles(cells)
+    return mdtraj.Trajectory(
+        positions, scene.to_mdtraj_topology(), time=times, unitcell_lengths=lengths, unitcell_angles=angles
+    )
+
+
+def to_mdanalysis(
+    source: str | Path | TrajectoryReader, *, start: int = 0, stop: int | None = None, stride: int = 1
+) -> Any:
+    """Return frames `start:stop:stride` of a trajectory as an `MDAnalysis.Universe` in memory, in its units (Å, ps).
+
+    Names, elements, masses, charges, residues, chains (segments) and bonds are taken over. Its reader knows one time
+    step: frames that are unevenly spaced are refused. Raises InputError, TrajectoryError.
+    """
+    import MDAnalysis
+    from MDAnalysis.coordinates.memory import MemoryReader
+
+    from systems.chemistry.cell import lengths_and_angles
+
+    scene, positions, times, cells = _read(source, start, stop, stride)
+    gaps = np.diff(times)
+    if len(gaps) and not np.allclose(gaps, gaps[0], rtol=1e-6):
+        raise InputError(f"frames between {times[0]:g} and {times[-1]:g} ps are unevenly spaced; take a range that is.")
+    chains = list(dict.fromkeys(scene.chain_of_residue))
+    universe = MDAnalysis.Universe.empty(
+        scene.n_atoms,
+        n_residues=len(scene.residue_names),
+        n_segments=len(chains),
+        atom_resindex=scene.residue_of_atom,
+        residue_segindex=[chains.index(c) for c in scene.chain_of_residue],
+        trajectory=False,
+    )
+    elements = ["" if e == PARTICLE else e for e in scene.elements]
+    attributes = {
+        "names": list(scene.atom_names), "types": elements, "elements": elements, "masses": scene.masses_da,
+        "formalcharges": scene.formal_charges, "resnames": list(scene.residue_names),
+        "resids": np.arange(1, len(scene.residue_names) + 1), "resnums": _numbers(scene), "segids": chains,
+    }  # fmt: skip
+    for name, values in attributes.items():
+        universe.add_TopologyAttr(name, values)
+    universe.add_TopologyAttr("bonds", [tuple(pair) for pair in scene.bonds.tolist()])
+    dimensions = None
+    if cells is not None:
+        lengths, angles = lengths_and_angles(cells)
+        dimensions = np.concatenate([lengths * 10.0, angles], axis=1).astype(np.float32)
+    step_ps = float(gaps[0]) if len(gaps) else 1.0
+    first_ps = float(times[0]) if len(times) else 0.0
+    universe.load_new(
+        positions * np.float32(10.0), format=MemoryReader, order="fac", dimensions=dimensions, dt=step_ps,
+        time_offset=first_ps,
+    )  # fmt: skip
+    return universe
+
+
+def _read(
+    source: str | Path | TrajectoryReader, start: int, stop: int | None, stride: int
+) -> tuple[Scene, npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float64] | None]:
+    if not isinstance(source, TrajectoryReader):
+        with open_trajectory(source) as reader:
+            return _read(reader, start, stop, stride)
+    if source.scene is None:
+        raise InputError(f"{source.path} carries no topology; open it with top= and convert the reader.")
+    positions = source.read(start, stop, stride)
+    return source.scene, positions, source.time_ps[start:stop:stride], source.read_cells(start, stop, stride)
+
+
+def _numbers(scene: Scene) -> list[int]:
+    """Residue numbers of the file, its position in the scene where it has none."""
+    found = []
+    for k, name in enumerate(scene.residue_ids, start=1):
+        digits = "".join(c for c in name if c.isdigit())
+        found.append(int(digits) if digits else k)
+    return found
+
+
+# ---- weights of frames ----------------------------------------------------------------------------------------------
+
+
+FloatArray = npt.NDArray[np.floating[Any]]
+
+# Scalar column of a rollout: U_truth - U_model in kJ/mol, NaN where the truth was not asked.
+DIFFERENCE_COLUMN = "energy_difference_kj_mol"
+
+
+def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
+    """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the truth, and how many
+    effective frames they leave (Kish: 1 / sum w^2).
+
+    `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent
+    frames are assumed; correlation in time lessens the number further.
+    """
+    reduced = -np.asarray(differences_kj_mol, dtype=np.float64) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)
+    weights = np.exp(reduced - reduced.max())
+    weights /= weights.sum()
+    return weights, float(1.0 / np.square(weights).sum())
+
+
+def frame_weights(path: str | Path) -> npt.NDArray[np.float64]:
+    """Return the weights `(n_frames,)` of a trajectory's frames at equilibrium; ones where the file has none.
+
+    All replicas of one answer share a scale, mean 1 over all their frames: concatenate them as the frames. Raises
+    TrajectoryError for a damaged file, or one that has grown since the weights were written.
+    """
+    path = Path(path)
+    with closing(open_trajectory(path)) as reader:
+        n_frames = reader.n_frames
+    store = _store(path)
+    if store.suffix in (".h5", ".hdf5") and store.is_file():
+        with closing(open_hdf5(store)) as file:
+            if WEIGHTS in file:
+                weights = np.asarray(file[WEIGHTS][:], dtype=np.float64)
+                if len(weights) != n_frames:
+                    raise TrajectoryError(
+                        f"{path} holds {n_frames} frames and weights of {len(weights)}: it has grown since they were "
+                        "written; let the run that made it end."
+                    )
+                return weights
+    return np.ones(n_frames)
+
+
+def write_weights(path: Path, weights: npt.NDArray[np.float64]) -> None:
+    """Write weights `(n_frames,)` into a trajectory of ours, or replace them. Raises InputError for another number of
+    them, TrajectoryError for a file of others, StorageError."""
+    with closing(FrameStore(_store(path))) as store:
+        store.write_weights(np.asarray(weights, dtype=np.float64))
+
+
+def _store(path: Path) -> Path:
+    """Return the HDF5 file that holds a trajectory's columns: itself, or what lies beside a DCD."""
+    return next((p for p in companions(path) if p.name.endswith(".meta.h5")), path)

@@ -1,10 +1,19 @@
 """DCD trajectories (CHARMM's layout) with a PDB and a record beside them, and plain DCD files of other programs.
 
 `NAME.dcd` holds positions in Å, `NAME.pdb` the topology, `NAME.meta.h5` our record, exact times, flags and scalars.
+Blocks of bytes stand between 32-bit lengths: a header of 4 + 80 bytes (`CORD`, number of frames, first step, steps
+between frames, ..., time step in AKMA units as float32), a title, the number of atoms; then x, y and z of each frame,
+after the unit cell where there is one.
+
+Other libraries' DCD files are not used: MDTraj and MDAnalysis read a file that is cut short as far as it goes, OpenMM
+appends behind half a frame, and none cuts a file to a number of frames.
 """
 
 from __future__ import annotations
 
+import os
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +21,19 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from systems.chemistry.cell import lengths_and_angles, read_cells
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, unused_top_note
-from systems.trajectory.companion_writer import CompanionWriter, companions
-from systems.trajectory.dcd_layout import (
-    DcdLayout,
-    cell_blocks,
-    cells_of_blocks,
-    header_bytes,
-    step_fields,
-    title_bytes,
-)
-from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
+from systems.trajectory.companion_writer import CompanionWriter, companions, is_our_topology
 from systems.trajectory.frame_store import (
     CELLS,
     ENDS,
     FRAMES,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
     add_column,
     consistent_length,
     damage_reported,
@@ -39,7 +43,213 @@ from systems.trajectory.frame_store import (
     read_run_id,
 )
 from systems.trajectory.hdf5_file import check_read, read_checksums, read_columns
-from systems.trajectory.topology_file import is_our_topology
+
+AKMA_PS = 4.888821e-2  # the value MDAnalysis and OpenMM use for CHARMM's unit of time
+_HEADER_BYTES = 92
+_MOST_ATOMS = 2**31 // 13  # a frame's bytes are counted in 32 bits
+_TITLE = b"Written by surromd"
+_LAMMPS_TITLE = b"Written by LAMMPS"
+_LEAST_LAMMPS_FS = 0.05
+_LAMMPS_NOTE = "written by LAMMPS; its time step is taken to be in fs (`units real`)."
+_LAMMPS_UNKNOWN = (
+    "written by LAMMPS with a time step that is too short for fs (`units metal` or `lj`); its times are not used."
+)
+_LAST_VERSION_WITH_ANGLES = 24
+_LIKELY_DEG = (40.0, 140.0)
+
+
+@dataclass(frozen=True)
+class DcdLayout:
+    """Where the frames of a DCD lie, and what its header says. Sizes in bytes."""
+
+    n_atoms: int
+    first_frame_at: int
+    byte_order: str = "<"
+    has_cell: bool = False
+    n_frames_in_header: int = 0
+    first_time_ps: float = 0.0
+    interval_ps: float = 0.0
+    file_bytes: int = 0
+    path: Path = Path()
+    has_our_title: bool = False
+    states_time: bool = True
+    charmm_version: int = 24
+    notes: tuple[str, ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, DcdLayout):
+            return NotImplemented
+        mine = (self.n_atoms, self.first_frame_at, self.byte_order, self.has_cell)
+        return mine == (other.n_atoms, other.first_frame_at, other.byte_order, other.has_cell)
+
+    @staticmethod
+    def ours(n_atoms: int, first_frame_at: int, *, has_cell: bool = False) -> DcdLayout:
+        """Return the layout we write."""
+        return DcdLayout(n_atoms, first_frame_at, has_cell=has_cell)
+
+    @staticmethod
+    def read(path: Path) -> DcdLayout:
+        """Read the header. Raises TrajectoryError when it is damaged or of a kind that is not supported."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEADER_BYTES)
+                size = os.fstat(file.fileno()).st_size
+                order = next((o for o in "<>" if np.frombuffer(head[:4], f"{o}i4")[:1] == 84), "")
+                if len(head) < _HEADER_BYTES or not order or head[4:8] != b"CORD":
+                    what = "is empty" if size == 0 else "is not a DCD file of the 32-bit kind"
+                    raise TrajectoryError(f"{path} {what}.")
+                fields = np.frombuffer(head[8:88], f"{order}i4")
+                charmm = fields[19] != 0
+                delta = np.frombuffer(head[44:52], f"{order}f4" if charmm else f"{order}f8")[0]
+                if fields[8] != 0 or (charmm and fields[11] != 0):
+                    raise TrajectoryError(f"{path} has fixed atoms or a fourth dimension; convert it first.")
+                title = int(np.frombuffer(file.read(4), f"{order}i4")[0])
+                titles = file.read(title + 4)
+                _, n_atoms, _ = np.frombuffer(file.read(12), f"{order}i4").tolist()
+                first_frame_at = file.tell()
+        except OSError as error:
+            reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+            raise TrajectoryError(f"{path} {reason}.") from error
+        except (ValueError, IndexError) as error:
+            raise TrajectoryError(f"{path} is cut short inside its header.") from error
+        if not 1 <= n_atoms < _MOST_ATOMS:
+            raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
+        unit_ps = AKMA_PS
+        notes: tuple[str, ...] = ()
+        # MDTraj and VMD write a time step of one unit, whatever the times were.
+        states_time = not (delta == 1.0 and fields[2] == 1)
+        if _LAMMPS_TITLE in titles:
+            # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
+            unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
+            notes = (_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN,)
+        # The time step is float32: digits beyond its seventh are noise.
+        interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
+        states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
+        if not (np.isfinite(interval_ps) and interval_ps > 0):
+            interval_ps = 1.0
+        first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
+        return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
+                         first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
+                         int(fields[19]), notes)  # fmt: skip
+
+    @property
+    def frame_dtype(self) -> np.dtype[Any]:
+        """The NumPy record of one frame, block lengths included."""
+        o = self.byte_order
+        cell = [("cell", f"{o}i4", (14,))] if self.has_cell else []
+        axes = [
+            entry
+            for k in range(3)
+            for entry in ((f"before{k}", f"{o}i4"), (f"x{k}", f"{o}f4", (self.n_atoms,)), (f"after{k}", f"{o}i4"))
+        ]
+        return np.dtype(cell + axes)
+
+    def offset(self, frame: int) -> int:
+        return self.first_frame_at + frame * int(self.frame_dtype.itemsize)
+
+    def times_ps(self, n_frames: int) -> npt.NDArray[np.float64]:
+        return self.first_time_ps + self.interval_ps * np.arange(n_frames, dtype=np.float64)
+
+    def whole_frames(self) -> int:
+        """Return the number of frames in the file. Raises TrajectoryError when it ends inside one or lacks some.
+
+        Other programs write the number they intend (or 0) and never correct it, so theirs is only warned about.
+        """
+        n, rest = divmod(self.file_bytes - self.first_frame_at, int(self.frame_dtype.itemsize))
+        stated = self.n_frames_in_header
+        if stated not in (0, n) and not rest and not self.has_our_title:
+            warnings.warn(f"{self.path}: the header states {stated} frames, the file holds {n}.", stacklevel=2)
+        elif rest or stated not in (0, n):
+            raise TrajectoryError(
+                f"{self.path} is cut short or damaged: its header states {stated} frames, {n} are whole; "
+                "restore it from a whole copy."
+            )
+        return n
+
+
+def step_fields(times_ps: npt.NDArray[np.float64], record: dict[str, Any]) -> tuple[int, int, float]:
+    """Return `(first step, steps between frames, time step in ps)` for the header.
+
+    In units of the integration step where the record states one that divides the times, else of the interval.
+    """
+    stated = record.get("save_every_ps")
+    if len(times_ps) > 1:
+        interval = float(times_ps[1] - times_ps[0])
+    else:
+        interval = float(stated) if isinstance(stated, int | float) and stated > 0 else 1.0
+    timestep = record.get("timestep_ps")
+    for unit in (timestep, interval):
+        if not isinstance(unit, int | float) or unit <= 0:
+            continue
+        nsavc, first = round(interval / unit), round(float(times_ps[0]) / unit)
+        fits = abs(nsavc * unit - interval) < 1e-6 * interval and abs(first * unit - times_ps[0]) < 1e-3 * interval
+        if fits and nsavc >= 1 and 0 <= first < 2**31:
+            return first, nsavc, float(unit)
+    return 0, 1, interval
+
+
+def cell_blocks(cell_nm: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Return the unit-cell blocks `(n, 14)` of box vectors `(n, 3, 3)` nm: A, gamma, B, beta, alpha, C (Å, degrees)."""
+    lengths, angles = lengths_and_angles(cell_nm)
+    (a, b, c), (alpha, beta, gamma) = 10.0 * lengths.T, angles.T
+    out = np.full((len(lengths), 14), 48, dtype="<i4")
+    out[:, 1:13] = np.ascontiguousarray(np.stack([a, gamma, b, beta, alpha, c], axis=1), dtype="<f8").view("<i4")
+    return out
+
+
+def cells_of_blocks(
+    blocks: npt.NDArray[np.int32], byte_order: str, charmm_version: int = _LAST_VERSION_WITH_ANGLES
+) -> npt.NDArray[np.float64] | None:
+    """Return box vectors `(n, 3, 3)` nm of unit-cell blocks `(n, 14)`, None of such as hold zeros.
+
+    Between the lengths stand angles in degrees (most programs), their cosines (NAMD), or the elements of CHARMM's
+    symmetric shape matrix in Å (version 25 on), whose rows are the box vectors: it is known by numbers that are no
+    angles. Raises ValueError where the numbers are none of the three.
+    """
+    raw = np.ascontiguousarray(blocks[:, 1:13]).view(f"{byte_order}f8").astype(np.float64)
+    lengths, angles = raw[:, [0, 2, 5]], raw[:, [4, 3, 1]]
+    if not len(raw) or (lengths == 0.0).any():
+        return read_cells(0.1 * lengths, angles)
+    if (np.abs(angles) <= 1.0).all() and charmm_version <= _LAST_VERSION_WITH_ANGLES:
+        angles = np.degrees(np.arccos(angles))
+    likely = bool(((angles >= _LIKELY_DEG[0]) & (angles <= _LIKELY_DEG[1])).all())
+    if not _are_angles(angles) or (charmm_version > _LAST_VERSION_WITH_ANGLES and not likely):
+        shape = raw[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
+        if np.isfinite(shape).all() and (np.linalg.eigvalsh(shape) > 0.0).all():
+            return 0.1 * shape
+    if not _are_angles(angles):
+        raise ValueError("neither angles, nor cosines, nor a shape matrix")
+    return read_cells(0.1 * lengths, angles)
+
+
+def _are_angles(angles: npt.NDArray[np.float64]) -> bool:
+    """Whether a cell can have these angles `(n, 3)`, degrees."""
+    alpha, beta, gamma = np.cos(np.radians(angles)).T
+    volume = 1.0 - alpha**2 - beta**2 - gamma**2 + 2.0 * alpha * beta * gamma
+    return bool(((angles > 0.0) & (angles < 180.0)).all() and (volume > 0.0).all())
+
+
+def header_bytes(n_frames: int, first_step: int, nsavc: int, timestep_ps: float, *, has_cell: bool = False) -> bytes:
+    """Return the first block of our header; `nsavc` time steps lie between frames."""
+    fields = np.zeros(20, dtype="<i4")
+    fields[:3] = n_frames, first_step, nsavc
+    fields[3] = min(n_frames * nsavc, 2**31 - 1)
+    fields[9:10] = np.array([timestep_ps / AKMA_PS], dtype="<f4").view("<i4")
+    fields[10] = int(has_cell)
+    fields[19] = 24  # CHARMM's version: float32 time step, three dimensions (field 11)
+    mark = np.array([84], dtype="<i4").tobytes()
+    return mark + b"CORD" + fields.tobytes() + mark
+
+
+def title_bytes(n_atoms: int) -> bytes:
+    """Return the title and the number of atoms, which complete our header."""
+    line = (_TITLE + b"; record and exact times in NAME.meta.h5").ljust(80)
+    mark = np.array([84], dtype="<i4").tobytes()
+    title = mark + np.array([1], dtype="<i4").tobytes() + line + mark
+    return title + np.array([4, n_atoms, 4], dtype="<i4").tobytes()
+
+
+# ---- writer and reader ----------------------------------------------------------------------------------------------
 
 
 class DcdWriter(CompanionWriter):

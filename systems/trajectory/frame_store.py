@@ -1,9 +1,8 @@
 """Per-frame columns, a record and a scene in one HDF5 file: the part that HDF5 trajectories and DCD companions share.
 
 Layout: `/time` (n,) float64 ps, `/surromd/chunk_idx` (n,) int32, `/surromd/flags` (n,) uint16 where frames were
-checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/checksums/NAME` (n,) uint32 (systems.files.checksums; not in
-files of earlier versions), `/surromd/record` and `/surromd/scene` JSON text with a seal; more columns as the format
-asks.
+checked, `/surromd/scalars/NAME` (n,) float64, `/surromd/checksums/NAME` (n,) uint32 (`frame_checksums`; not in files of
+earlier versions), `/surromd/record` and `/surromd/scene` JSON text with a seal; more columns as the format asks.
 """
 
 from __future__ import annotations
@@ -14,22 +13,129 @@ import uuid
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, StorageError, TrajectoryError, first_line
-from systems.files.atomic_file import AtomicFile, journal_path
-from systems.files.checksums import checksum_rows, frame_checksums, frames_digest, sealed, unsealed
 from systems.files.outside import UNREADABLE, open_checked
 from systems.files.schema import fitted, parsed
-from systems.files.whole_file import create_whole, refuse_existing, storage_error
-from systems.record import Record
+from systems.files.whole_file import (
+    AtomicFile,
+    checksum_rows,
+    create_whole,
+    frame_checksums,
+    frames_digest,
+    journal_path,
+    refuse_existing,
+    sealed,
+    storage_error,
+    unsealed,
+)
 from systems.scene import Scene
-from systems.trajectory.frame_block import FrameBlock
+
+Count = Annotated[int, range(2**63)]
+# Also of a run that came to nothing.
+Number = Annotated[float, ...]
+
+
+class _Mean(TypedDict):
+    mean: Number
+
+
+class _Value(_Mean, total=False):
+    standard_error: Number | None
+    target: Number | None
+
+
+class _Drift(TypedDict):
+    kj_mol_ns_dof: Number | None
+    standard_error: Number | None
+
+
+class _Summary(TypedDict, total=False):
+    temperature_k: _Value
+    potential_kj_mol: _Value
+    density_g_ml: _Value
+    drift: _Drift
+
+
+class _Cost(TypedDict, total=False):
+    wall_s: Number
+
+
+class _Deviation(TypedDict):
+    what: str
+    reason: str
+
+
+class _Guarded(TypedDict):
+    guard: str
+    chunks: Count
+    chunks_caught: Count
+    frames: dict[str, int]
+    bias: list[str]
+
+
+class _Interventions(_Guarded, total=False):
+    reasons: dict[str, int]
+    seconds: dict[str, Number]
+
+
+class Record(TypedDict, total=False):
+    """The record of a trajectory as JSON has it."""
+
+    kind: str
+    completed: bool
+    seed: int
+    program: dict[str, str]
+    platform: str
+    force_field: str | None
+    solvent: str | None
+    temperature_k: Number | None
+    hydrogen_mass_da: Number | None
+    constrain_hydrogens: bool
+    cost: _Cost
+    summary: _Summary
+    interventions: _Interventions
+    precision: str
+    precision_reason: str | None
+    out_of_domain: list[_Deviation]
+
+
+# ---- frames of one append -------------------------------------------------------------------------------------------
+
+
+Float32Array = npt.NDArray[np.float32]
+Float64Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBlock:
+    """Frames that belong together, checked: positions `(n, n_atoms, 3)` float32 nm, series `(n,)`.
+
+    Where they are kept: velocities and forces `(n, n_atoms, 3)` float32, box vectors `(n, 3, 3)`.
+    """
+
+    positions_nm: Float32Array
+    time_ps: Float64Array
+    flags: npt.NDArray[np.uint16] | None
+    chunk_idx: npt.NDArray[np.int32]
+    scalars: dict[str, Float64Array]
+    velocities_nm_ps: Float32Array | None = None
+    forces_kj_mol_nm: Float32Array | None = None
+    cell_nm: Float64Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_ps)
+
+
+# ---- the store ------------------------------------------------------------------------------------------------------
+
 
 FORMAT_VERSION = 1
 _COLUMN_CHUNK = 2048

@@ -1,9 +1,12 @@
-"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone.
+"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone; others' H5MD.
 
 MDTraj: `/coordinates` (n, n_atoms, 3) float32 nm, `/time` ps, `/topology` JSON (mdtraj.org, HDF5 format, version 1.1).
 H5MD 1.1 (de Buyl, Colberg and Höfling, Comput. Phys. Commun. 185, 1546 (2014)): `/particles/trajectory/position` with
-`value` and `time` as hard links onto the same datasets, so that the second convention takes no space. What else frames
-may have (velocities, forces, a cell) is in `extra_columns`.
+`value` and `time` as hard links onto the same datasets, so that the second convention takes no space.
+
+What else frames may have. MDTraj: `/velocities` nm/ps, `/cell_lengths` nm, `/cell_angles` degrees. H5MD: `velocity` and
+`force` beside `position`, as hard links, and `box/edges`. MDTraj has no place for forces; they lie in `/forces`,
+kJ/mol/nm.
 """
 
 from __future__ import annotations
@@ -17,21 +20,24 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.elements import ATOMIC_NUMBERS
+from systems.chemistry.cell import lengths_and_angles
+from systems.chemistry.cell import read_cells as cells_of
 from systems.errors import InputError, TrajectoryError, first_line
-from systems.files.checksums import Checksums, check_frames_read, frame_checksums
 from systems.files.outside import UNREADABLE
-from systems.files.whole_file import refuse_existing
-from systems.scene import Scene
+from systems.files.whole_file import Checksums, check_frames_read, frame_checksums, refuse_existing
+from systems.scene import ATOMIC_NUMBERS, Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology, unused_top_note
-from systems.trajectory.extra_columns import PER_ATOM, check_wanted, extra_values, lay_out_extras, read_cells
-from systems.trajectory.foreign_details import counted_note
-from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
+from systems.trajectory.companion_writer import refuse_other_topology, topology_bytes, topology_path, write_topology
+from systems.trajectory.foreign_readers import counted_note
+from systems.trajectory.foreign_scenes import nm_per, ps_per, scene_from_structure
 from systems.trajectory.frame_store import (
     CELLS,
     CHECKSUMS,
     EDGES,
     FRAMES,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
     FrameStore,
     add_column,
     columns_with_frames,
@@ -44,13 +50,87 @@ from systems.trajectory.frame_store import (
     read_record,
     read_run_id,
 )
-from systems.trajectory.stated_units import nm_per, ps_per
-from systems.trajectory.topology_file import refuse_other_topology, topology_bytes, topology_path, write_topology
+
+PER_ATOM = ("velocities", "forces")
+# Dataset: H5MD's name, MDTraj's units, H5MD's unit.
+_LAYOUT = {
+    "velocities": ("velocity", b"nanometers/picosecond", "nm ps-1"),
+    "forces": ("force", b"kilojoules_per_mole/nanometer", "kJ mol-1 nm-1"),
+}
+_POSITION = "particles/trajectory/position"
+
+
+def check_wanted(wanted: Sequence[str], path: Path) -> None:
+    """Raise InputError for a column that a file cannot have."""
+    for name in wanted:
+        if name not in PER_ATOM:
+            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
+
+
+def lay_out_extras(file: h5py.File, wanted: Sequence[str], *, periodic: bool) -> None:
+    """Add empty columns for what is `wanted`, and for the cell; positions must be there already."""
+    particles, position, coordinates = file["particles/trajectory"], file[_POSITION], file["coordinates"]
+    for name in (n for n in PER_ATOM if n in wanted):
+        h5md_name, units, unit = _LAYOUT[name]
+        column = add_column(file, name, 0, "<f4", tail=coordinates.shape[1:], chunk=coordinates.chunks[0])
+        column.attrs["units"], column.attrs["unit"] = np.bytes_(units), unit
+        group = particles.create_group(h5md_name)
+        group["value"], group["time"], group["step"] = column, position["time"], position["step"]
+    box = particles["box"]
+    box.attrs["boundary"] = np.array([b"periodic" if periodic else b"none"] * 3, dtype="S8")
+    if not periodic:
+        return
+    for name, units, unit in (("cell_lengths", b"nanometers", "nm"), ("cell_angles", b"degrees", "deg")):
+        column = add_column(file, name, 0, "<f4", tail=(3,))
+        column.attrs["units"], column.attrs["unit"] = np.bytes_(units), unit
+    edges = add_column(file, EDGES, 0, "<f8", tail=(3, 3))
+    edges.attrs["unit"] = "nm"
+    box["edges/time"], box["edges/step"] = position["time"], position["step"]
+
+
+def extra_values(
+    file: h5py.File, block: FrameBlock, cell_nm: npt.ArrayLike | None, where: str
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of a block by dataset name.
+
+    `cell_nm` (3, 3): the cell of frames that come without one. Raises InputError when velocities or forces are
+    given for some frames of a file and not for others.
+    """
+    values: dict[str, npt.NDArray[Any]] = {}
+    for name, given in (("velocities", block.velocities_nm_ps), ("forces", block.forces_kj_mol_nm)):
+        if (given is not None) != (name in file):
+            state = "holds" if name in file else "was started without"
+            raise InputError(f"{where}: this file {state} {name}; give them with every frame or with none.")
+        if given is not None:
+            values[name] = given
+    if EDGES in file:
+        cell = block.cell_nm
+        if cell is None:
+            cell = np.broadcast_to(np.asarray(cell_nm, dtype=np.float64), (len(block), 3, 3))
+        values["cell_lengths"], values["cell_angles"] = lengths_and_angles(cell)
+        values[EDGES] = np.asarray(cell)
+    elif block.cell_nm is not None:
+        raise InputError(f"{where}: this file has no periodic cell, but frames came with one.")
+    return values
+
+
+def read_cells(file: h5py.File, start: int, stop: int, stride: int) -> npt.NDArray[np.float64] | None:
+    """Return the box vectors `(n, 3, 3)` nm of frames, None in a file that is not periodic. MDTraj's files too."""
+    frames = slice(start, stop, stride)
+    if EDGES in file:
+        cells: npt.NDArray[np.float64] = np.asarray(file[EDGES][frames], dtype=np.float64)
+        return cells
+    if "cell_lengths" in file and "cell_angles" in file:
+        return cells_of(file["cell_lengths"][frames], file["cell_angles"][frames])
+    return None
+
+
+# ---- ours and MDTraj's ----------------------------------------------------------------------------------------------
+
 
 _CHUNK_BYTES = 131_072
 _STRIDED_READ_FRAMES = 8192
 _BOND_TYPES = {1.0: "Single", 1.5: "Aromatic", 2.0: "Double", 3.0: "Triple"}
-_POSITION = "particles/trajectory/position"
 
 
 class Hdf5Writer(TrajectoryWriter):
@@ -337,3 +417,104 @@ def _topology_json(scene: Scene) -> str:
     orders = scene.bond_orders.tolist()
     metadata = [{"order": order or None, "type": _BOND_TYPES.get(order)} for order in orders]
     return json.dumps({"chains": chains, "bonds": scene.bonds.tolist(), "bond_metadata": metadata})
+
+
+# ---- H5MD of other programs -----------------------------------------------------------------------------------------
+
+
+class H5mdReader(TrajectoryReader):
+    """Reads the positions of an H5MD file's particles. Times without a unit are not known.
+
+    Raises TrajectoryError for a file that is damaged or states no unit of length, InputError for several groups of
+    particles or a `top` that does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        self.path = path
+        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        self._file = open_hdf5(path)
+        try:
+            with damage_reported(path):
+                self._read_headers()
+            self.scene = None if top is None else scene_from_structure(top, name=path.stem)
+            if self.scene is not None:
+                if self.scene.n_atoms != self.n_atoms:
+                    raise InputError(
+                        f"{top} has {self.scene.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one."
+                    )
+                if self.n_frames:
+                    self.scene = self.scene.with_positions(self._read(0, 1, 1)[0])
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read_headers(self) -> None:
+        groups = [g for g in self._file.get("particles", {}).values() if "position/value" in g]
+        if not groups:
+            raise InputError(f"{self.path} holds no positions of particles.")
+        if len(groups) > 1:
+            names = ", ".join(g.name.rpartition("/")[2] for g in groups)
+            raise InputError(f"{self.path} holds several groups of particles ({names}); write one of them alone.")
+        self._box, position = groups[0].get("box"), groups[0]["position"]
+        self._value = position["value"]
+        if self._value.ndim != 3 or self._value.shape[2] != 3:
+            raise TrajectoryError(f"{self.path}: positions of shape {self._value.shape}, not (n, n_atoms, 3).")
+        self.n_frames, self.n_atoms = self._value.shape[:2]
+        nm = nm_per(self._value.attrs.get("unit", ""))
+        if nm is None:
+            raise TrajectoryError(
+                f"{self.path}: its positions state no unit of length that is known; set the attribute `unit` of "
+                f"{self._value.name} to 'nm' or 'Angstrom'."
+            )
+        self._nm = nm
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        time = position.get("time")
+        ps = None if time is None else ps_per(time.attrs.get("unit", ""))
+        if time is not None and ps is None:
+            self.notes = ("its times state no unit that is known and are not used.",)
+        elif time is not None and ps is not None:
+            steps: Any = time[()]
+            if np.ndim(steps) == 0:
+                steps = float(time.attrs.get("offset", 0.0)) + steps * np.arange(self.n_frames)
+            self.time_ps, self.times_known = ps * np.asarray(steps[: self.n_frames], dtype=np.float64), True
+            if len(self.time_ps) != self.n_frames:
+                raise TrajectoryError(f"{self.path} is damaged: {self.n_frames} frames, {len(self.time_ps)} times.")
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        return self._rows(self._value, start, stop, stride).astype(np.float32) * np.float32(self._nm)
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        if not self._file:
+            raise InputError(f"{self.path} is closed.")
+        with damage_reported(self.path):
+            edges = None if self._box is None else self._box.get("edges", self._box.attrs.get("edges"))
+            if edges is None:
+                return None
+            column = edges.get("value") if isinstance(edges, h5py.Group) else None
+            if column is not None:
+                values, unit = self._rows(column, start, stop, stride), column.attrs.get("unit")
+            else:
+                one: npt.NDArray[Any] = np.asarray(edges[()])
+                values = np.broadcast_to(one, (len(range(start, stop, stride)), *one.shape))
+                unit = edges.attrs.get("unit") if isinstance(edges, h5py.Dataset) else None
+            nm = self._nm if unit is None else nm_per(unit)
+            if nm is None:
+                raise TrajectoryError(
+                    f"{self.path}: its cell is in {unit!r}, a unit that is not known; write it in nm."
+                )
+            cells = values[..., None] * np.eye(3) if values.ndim == 2 else values
+            return None if not np.any(cells) else np.asarray(cells, dtype=np.float64) * nm
+
+    def _rows(self, column: h5py.Dataset, start: int, stop: int, stride: int) -> npt.NDArray[Any]:
+        try:
+            rows: npt.NDArray[Any] = np.asarray(column[start:stop])[::stride]
+        except UNREADABLE as error:
+            if not self._file:
+                raise InputError(f"{self.path} is closed.") from error
+            raise TrajectoryError(
+                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
+            ) from error
+        return rows
+
+    def close(self) -> None:
+        self._file.close()

@@ -20,11 +20,13 @@ from systems.errors import InputError, TrajectoryError, first_line
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryReader, unused_top_note
 from systems.trajectory.companion_writer import CompanionWriter, companions
-from systems.trajectory.frame_block import Float32Array, Float64Array, FrameBlock
 from systems.trajectory.frame_store import (
     CELLS,
     ENDS,
     FRAMES,
+    Float32Array,
+    Float64Array,
+    FrameBlock,
     add_column,
     consistent_length,
     damage_reported,

@@ -1,25 +1,133 @@
-"""XYZ files, and extended ones: `Lattice`, `pbc` and `Properties` of each frame's second line are read.
+"""Files that name the atoms in every frame: XYZ, extended XYZ and ASE's own trajectories (`.traj`, where ase is there).
 
-Positions in Å. https://github.com/libAtoms/extxyz: `Lattice` holds the rows a, b, c; `Properties` the columns as
-`name:type:number` (`species:S:1:pos:R:3` where there is none).
+XYZ: positions in Å; `Lattice`, `pbc` and `Properties` of each frame's second line are read
+(https://github.com/libAtoms/extxyz): `Lattice` holds the rows a, b, c; `Properties` the columns as `name:type:number`
+(`species:S:1:pos:R:3` where there is none).
 """
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import itertools
 import re
 import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from systems.chemistry.element_data import element_symbol
-from systems.errors import InputError, TrajectoryError
+from systems.errors import InputError, TrajectoryError, first_line
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import named_scene, scene_from_structure
-from systems.trajectory.frame_block import Float32Array, Float64Array
-from systems.trajectory.frame_orders import moved_note, open_text, order_of
+from systems.trajectory.frame_store import Float32Array, Float64Array
+
+IntArray = npt.NDArray[np.int64]
+
+
+def open_text(path: Path) -> IO[str]:
+    """Open a text file, a compressed one (.gz, .bz2) too."""
+    suffix = path.suffix.lower()
+    if suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8", errors="replace")
+    if suffix == ".bz2":
+        return bz2.open(path, "rt", encoding="utf-8", errors="replace")
+    return path.open(encoding="utf-8", errors="replace")
+
+
+def order_of(names: Sequence[str], first: Sequence[str], path: Path, frame: int) -> IntArray | None:
+    """Return where each atom of the first frame stands in a later one `(n_atoms,)`, None where nothing moved.
+
+    Raises TrajectoryError where the frames hold different atoms, or moved ones that share a name.
+    """
+    if names == first:
+        return None
+    if len(names) != len(first):
+        raise TrajectoryError(
+            f"{path}: frame {frame} has {len(names)} atoms, not as many as the first ({len(first)}); split the file."
+        )
+    k = next(k for k, (one, two) in enumerate(zip(names, first, strict=True)) if one != two)
+    here = f"{path}: frame {frame} names other atoms than the first (atom {k + 1} is {names[k]!r}, not {first[k]!r})"
+    if Counter(names) != Counter(first):
+        raise TrajectoryError(f"{here}; split the file.")
+    moved = [name for name, other in zip(first, names, strict=True) if name != other]
+    if any(first.count(name) > 1 for name in set(moved)):
+        raise TrajectoryError(f"{here}, and names that occur twice do not tell the order; write it again in one order.")
+    place: dict[str, list[int]] = {}
+    for j, name in enumerate(names):
+        place.setdefault(name, []).append(j)
+    return np.array([place[name].pop(0) for name in first], dtype=np.int64)
+
+
+def orders(frames: Iterable[Sequence[str]], path: Path) -> tuple[dict[int, IntArray], int]:
+    """Return the order by frame of those that differ from the first, and the number of atoms in a frame.
+
+    `frames`: the atoms' names of each frame. Raises TrajectoryError as `order_of`.
+    """
+    first: Sequence[str] | None = None
+    moved: dict[int, IntArray] = {}
+    for frame, names in enumerate(frames):
+        first = names if first is None else first
+        order = order_of(names, first, path, frame)
+        if order is not None:
+            moved[frame] = order
+    return moved, 0 if first is None else len(first)
+
+
+def pdb_names(path: Path) -> Iterator[list[str]]:
+    """Yield atom name, alternate, residue and element of all atoms of each model of a PDB file."""
+    names: list[str] = []
+    with open_text(path) as file:
+        for line in file:
+            if line.startswith(("ATOM", "HETATM")):
+                names.append(" ".join(f"{line[12:27]} {line[76:78]}".split()))
+            elif line.startswith("END") and names:
+                yield names
+                names = []
+    if names:
+        yield names
+
+
+def arc_names(path: Path) -> Iterator[list[str]]:
+    """Yield name and type of all atoms of each frame of a Tinker archive."""
+    with open_text(path) as file:
+        for title in file:
+            words = title.split()
+            if not words or not words[0].isdigit():
+                return
+            names: list[str] = []
+            while len(names) < int(words[0]) and (row := file.readline().split()):
+                if len(row) > 5 and not row[1].replace(".", "").isdigit():  # else the cell
+                    names.append(f"{row[1]} {row[5]}")
+            yield names
+
+
+def gro_frames(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield the title, and residue and name of all atoms, of each frame of a GRO file."""
+    with open_text(path) as file:
+        for title in file:
+            count = file.readline().strip()
+            if not count.isdigit():
+                return
+            names = [" ".join(f"{line[:10]} {line[10:15]}".split()) for line in itertools.islice(file, int(count))]
+            file.readline()
+            yield title, names
+
+
+def moved_note(moved: dict[int, IntArray]) -> tuple[str, ...]:
+    """Return the line on reordered frames, none where none is."""
+    if not moved:
+        return ()
+    first = min(moved)
+    return (f"{len(moved)} frames, from {first} on, list their atoms in another order; matched by their names.",)
+
+
+# ---- XYZ ------------------------------------------------------------------------------------------------------------
+
 
 _NM = 0.1
 _FIELD = re.compile(r'(\w+)\s*=\s*(?:"([^"]*)"|\'([^\']*)\'|(\S+))')
@@ -132,3 +240,73 @@ def _elements(names: list[str], path: Path) -> list[str]:
             raise InputError(f"{path}: the element of atom {i} ({name}) is not known; give a PDB file with `top`.")
         out.append(element)
     return out
+
+
+# ---- ASE ------------------------------------------------------------------------------------------------------------
+
+
+class AseReader(TrajectoryReader):
+    """A file of ASE's `Trajectory`, read frame by frame; elements are the file's, bonds found by distance.
+
+    Raises TrajectoryError where ase is not installed or cannot read it, InputError for a `top` that does not fit.
+    """
+
+    def __init__(self, path: Path, top: Path | None) -> None:
+        self.path = path
+        if not path.exists():
+            raise TrajectoryError(f"{path} does not exist.")
+        self.record, self.flags, self.chunk_idx, self.scalars = {}, None, None, {}
+        try:
+            from ase.io.trajectory import Trajectory
+        except ImportError as error:
+            raise TrajectoryError(
+                f"{path} is read by ase: `pip install ase`, or convert it elsewhere by `ase convert {path.name} "
+                f"{path.stem}.xyz`."
+            ) from error
+        try:
+            self._frames: Any = Trajectory(str(path))
+            self.n_frames = len(self._frames)
+            first = self._frames[0]
+        except Exception as error:  # ase raises whatever its parts do
+            raise TrajectoryError(f"{path} cannot be read by ase: {first_line(error)}.") from error
+        self.n_atoms = len(first)
+        self.time_ps, self.times_known = np.arange(self.n_frames, dtype=np.float64), False
+        self._elements = [str(x) for x in first.get_chemical_symbols()]
+        if top is None:
+            cell = first.cell.array * _NM if first.pbc.all() else None
+            names = [f"{e}{k + 1}" for k, e in enumerate(self._elements)]
+            stated = named_scene(path, names, self._elements, first.positions * _NM, cell)
+        else:
+            stated = scene_from_structure(top, name=path.stem)
+        if stated.n_atoms != self.n_atoms:
+            self.close()
+            raise InputError(f"{top} has {stated.n_atoms} atoms, {path} has {self.n_atoms}; give the matching one.")
+        self.scene = stated.with_positions(self._read(0, 1, 1)[0])
+
+    def _read(self, start: int, stop: int, stride: int) -> Float32Array:
+        out = np.empty((len(range(start, stop, stride)), self.n_atoms, 3), dtype=np.float32)
+        for k, frame in enumerate(self._stored(start, stop, stride)):
+            order_of(list(frame.get_chemical_symbols()), self._elements, self.path, start + k * stride)
+            out[k] = frame.positions * _NM
+        return out
+
+    def _read_cells(self, start: int, stop: int, stride: int) -> Float64Array | None:
+        frames = self._stored(start, stop, stride)
+        if not all(frame.pbc.all() for frame in frames):
+            return None
+        return np.array([frame.cell.array * _NM for frame in frames], dtype=np.float64).reshape(-1, 3, 3)
+
+    def _stored(self, start: int, stop: int, stride: int) -> list[Any]:
+        if self._frames is None:
+            raise InputError(f"{self.path} is closed.")
+        try:
+            return [self._frames[k] for k in range(start, stop, stride)]
+        except Exception as error:  # ase raises whatever its parts do
+            raise TrajectoryError(
+                f"{self.path} is damaged in frames {start} to {stop} ({first_line(error)})."
+            ) from error
+
+    def close(self) -> None:
+        if self._frames is not None:
+            self._frames.close()
+        self._frames = None

@@ -17,10 +17,10 @@ FAST = ("--time", "0.4ps", "--save-every", "0.02ps", "--timestep", "1fs", "--hyd
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     # The library's protocol equilibrates for longer than a test may take.
-    from md_reference.run import defaults
+    from md_reference.run import config
 
-    shortened = defaults.defaults() | {"equilibrate_ps": 0.2}
-    monkeypatch.setattr(defaults, "defaults", lambda: shortened)
+    shortened = config.defaults() | {"equilibrate_ps": 0.2}
+    monkeypatch.setattr(config, "defaults", lambda: shortened)
     return tmp_path
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from energies import energy_terms
 from md_reference.forces.forcefield import build_system
-from md_reference.forces.small_molecules import gaff, parameter_cache
+from md_reference.forces.small_molecules import gaff
 from md_reference.forces.small_molecules.prmtop import Prmtop, load_openmm
 from md_reference.forces.small_molecules.programs import find_ambertools
 from md_reference.forces.spec import ForceFieldSpec
@@ -182,11 +182,11 @@ def test_the_first_of_two_writers_stays(tmp_path: Path, alanine_dipeptide: Scene
     from systems.library.named_scenes import load
 
     scene = load("ethanol")
-    found = parameter_cache.find_shipped(scene, gaff.METHOD)
+    found = gaff.find_shipped(scene, gaff.METHOD)
     assert found is not None
     path = tmp_path / "entry.json.gz"
-    first = parameter_cache.store(path, replace(found, source={"who": "first"}))
-    second = parameter_cache.store(path, replace(found, source={"who": "second"}))
+    first = gaff.store(path, replace(found, source={"who": "first"}))
+    second = gaff.store(path, replace(found, source={"who": "second"}))
     assert first.source == second.source == {"who": "first"}
     assert not [p for p in tmp_path.iterdir() if p != path]
 

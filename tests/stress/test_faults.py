@@ -21,7 +21,7 @@ from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import Progress, RolloutConfig, packed_progress, progress_of, rollout
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError, WeightsError
 from systems.scene import Scene
-from systems.trajectory.checkpoint import checkpoint_path, read_checkpoints
+from systems.trajectory.checkpoint import checkpoint_path, read_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 
 N_CHUNKS = 180
@@ -86,7 +86,7 @@ def test_stopped_at_random_moments_it_goes_on_bit_for_bit(
         child.stop(number)
         status, said = child.end()
         assert status in expected, said or status
-        known = progress_of(state, read_checkpoints(state)[0], None).steps if state.exists() else 0
+        known = progress_of(state, read_checkpoint(state), None).steps if state.exists() else 0
         assert known >= promised, "what a checkpoint has seen stays"
         # A kill between the append and its checkpoint leaves one chunk more, which is cut and computed again.
         assert all(known <= len(frames_of(path)) <= known + chunk for path in outs if known or path.exists())
@@ -239,7 +239,7 @@ def test_no_code_runs_from_a_hostile_file(tmp_path: Path, alanine_dipeptide: Sce
     for data in (file.read_bytes(), pickle.dumps(_Harm(harm))):
         file.write_bytes(data)
         with pytest.raises(SurromdError):
-            read_checkpoints(file)
+            read_checkpoint(file)
         with pytest.raises(SurromdError):
             simulation.loadCheckpoint(str(file))
     torch.save({"model": _Harm(harm)}, tmp_path / "w.safetensors")

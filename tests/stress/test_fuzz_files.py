@@ -18,7 +18,7 @@ from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import Progress, packed_progress, progress_of
 from systems.errors import SurromdError
 from systems.scene import Scene
-from systems.trajectory.checkpoint import CheckpointFile, new_header, read_checkpoints
+from systems.trajectory.checkpoint import new_header, read_checkpoint, write_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 from time_limits import time_limit
 
@@ -125,11 +125,11 @@ def make_checkpoint(path: Path) -> None:
     progress = Progress(last, velocities,
                         chunks=9, steps=63, wall_s=1.5, seconds={"draw": 1.0}, tallies=[tally, Tally()])  # fmt: skip
     plain, arrays = packed_progress(progress)
-    CheckpointFile(path, None).write(new_header(0, overwrite=False) | {"settings": SETTINGS, "progress": plain}, arrays)
+    write_checkpoint(path, new_header(0, overwrite=False) | {"settings": SETTINGS, "progress": plain}, arrays)
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    found = vars(progress_of(path, read_checkpoints(path)[0], SETTINGS))
+    found = vars(progress_of(path, read_checkpoint(path), SETTINGS))
     return {key: value.tobytes() if isinstance(value, np.ndarray) else repr(value) for key, value in found.items()}
 
 
@@ -164,8 +164,8 @@ def prepare(kind: str, folder: Path, scene: Scene, small_weights: Weights) -> tu
         make_checkpoint(folder / "a.h5.checkpoint")
         return folder / "a.h5.checkpoint", read_progress
     if kind == "reference checkpoint":
-        CheckpointFile(folder / "b.h5.checkpoint", None).write(new_header(0, overwrite=False), b"state" * 300)
-        return folder / "b.h5.checkpoint", read_checkpoints
+        write_checkpoint(folder / "b.h5.checkpoint", new_header(0, overwrite=False), b"state" * 300)
+        return folder / "b.h5.checkpoint", read_checkpoint
     if kind == "simulation checkpoint":
         simulation = Simulation(scene, small_weights, seed=5, solver_steps=1, precision="fp32")
         simulation.step(9)

@@ -34,7 +34,13 @@ from systems.errors import InputError, SurromdError
 from systems.files.whole_file import sealed
 from systems.library.named_scenes import load
 from systems.scene import Scene
-from systems.trajectory.checkpoint import CheckpointFile, checkpoint_path, last_supported, new_header, read_checkpoints
+from systems.trajectory.checkpoint import (
+    checkpoint_path,
+    new_header,
+    read_checkpoint,
+    supported_checkpoint,
+    write_checkpoint,
+)
 from systems.trajectory.codec import open_trajectory
 from systems.trajectory.frame_store import json_text, set_text
 from time_limits import time_limit
@@ -174,9 +180,9 @@ def checkpoint_kind(folder: Path) -> Kind:
     path = folder / "a.h5.checkpoint"
 
     def write(altered: Any) -> None:
-        CheckpointFile(path, None).write(altered, b"") if "files" in altered else path.write_bytes(b"")
+        write_checkpoint(path, altered, b"") if "files" in altered else path.write_bytes(b"")
 
-    return Kind(new_header(1, overwrite=False), write, lambda: last_supported(path, [folder / "a.h5"]))
+    return Kind(new_header(1, overwrite=False), write, lambda: supported_checkpoint(path, [folder / "a.h5"]))
 
 
 def reference_kind(folder: Path) -> Kind:
@@ -191,13 +197,13 @@ def reference_kind(folder: Path) -> Kind:
 
     with pytest.raises(KeyboardInterrupt):
         simulate(scene, config, out, progress=stop, checkpoint_every_s=0.0)
-    header, blob = read_checkpoints(checkpoint_path(out))[0]
+    header, blob = read_checkpoint(checkpoint_path(out))
     files = {path: path.read_bytes() for path in folder.iterdir()}
 
     def write(altered: Any) -> None:
         for path, data in files.items():
             path.write_bytes(data)
-        CheckpointFile(checkpoint_path(out), None).write({"files": [], **altered}, blob)
+        write_checkpoint(checkpoint_path(out), {"files": [], **altered}, blob)
 
     return Kind(header, write, lambda: simulate(scene, config, out, resume=True))
 

@@ -28,7 +28,7 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(REPOSITORY))
 
-from systems.trajectory.checkpoint import frames_in, read_checkpoints  # noqa: E402
+from systems.trajectory.checkpoint import frames_in, read_checkpoint  # noqa: E402
 from systems.trajectory.codec import open_trajectory  # noqa: E402
 
 MD = ["reference", "alanine-dipeptide", "--time", "40ps", "--save-every", "100fs", "--equilibrate", "2ps", "--platform",
@@ -66,7 +66,7 @@ def frames(folder: Path) -> dict[str, Any]:
             with open_trajectory(path) as reader:
                 found[path.name] = reader.read()
     for path in folder.glob("run/*/*.checkpoint"):
-        files = read_checkpoints(path)[0][0]["files"]
+        files = read_checkpoint(path)[0]["files"]
         stem, _, first = path.name.removesuffix(".h5.checkpoint").partition("_r")
         for k, entry in enumerate(files):
             name = f"{stem}_r{int(first) + k}.h5" if first else f"{stem}.h5"

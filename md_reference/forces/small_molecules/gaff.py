@@ -6,26 +6,133 @@ Jakalian, Jack and Bayly, J. Comput. Chem. 23, 1623 (2002).
 
 from __future__ import annotations
 
+import gzip
+import json
 import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import networkx as nx
 
-from md_reference.forces.small_molecules import parameter_cache
-from md_reference.forces.small_molecules.ambertools import ambertools, complaint, find_ambertools, gaff2_table, run
-from md_reference.forces.small_molecules.parameter_cache import Entry
 from md_reference.forces.small_molecules.prmtop import CHARGE_UNIT, Prmtop
-from md_reference.forces.small_molecules.programs import scratch_folder
-from md_reference.forces.template_files import CHAIN_FILES, force_field_of, unmatched_residues
+from md_reference.forces.small_molecules.programs import (
+    ambertools,
+    complaint,
+    find_ambertools,
+    gaff2_table,
+    run,
+    scratch_folder,
+)
+from md_reference.forces.spec import CHAIN_FILES, force_field_of, unmatched_residues
 from systems.chemistry.distance_bonds import changed_bond
-from systems.chemistry.graph import molecule_key
-from systems.errors import InputError, PreparationError, StorageError
+from systems.chemistry.graph import match_atoms, molecule_key
+from systems.errors import InputError, OutOfDomainError, PreparationError, StorageError
+from systems.files.native import cache_folder
+from systems.files.outside import content
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole, sealed, storage_error, unsealed
 from systems.scene import Scene
 from systems.units import format_wall
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Parameters of one molecule: prmtop text in the atom order of `template`, and where they come from."""
+
+    template: Scene
+    prmtop: str
+    source: dict[str, Any]
+
+    def ordered_as(self, scene: Scene) -> str:
+        """Return the prmtop text in the scene's atom order. Raises OutOfDomainError for another molecule."""
+        order = match_atoms(scene, self.template)
+        return Prmtop(self.prmtop).permuted(order).text()
+
+
+@dataclass(frozen=True)
+class _Record:
+    format: int
+    scene: Scene
+    prmtop: str
+    source: dict[str, Any]
+
+
+def shipped_folder() -> Path:
+    """Where the parameters lie that come with the package."""
+    return Path(str(files("systems.library") / "data" / "parameters"))
+
+
+def find_shipped(scene: Scene, method: str) -> Entry | None:
+    """Return the shipped parameters of this molecule, or None."""
+    return _read(shipped_folder() / f"{molecule_key(scene)}-{method}.json.gz")
+
+
+def find_cached(scene: Scene, method: str, version: str | None) -> Entry | None:
+    """Return parameters computed here earlier by this version (by any, the last by name, where `version` is None)."""
+    folder = cache_folder() / "parameters"
+    if version is not None:
+        return _read(folder / f"{molecule_key(scene)}-{method}-{version}.json.gz")
+    found = sorted(folder.glob(f"{molecule_key(scene)}-{method}-*.json.gz"))
+    return _read(found[-1]) if found else None
+
+
+def cached_path(scene: Scene, method: str, version: str) -> Path:
+    """Where `find_cached` looks."""
+    return cache_folder() / "parameters" / f"{molecule_key(scene)}-{method}-{version}.json.gz"
+
+
+def fits(entry: Entry | None, scene: Scene) -> bool:
+    """Return whether the entry's molecule is the scene's (keys are hashes, and some stereo is beyond them)."""
+    if entry is None:
+        return False
+    try:
+        match_atoms(scene, entry.template)
+    except OutOfDomainError:
+        return False
+    return True
+
+
+def store(path: Path, entry: Entry) -> Entry:
+    """Write an entry and return what lies there: of several processes that compute the same, the first one's stays.
+
+    The file appears whole or not at all. Raises StorageError when it cannot be written.
+    """
+    template = replace(entry.template, provenance={})
+    record = {"format": _FORMAT, "source": entry.source, "scene": template.to_dict(), "prmtop": entry.prmtop}
+    data = gzip.compress(sealed(json.dumps(record, sort_keys=True)).encode(), mtime=0)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(path, error, "nothing was changed") from error
+    existing = _read(path)
+    if existing is not None and fits(existing, entry.template):
+        return existing
+    create_whole(path, data)
+    return entry
+
+
+def _read(path: Path) -> Entry | None:
+    """Return an entry, or None where there is none or it is damaged (it is then made again)."""
+    try:
+        text = content(path).decode()
+        found = built(_Record, parsed(unsealed(text) if path.parent != shipped_folder() else text))
+        if found.format != _FORMAT or Prmtop(found.prmtop).n_atoms != found.scene.n_atoms:
+            return None
+        return Entry(found.scene, found.prmtop, found.source)
+    except (OSError, ValueError, LookupError, TypeError, InputError):
+        return None
+
+
+# ---- computed here --------------------------------------------------------------------------------------------------
+
 
 METHOD = "gaff2-am1bcc"
 ELEMENTS = ("H", "C", "N", "O", "F", "P", "S", "Cl", "Br", "I")
@@ -61,16 +168,16 @@ def entry(scene: Scene, *, cached: bool = True) -> Entry:
     refuse(scene)
     if not cached:
         return _parametrise(scene)
-    shipped = parameter_cache.find_shipped(scene, METHOD)
-    if shipped is not None and parameter_cache.fits(shipped, scene):
+    shipped = find_shipped(scene, METHOD)
+    if shipped is not None and fits(shipped, scene):
         return shipped
     tools = find_ambertools()
-    known = parameter_cache.find_cached(scene, METHOD, None if tools is None else tools.label)
-    if known is not None and parameter_cache.fits(known, scene):
+    known = find_cached(scene, METHOD, None if tools is None else tools.label)
+    if known is not None and fits(known, scene):
         return known
     made = _parametrise(scene)
     try:
-        return parameter_cache.store(parameter_cache.cached_path(scene, METHOD, ambertools().label), made)
+        return store(cached_path(scene, METHOD, ambertools().label), made)
     except StorageError:
         return made  # a cache that cannot be written costs time, not the run
 
@@ -83,9 +190,9 @@ def write_shipped(scene: Scene) -> Path:
     """
     refuse(scene)
     found = _parametrise(scene)
-    path = parameter_cache.shipped_folder() / f"{molecule_key(scene)}-{METHOD}.json.gz"
+    path = shipped_folder() / f"{molecule_key(scene)}-{METHOD}.json.gz"
     path.unlink(missing_ok=True)
-    parameter_cache.store(path, found)
+    store(path, found)
     return path
 
 

@@ -75,7 +75,7 @@ def stress_weights(
 ) -> dict[str, Any]:  # fmt: skip
     """Run a stress test of weights, by name or file, and write its tables and plot into `folder`; return its rows.
 
-    Weights of several peptides are tried on `scene`, as `systems.library.named_scenes` reads it, or the first that they were
+    Weights of several peptides are tried on `scene` (`systems.library.named_scenes`), or the first that they were
     trained on. Raises SurromdError for weights that cannot be loaded or do not cover the scene and a folder that
     cannot be written; KeyboardInterrupt says what is kept.
     """

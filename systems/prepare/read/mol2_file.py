@@ -1,4 +1,7 @@
-"""Tripos MOL2 files: elements, bonds and positions from the file; bond orders and charges perceived from them."""
+"""Tripos MOL2 files: elements, bonds and positions from the file; bond orders and charges perceived from them.
+
+Peptides among them (standard residues, which a force field of peptides describes) become records of atoms.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,13 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.bond_orders import bent_carbons
-from systems.chemistry.cell_images import bonded_images, cell_of, images_of_whole
+from systems.chemistry.bond_orders import bent_carbons, lewis_structure
+from systems.chemistry.cell import bonded_images, cell_of, images_of_whole
 from systems.chemistry.distance_bonds import bonds_by_distance
 from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
-from systems.chemistry.lewis import lewis_structure
+from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError, PreparationError
+from systems.prepare.read.records import AtomRecord, StructureFile, read_text
 
 _TWO_LETTERS = re.compile(r"cl|br|si|se", re.IGNORECASE)
 _FIRST_LETTERS = ("H", "B", "C", "N", "O", "F", "P", "S", "I")
@@ -272,3 +276,50 @@ def _bonds(
         if kind in _ORDERS:
             orders[i, j] = _ORDERS[kind]
     return bonds, orders
+
+
+# ---- peptides -------------------------------------------------------------------------------------------------------
+
+
+def is_peptide_mol2(path: Path) -> bool:
+    """Whether the first molecule of a MOL2 file has two or more standard residues, by their names and atoms."""
+    try:
+        found = read_mol2(read_text(path, "a molecule with coordinates"), path, [])
+    except InputError:
+        return False  # to be refused where it is read
+    standard: set[tuple[str, str]] = set()
+    for (number, written), name, element in zip(found.residues, found.names, found.elements, strict=True):
+        template = template_for(_residue_name(number, written))
+        if template is None:
+            continue
+        if element != "H" and canonical_heavy_name(template, name) is None:
+            return False
+        standard.add((number, written))
+    return len(standard) > 1
+
+
+def read_peptide_mol2(path: Path) -> StructureFile:
+    """Return the atoms of a peptide's MOL2 file, in its order, and its bonds. Raises InputError; see `read_mol2`."""
+    notes: list[str] = []
+    found: Mol2 = read_mol2(read_text(path, "a molecule with coordinates"), path, notes)
+    atoms = [
+        AtomRecord(
+            serial=str(k + 1),
+            name=found.names[k],
+            altloc="",
+            residue_name=_residue_name(*found.residues[k]),
+            chain="",
+            residue_id=found.residues[k][0],
+            position_angstrom=(x, y, z),
+            occupancy=1.0,
+            element=found.elements[k],
+            hetero=False,
+        )
+        for k, (x, y, z) in enumerate((10.0 * found.positions_nm).tolist())
+    ]
+    return StructureFile(atoms, conect=[(i, j) for i, j in found.bonds.tolist()], notes=notes)
+
+
+def _residue_name(number: str, written: str) -> str:
+    """`LYS` of substructure 1 called LYS1."""
+    return written.removesuffix(number) if len(written) > 3 else written

@@ -11,10 +11,9 @@ import numpy as np
 from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.geometry import near_pairs
 from systems.errors import InputError, PreparationError
-from systems.prepare.read.file_text import read_text, suffix_of
 from systems.prepare.read.mol2_file import Mol2, missing_hydrogens, molecule_of, read_mol2
-from systems.prepare.read.salts import main_molecule
-from systems.prepare.read.smiles import drop_isotopes, embed, require, sanitise
+from systems.prepare.read.records import read_text, suffix_of
+from systems.prepare.read.smiles import drop_isotopes, embed, main_molecule, require, sanitise
 
 SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from systems import selection
+from systems import scene as scenes
 from systems.scene import Scene
 
 
@@ -45,7 +45,7 @@ def from_smiles() -> Callable[..., Scene]:
 @pytest.fixture(scope="session")
 def reordered() -> Callable[..., Scene]:
     """`reordered(scene, order)`: atom k of the result is atom order[k] of the scene."""
-    return selection.reordered
+    return scenes.reordered
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from md_reference.forces.small_molecules import ambertools
+from md_reference.forces.small_molecules import programs
 from process_table import needs_process_table, runs, wait_until
 from systems.errors import PreparationError
 
@@ -23,7 +23,7 @@ def fake_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (home / "bad").write_text("#!/bin/sh\necho 'Error: no such atom type'\nexit 3\n")
     for program in home.iterdir():
         program.chmod(0o755)
-    monkeypatch.setattr(ambertools, "ambertools", lambda: ambertools.AmberTools(home, "test", "test"))
+    monkeypatch.setattr(programs, "ambertools", lambda: programs.AmberTools(home, "test", "test"))
     return tmp_path
 
 
@@ -40,7 +40,7 @@ def test_an_interruption_ends_the_program_and_its_children(fake_tools: Path) -> 
     thread.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            ambertools.run("slow", [], fake_tools)
+            programs.run("slow", [], fake_tools)
     finally:
         signal.signal(signal.SIGINT, before)
     thread.join()
@@ -50,4 +50,4 @@ def test_an_interruption_ends_the_program_and_its_children(fake_tools: Path) -> 
 
 def test_a_failure_is_told_in_its_own_words(fake_tools: Path) -> None:
     with pytest.raises(PreparationError, match="bad failed: Error: no such atom type"):
-        ambertools.run("bad", [], fake_tools)
+        programs.run("bad", [], fake_tools)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import batch
+from md_reference.run import replicas
 from md_reference.run.config import MDConfig
 from md_reference.run.plan import make_plan
 from md_reference.run.replicas import simulate_batch, simulate_replicas
@@ -49,7 +49,7 @@ def test_replicas_differ_and_say_how_they_were_made(tmp_path: Path) -> None:
 def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, parts = [tmp_path / "w0.h5", tmp_path / "w1.h5"], [tmp_path / "p0.h5", tmp_path / "p1.h5"]
     simulate_batch(SCENE, CONFIG, whole)
-    monkeypatch.setattr(batch, "_BLOCK_S", 0.0)
+    monkeypatch.setattr(replicas, "_BLOCK_S", 0.0)
 
     def stop(done: int, total: int, note: str | None = None) -> None:
         if note is None and done >= 6:
@@ -70,16 +70,16 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Path, monkeypa
 
 
 def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = batch.SimdReplicas.step
+    steps = replicas.SimdReplicas.step
     count = []
 
-    def fails(self: batch.SimdReplicas, n: int) -> None:
+    def fails(self: replicas.SimdReplicas, n: int) -> None:
         count.append(n)
         if len(count) > 4:
             raise SimulationError("a copy of the molecule blew up")
         steps(self, n)
 
-    monkeypatch.setattr(batch.SimdReplicas, "step", fails)
+    monkeypatch.setattr(replicas.SimdReplicas, "step", fails)
     out = [tmp_path / "x.h5"]
     with pytest.raises(SimulationError, match="blew up after 3 ps; 3 good frames"):
         simulate_batch(SCENE, CONFIG, out)

@@ -23,7 +23,7 @@ from md_reference.run.platforms import PlatformChoice
 from md_reference.run.simulate import MDConfig, checkpoint_path, simulate
 from systems.errors import InputError, SimulationError, TrajectoryError, UnknownNameError
 from systems.scene import Scene
-from systems.trajectory.checkpoint import CheckpointFile, read_checkpoints
+from systems.trajectory.checkpoint import read_checkpoint, write_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
@@ -179,7 +179,7 @@ def test_a_run_stopped_anywhere_goes_on_as_if_nothing_had_happened(
         patch.setattr(module, "_SIGNAL_S", 0.0)  # look after every few steps, so that the stop falls inside a frame
         with pytest.raises(KeyboardInterrupt):
             simulate(alanine_dipeptide, config, out)
-    header, _ = read_checkpoints(checkpoint_path(out))[0]
+    header, _ = read_checkpoint(checkpoint_path(out))
     assert out.exists() == (stage == "production")
     if stage == "equilibration":
         assert 0 < header["equilibrated_steps"] < 200
@@ -199,7 +199,7 @@ def test_what_progress_has_reported_survives_a_kill(alanine_dipeptide: Scene, tm
     def look(done: int, _: int, note: str | None = None) -> None:
         if note is not None:
             return
-        reported.append(read_checkpoints(checkpoint_path(tmp_path / "a.h5"))[0][0]["files"][0]["n_frames"])
+        reported.append(read_checkpoint(checkpoint_path(tmp_path / "a.h5"))[0]["files"][0]["n_frames"])
         if done < 10:
             assert reported[-1] == done
 
@@ -226,8 +226,8 @@ def test_a_resumed_run_keeps_its_platform(alanine_dipeptide: Scene, tmp_path: Pa
         assert reader.record["platform_reason"] == "measured once"
     # Negative control: on another platform the checkpoint is of no use.
     out = stopped(alanine_dipeptide, config, tmp_path / "b.h5", choice=PlatformChoice("CPU", 1, "measured once"))
-    header, blob = read_checkpoints(checkpoint_path(out))[0]
-    CheckpointFile(checkpoint_path(out), None).write(header | {"platform": "Reference"}, blob)
+    header, blob = read_checkpoint(checkpoint_path(out))
+    write_checkpoint(checkpoint_path(out), header | {"platform": "Reference"}, blob)
     with pytest.raises(SimulationError, match="does not fit"):
         simulate(alanine_dipeptide, config, out, resume=True)
 

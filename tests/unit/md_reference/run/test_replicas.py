@@ -20,7 +20,7 @@ from md_reference.run.simulate import MDConfig, checkpoint_path
 from systems.errors import SimulationError, TrajectoryError
 from systems.files.whole_file import replica_paths
 from systems.scene import Scene
-from systems.trajectory.checkpoint import read_checkpoints
+from systems.trajectory.checkpoint import read_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 
 SHORT = MDConfig(time_ps=0.8, save_every_ps=0.2, equilibrate_ps=0.4, platform="Reference")
@@ -69,6 +69,26 @@ def test_replicas_resume_and_keep_what_is_complete(alanine_dipeptide: Scene, tmp
 
 
 # ---- the end of the parent -----------------------------------------------------------------------------------------
+
+
+def test_a_script_that_starts_replicas_while_it_is_imported(tmp_path: Path, repository: Path) -> None:
+    begun = (
+        "from pathlib import Path\nfrom md_reference.forces.spec import ForceFieldSpec\n"
+        "from md_reference.run.replicas import simulate_replicas\n"
+        "from md_reference.run.simulate import MDConfig\nfrom systems.library.named_scenes import load\n"
+        "config = MDConfig(time_ps=2.0, timestep_ps=0.02, equilibrate_ps=0.2, platform='Reference',\n"
+        "                  force=ForceFieldSpec('auto', 'auto'))\n"
+        f"outs = [Path({str(tmp_path)!r}) / name for name in ('0.h5', '1.h5')]\n"
+    )
+    call = "simulate_replicas(load('double-well'), config, outs)\n"
+    for guard, said in (("", ["put what starts them below `if __name__ == '__main__':`"]),
+                        ("if __name__ == '__main__':\n    ", [])):  # fmt: skip
+        (tmp_path / "script.py").write_text(begun + guard + call)
+        run = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=False,
+                             env=os.environ | {"PYTHONPATH": str(repository)})  # fmt: skip
+        assert (run.returncode == 0) == (not said), run.stderr
+        assert run.stderr.count("Traceback") == len(said)
+        assert all(part in run.stderr for part in said)
 
 
 @contextmanager
@@ -144,4 +164,4 @@ def test_replicas_end_with_their_parent_and_can_be_resumed(
         n_frames = frames_in(out)
         assert checkpoint_path(out).exists()
         # Stopped between two frames, with a checkpoint at the last one: nothing is lost on the way to a longer run.
-        assert read_checkpoints(checkpoint_path(out))[0][0]["files"][0]["n_frames"] == n_frames
+        assert read_checkpoint(checkpoint_path(out))[0]["files"][0]["n_frames"] == n_frames

@@ -32,7 +32,7 @@ from systems.errors import (
 )
 from systems.library.named_scenes import prepare
 from systems.scene import Scene
-from systems.trajectory.checkpoint import read_checkpoints
+from systems.trajectory.checkpoint import read_checkpoint
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.companion_writer import topology_bytes
 
@@ -211,7 +211,7 @@ def test_resume_after_kill_9_equals_an_uninterrupted_run(
         killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
         assert checkpoint_path(out).exists()
-        header = {"n_frames": read_checkpoints(checkpoint_path(out))[0][0]["files"][0]["n_frames"]}
+        header = {"n_frames": read_checkpoint(checkpoint_path(out))[0]["files"][0]["n_frames"]}
         with open_trajectory(out) as reader:
             assert header["n_frames"] <= reader.n_frames < 600
             assert reader.record["completed"] is False
@@ -356,25 +356,20 @@ def test_a_users_own_file_is_not_taken_for_a_checkpoint(alanine_dipeptide: Scene
     assert checkpoint_path(out).read_text() == "mine" and not out.exists()
 
 
-def test_frames_behind_the_last_checkpoint_are_not_missed(alanine_dipeptide: Scene, tmp_path: Path) -> None:
-    """The last state is of frames that did not reach the medium: the one before is gone on from."""
-    out = interrupted(alanine_dipeptide, tmp_path / "a.h5")
-    states = read_checkpoints(checkpoint_path(out))
-    assert len(states) == 2
-    n_before = states[1][0]["files"][0]["n_frames"]
-    assert 0 < n_before < states[0][0]["files"][0]["n_frames"]
-    with open_writer(out, alanine_dipeptide, {}, append=True) as writer:
-        writer.truncate(n_before)
-    simulate(alanine_dipeptide, SHORT, out, resume=True)
-    whole = simulate(alanine_dipeptide, SHORT, tmp_path / "whole.h5")
-    np.testing.assert_array_equal(contents(out)[0], contents(whole)[0])
-
-
 def test_a_run_without_its_checkpoint_is_not_resumed_blindly(alanine_dipeptide: Scene, tmp_path: Path) -> None:
     out = interrupted(alanine_dipeptide, tmp_path / "a.h5")
     checkpoint_path(out).unlink()
     with pytest.raises(InputError, match="its checkpoint is gone"):
         simulate(alanine_dipeptide, SHORT, out, resume=True)
+
+
+def test_a_finished_run_is_not_made_longer(alanine_dipeptide: Scene, tmp_path: Path) -> None:
+    out = simulate(alanine_dipeptide, SHORT, tmp_path / "a.h5")
+    before = out.read_bytes()
+    simulate(alanine_dipeptide, SHORT, out, resume=True)
+    with pytest.raises(InputError, match=r"is a finished run of .* cannot be made longer.*under another name"):
+        simulate(alanine_dipeptide, replace(SHORT, time_ps=2 * SHORT.time_ps), out, resume=True)
+    assert out.read_bytes() == before
 
 
 # ---- blow-ups ------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run import platforms, timing
+from md_reference.run import machine, platforms
 from md_reference.run.config import Conditions
 from md_reference.run.machine import Timing, cache_file, recall, remember, size_class
 from md_reference.run.platforms import PlatformChoice, choose_fastest, measured_platform, timing_key
@@ -119,7 +119,7 @@ def test_a_damaged_cache_is_ignored_and_replaced(
     alanine_dipeptide: Scene, counted: list[list[tuple[str, int]]], content: bytes
 ) -> None:
     key = timing_key(alanine_dipeptide, VACUUM)
-    text = content.replace(b"MACHINE", timing.machine_name().encode()).replace(b"KEY", key.encode())
+    text = content.replace(b"MACHINE", machine.machine_name().encode()).replace(b"KEY", key.encode())
     cache_file().parent.mkdir(parents=True)
     cache_file().write_bytes(text)
     assert recall(key) == {}
@@ -144,7 +144,7 @@ def test_the_cache_is_never_written_half(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_timings_of_another_machine_are_kept_and_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     remember("a", [Timing("CPU", 1, 1.0)])
     with monkeypatch.context() as elsewhere:
-        elsewhere.setattr(timing, "machine_name", lambda: "another")
+        elsewhere.setattr(machine, "machine_name", lambda: "another")
         assert recall("a") == {}
         remember("a", [Timing("CPU", 1, 2.0)])
     assert recall("a") == {"CPU/1": 1.0}
@@ -180,10 +180,10 @@ def test_on_busy_cores_threads_are_not_timed(alanine_dipeptide: Scene, monkeypat
         return fake
 
     monkeypatch.setattr(platforms, "_THREADS_TIMED_ATOMS", 1)
-    monkeypatch.setattr(timing, "_batch", batch(2.5))
+    monkeypatch.setattr(machine, "_batch", batch(2.5))
     busy = measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2)
     assert busy.threads == 1
     assert "CPU/2" not in recall(timing_key(alanine_dipeptide, VACUUM)), "a number about other work was remembered"
     assert any("other work" in t.note for t in busy.timings)
-    monkeypatch.setattr(timing, "_batch", batch(1.02))
+    monkeypatch.setattr(machine, "_batch", batch(1.02))
     assert measured_platform(alanine_dipeptide, Conditions(force=VACUUM), max_threads=2).threads == 2

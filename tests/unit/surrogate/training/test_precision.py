@@ -20,7 +20,7 @@ from surrogate.training.devices import ProductSpeed, bf16_pays, bf16_unit, choos
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError
 from systems.scene import Scene
-from systems.trajectory.checkpoint import checkpoint_path, read_checkpoints
+from systems.trajectory.checkpoint import checkpoint_path, read_checkpoint
 from systems.trajectory.codec import open_trajectory
 
 FAST = ProductSpeed("avx512_bf16", 70.0, 280.0, 1)
@@ -94,7 +94,7 @@ def test_the_record_says_which_and_why_and_resume_keeps_it(
 
     with pytest.raises(Stop):
         rollout(alanine_dipeptide, small_weights, [begun], config, progress=stop, flush_every_s=0.0)
-    assert read_checkpoints(checkpoint_path(begun))[0][0]["settings"]["bf16"] is False
+    assert read_checkpoint(checkpoint_path(begun))[0]["settings"]["bf16"] is False
     processor(monkeypatch, FAST)
     rollout(alanine_dipeptide, small_weights, [begun], config, resume=True)
     with open_trajectory(begun) as ours, open_trajectory(whole) as undisturbed:

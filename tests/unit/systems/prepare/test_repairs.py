@@ -14,7 +14,7 @@ from systems.errors import InputError, PreparationError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
-from systems.prepare.checks import compare, handedness, say_inverted
+from systems.prepare.checks import handedness, refuse_changed, say_inverted
 from systems.prepare.heterogens import ligand_atoms
 from systems.prepare.protonation import protonation_account
 from systems.prepare.read.records import AtomRecord, standardise
@@ -172,11 +172,11 @@ def test_inverted_centres_are_seen_said_and_refused() -> None:
     notes: list[str] = []
     say_inverted(inverted, notes)
     assert notes == ["D-residues, as the file has them: ALA 2"]
-    compare(natural, natural)
-    compare(inverted, inverted)
+    refuse_changed(natural, natural)
+    refuse_changed(inverted, inverted)
     for before, after in ((natural, inverted), (inverted, natural), ({}, inverted)):
         with pytest.raises(PreparationError, match="CA came out inverted"):
-            compare(before, after)
+            refuse_changed(before, after)
 
 
 def test_protonation_is_chosen_by_ph_and_said(tmp_path: Path) -> None:
@@ -347,3 +347,17 @@ def test_missing_atoms_are_added_although_their_hydrogens_are_there(tmp_path: Pa
            for line in lines]  # fmt: skip
     with pytest.raises(PreparationError, match="Hydrogen SER A2 HG is"):  # control: nothing is missing
         prepare(_write(tmp_path / "y.pdb", *far))
+
+
+def test_a_hydrogen_at_anothers_methyl_is_a_clash(tmp_path: Path) -> None:
+    names = list(zip((ALA2.residue_names[r] for r in ALA2.residue_of_atom), ALA2.atom_names, strict=True))
+    moved, methyl = names.index(("NME", "H1")), names.index(("ACE", "CH3"))
+    beside, own = ALA2.positions_nm[methyl], ALA2.positions_nm[names.index(("ACE", "C"))]
+    x = ALA2.positions_nm.copy()
+    x[moved] = beside + 0.1 * (beside - own) / np.linalg.norm(beside - own)
+    path = tmp_path / "clash.pdb"
+    path.write_text(pdb_text(ALA2.with_positions(x)))
+    with pytest.raises(PreparationError, match=r"NME A3 H1 and ACE A1 CH3 are 1\.00 Å apart.*the atoms clash"):
+        prepare(str(path))
+    path.write_text(pdb_text(ALA2))
+    assert prepare(str(path)).provenance["repairs"] == []

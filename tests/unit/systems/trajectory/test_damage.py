@@ -18,7 +18,7 @@ import pytest
 
 from chain_files import RECORD, SUFFIXES, TOLERANCES, chain, frames, left_behind, read, write
 from systems.errors import InputError, StorageError, TrajectoryError
-from systems.files import atomic_file
+from systems.files import whole_file
 from systems.scene import Scene
 from systems.trajectory import frame_store, hdf5_file
 from systems.trajectory.codec import open_trajectory, open_writer
@@ -33,19 +33,19 @@ def test_every_prefix_of_every_append_is_readable(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(frame_store.add_column.__kwdefaults__, "chunk", 2)
     path, copy = tmp_path / "a.h5", tmp_path / "b.h5"
     positions = frames(180, 1)
-    state = {"old": 0, "new": 0, "prefixes": 0, "undone": 0, "looked at": True}
-    write_whole = atomic_file.write_whole
+    state = {"old": 0, "new": 0, "prefixes": 0, "undone": 0, "looked at": False}
+    write_whole = whole_file.write_whole
 
     def written_and_looked_at(descriptor: int, data: bytes, offset: int) -> None:
         write_whole(descriptor, data, offset)
         if not state["looked at"]:
             return
         shutil.copyfile(path, copy)
-        shutil.copyfile(atomic_file.journal_path(path), atomic_file.journal_path(copy))
+        shutil.copyfile(whole_file.journal_path(path), whole_file.journal_path(copy))
         found = read(copy)
         np.testing.assert_array_equal(found, positions[: state["old"]])
         if state["new"] > state["old"]:  # what is cut off is for the journal alone
-            atomic_file.journal_path(copy).unlink()
+            whole_file.journal_path(copy).unlink()
             with h5py.File(copy) as file:
                 n = len(file["coordinates"])
                 assert n in (state["old"], state["new"])
@@ -53,7 +53,7 @@ def test_every_prefix_of_every_append_is_readable(tmp_path: Path, monkeypatch: p
                 state["undone"] += n > len(found)
         state["prefixes"] += 1
 
-    monkeypatch.setattr(atomic_file, "write_whole", written_and_looked_at)
+    monkeypatch.setattr(whole_file, "write_whole", written_and_looked_at)
     with open_writer(path, chain(1), {}) as writer:
         k = 0
         for turn, size in enumerate([1, 3, 2, 6, 24] * 5):

@@ -1,4 +1,4 @@
-"""Every format that `compare` reads, with files that other programs than its reader wrote (`format_table.tried`).
+"""Every format that `compare` reads, with files that other programs than its reader wrote (`Format.tried`).
 
 Files of GROMACS, LAMMPS, DL_POLY, GROMOS, HOOMD-blue, Tinker and others are MDAnalysisTests' (`pip install
 MDAnalysisTests gsd pytng pandas`; what is lacking is skipped); cpptraj and OpenMM write theirs here.

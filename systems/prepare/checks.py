@@ -1,0 +1,315 @@
+"""What a structure file is held to: chain breaks, handedness, molecules that their cell cuts, atoms too close."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+
+import networkx as nx
+import numpy as np
+import numpy.typing as npt
+
+from systems.chemistry.cell import bonded_images, images_of_whole
+from systems.chemistry.geometry import near_pairs, signed_volumes
+from systems.errors import PreparationError, listed
+from systems.prepare.bonding import links_residues
+from systems.prepare.read.records import AtomRecord, Bonding, Residue, StructureFile
+from systems.prepare.structure import atom_label
+
+Vector = npt.NDArray[np.float64]
+# Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).
+_C_N, _C_O, _C_CH3, _N_CH3 = 1.335, 1.231, 1.52, 1.45
+_C_N_CA, _CH3_C_N, _O_C_N = 121.7, 116.2, 123.0
+_PHI = (-65.0, -85.0, -110.0, -135.0, -160.0, 180.0, 60.0, 90.0, 120.0, 150.0)
+
+
+def find_gaps(bonding: Bonding, chain_ends: set[int]) -> list[tuple[Residue, Residue]]:
+    """Return neighbours in one chain, neither an end by its atoms, a cap or TER, whose C and N no bond joins."""
+    bonded_n = {i for pair in bonding.peptide_bonds for i in pair}
+    found = []
+    for before, residue in pairwise(bonding.residues):
+        c, n = before.heavy.get("C", -1), residue.heavy.get("N", -1)
+        if min(c, n) < 0 or {c, n} & bonded_n or before.key[0] != residue.key[0] or chain_ends & set(before.atoms):
+            continue
+        names = (before.template.name if before.template else "", residue.template.name if residue.template else "")
+        if all(names) and names[0] not in ("NME", "NH2") and names[1] != "ACE" and "OXT" not in before.heavy:
+            found.append((before, residue))
+    return found
+
+
+def refuse_gaps(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord]) -> None:
+    """Raise PreparationError where a chain breaks."""
+    for before, residue in gaps:
+        gap = np.linalg.norm(_at(atoms, before, "C") - _at(atoms, residue, "N"))
+        more = f", and in {len(gaps) - 1} more places" if len(gaps) > 1 else ""
+        raise PreparationError(
+            f"the chain breaks between {before.label} and {residue.label} (C and N are {gap:.1f} Å apart){more}; fill "
+            "the gap, add `cap_breaks=True` to close both ends with caps, or end the chain there with a TER record."
+        )
+
+
+def caps_of(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord], notes: list[str]) -> list[AtomRecord]:
+    """Return the heavy atoms of an NME before and an ACE after each gap, trans, clear of the other atoms.
+
+    Raises PreparationError where an end has not the atoms that a cap is built from.
+    """
+    caps: list[AtomRecord] = []
+    for before, residue in gaps:
+        for end, needed in ((before, ("CA", "C", "O")), (residue, ("N", "CA", "C"))):
+            lacking = [a for a in needed if a not in end.heavy]
+            if lacking:
+                raise PreparationError(f"{end.label} lacks {' '.join(lacking)}, from which its cap would be built.")
+        ca, c, o = (_at(atoms, before, a) for a in ("CA", "C", "O"))
+        n = c + _C_N * _between(c, ca, o)
+        caps += _records("NME", _beside(before, 1), {"N": n, "C": _placed(ca, c, n, _N_CH3, _C_N_CA, 180.0)})
+        others = np.array([a.position_angstrom for a in (*atoms, *caps) if a.element != "H"])
+        acetyls = _acetyls(atoms, residue)
+        n = _at(atoms, residue, "N")
+        others = others[np.linalg.norm(others - n, axis=1) > 2.0]  # CA and what else is bonded to the nitrogen
+        clear = [
+            min(float(np.linalg.norm(others - place, axis=1).min(initial=np.inf)) for place in each.values())
+            for each in acetyls
+        ]
+        caps += _records("ACE", _beside(residue, -1), acetyls[int(np.argmax(clear))])
+    if gaps:
+        notes.append(f"caps added where the chain breaks: {listed([f'{a.label} | {b.label}' for a, b in gaps])}")
+    return caps
+
+
+def _acetyls(atoms: Sequence[AtomRecord], residue: Residue) -> list[dict[str, Vector]]:
+    """Possible ACE before a residue: the one that its nitrogen's other atoms leave, else one for each φ."""
+    n, ca, c = (_at(atoms, residue, a) for a in ("N", "CA", "C"))
+    third = [i for i in residue.atoms if atoms[i].element == "H" and np.linalg.norm(_position(atoms[i]) - n) < 1.3]
+    if "CD" in residue.heavy and residue.template is not None and residue.template.name == "PRO":
+        third = [residue.heavy["CD"]]
+    if len(third) == 1:
+        carbons = [n + _C_N * _between(n, ca, _position(atoms[third[0]]))]
+    else:
+        carbons = [_placed(c, ca, n, _C_N, _C_N_CA, phi) for phi in _PHI]
+    return [
+        {
+            "C": carbon,
+            "O": _placed(ca, n, carbon, _C_O, _O_C_N, 0.0),
+            "CH3": _placed(ca, n, carbon, _C_CH3, _CH3_C_N, 180.0),
+        }
+        for carbon in carbons
+    ]
+
+
+def _records(name: str, place: tuple[str, str], positions: dict[str, Vector]) -> list[AtomRecord]:
+    chain, number = place
+    return [
+        AtomRecord("", atom, "", name, chain, number, (float(x), float(y), float(z)), 1.0, atom[0], False)
+        for atom, (x, y, z) in positions.items()
+    ]
+
+
+def _beside(residue: Residue, step: int) -> tuple[str, str]:
+    """Chain and number of the residue before or after."""
+    chain, number, _ = residue.key
+    digits = re.match(r"-?\d+", number)
+    return chain, str(int(digits[0]) + step) if digits else number
+
+
+def _position(atom: AtomRecord) -> Vector:
+    return np.array(atom.position_angstrom, dtype=np.float64)
+
+
+def _at(atoms: Sequence[AtomRecord], residue: Residue, name: str) -> Vector:
+    return _position(atoms[residue.heavy[name]])
+
+
+def _between(centre: Vector, first: Vector, second: Vector) -> Vector:
+    """The third direction of a planar centre with two neighbours, a unit vector."""
+    a, b = centre - first, centre - second
+    away: Vector = a / np.linalg.norm(a) + b / np.linalg.norm(b)
+    return away / np.linalg.norm(away)
+
+
+def _placed(a: Vector, b: Vector, c: Vector, length: float, angle_deg: float, torsion_deg: float) -> Vector:
+    """The point at `length` from c, at an angle b-c-x and a torsion a-b-c-x (natural extension reference frame)."""
+    angle, torsion = np.radians(angle_deg), np.radians(torsion_deg)
+    along = (c - b) / np.linalg.norm(c - b)
+    normal = np.cross(b - a, along)
+    normal /= np.linalg.norm(normal)
+    side = np.cross(normal, along)
+    x = np.cos(torsion) * np.sin(angle) * side + np.sin(torsion) * np.sin(angle) * normal - np.cos(angle) * along
+    point: Vector = c + length * x
+    return point
+
+
+# ---- handedness of amino acids: L or D, and whether preparation left it as it was -----------------------------------
+
+
+# (centre, a, b, c): positive signed volume is the natural form (L; 2S,3R threonine; 2S,3S isoleucine).
+_ALPHA = ("CA", "N", "C", "CB")
+_BETA = {"THR": ("CB", "CA", "OG1", "CG2"), "ILE": ("CB", "CA", "CG1", "CG2")}
+_FLAT_NM3 = 2e-4
+
+ResidueKey = tuple[str, str, str]
+Handedness = dict[tuple[ResidueKey, str], int]
+
+
+def handedness(residues: Iterable[tuple[ResidueKey, str, Mapping[str, AtomRecord]]]) -> Handedness:
+    """Return +1 (natural), -1 (inverted) or 0 (flat) of each stereocentre whose atoms are all there.
+
+    `residues`: (key, standard name, heavy atoms under their standard names). Centres are CA, and CB of THR and ILE.
+    """
+    found: Handedness = {}
+    for key, name, heavy in residues:
+        for row in (_ALPHA, _BETA[name]) if name in _BETA else (_ALPHA,):
+            if not set(row) <= set(heavy):
+                continue
+            at = np.array([heavy[a].position_angstrom for a in row]) / 10.0
+            volume = float(signed_volumes(at, [[0, 1, 2, 3]])[0])
+            found[key, row[0]] = 0 if abs(volume) < _FLAT_NM3 else (1 if volume > 0 else -1)
+    return found
+
+
+def refuse_changed(before: Handedness, after: Handedness) -> None:
+    """Raise PreparationError when a stereocentre changed, or one that was built anew is not the natural form."""
+    for (key, centre), sign in after.items():
+        expected = before.get((key, centre), 1)
+        if expected and sign != expected:
+            raise PreparationError(
+                f"{_label(key)}: {centre} came out {'inverted' if sign else 'flat'} when atoms were added; "
+                "give the residue with all its heavy atoms."
+            )
+
+
+def say_inverted(found: Handedness, notes: list[str]) -> None:
+    """Note the residues that are not L, or whose side chain is the other diastereomer, as the file has them."""
+    for centre, words in (("CA", "D-residues, as the file has them"), ("CB", "the other diastereomer at CB")):
+        names = [_label(key) for (key, atom), sign in found.items() if atom == centre and sign < 0]
+        if names:
+            notes.append(f"{words}: {listed(names)}")
+    flat = [f"{_label(key)} {atom}" for (key, atom), sign in found.items() if sign == 0]
+    if flat:
+        notes.append(f"flat stereocentres, as the file has them: {listed(flat)}")
+
+
+def heavy_of_records(records: Sequence[AtomRecord]) -> dict[ResidueKey, dict[str, AtomRecord]]:
+    """Heavy atoms by residue and name, for records under standard names."""
+    out: dict[ResidueKey, dict[str, AtomRecord]] = {}
+    for atom in records:
+        if atom.element != "H":
+            out.setdefault(atom.residue_key, {})[atom.name] = atom
+    return out
+
+
+def _label(key: ResidueKey) -> str:
+    return f"{key[2]} {key[0]}{key[1]}"
+
+
+# ---- molecules made whole by cell vectors ---------------------------------------------------------------------------
+
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+def made_whole(found: StructureFile) -> StructureFile:
+    """Return the structure with every molecule that its cell cuts in one piece, and a note of it; else as it is.
+
+    Atoms of one residue are bonded where an image of one is within a bond's length of the other; those of two residues
+    where a record says so, or where it is one of the bonds that link polymers. What stands beside a molecule that was
+    cut is moved to the image nearest to the largest one. Only whole cell vectors are added.
+    """
+    if found.cell_nm is None or len(found.atoms) < 2:
+        return found
+    x = np.array([a.position_angstrom for a in found.atoms]) / 10.0
+    pairs = _bonds_in_cell(found, x)
+    images = images_of_whole(x, found.cell_nm, pairs)
+    if not images.any():
+        return found
+    cut = sorted(np.flatnonzero(images.any(axis=1)).tolist())
+    names = dict.fromkeys(f"{a.residue_name} {a.chain}{a.residue_id}" for a in (found.atoms[i] for i in cut))
+    note = f"made whole by the periodic cell: moved by cell vectors, {len(cut)} of the atoms of {listed(list(names))}"
+    x = x + images @ found.cell_nm
+    beside = _beside_the_largest(x, found.cell_nm, pairs)
+    if beside.any():
+        note += f", and other molecules to the nearest image ({int(beside.any(axis=1).sum())} atoms)"
+    moved = np.round(10.0 * (x + beside @ found.cell_nm), 6).tolist()
+    changed: list[bool] = np.any(images + beside, axis=1).tolist()
+    atoms = [
+        replace(atom, position_angstrom=(px, py, pz)) if change else atom
+        for atom, (px, py, pz), change in zip(found.atoms, moved, changed, strict=True)
+    ]
+    return replace(found, atoms=atoms, notes=[*found.notes, note])
+
+
+def _bonds_in_cell(found: StructureFile, x: FloatArray) -> IntArray:
+    """What is bonded, `(n, 2)`, images being alike."""
+    assert found.cell_nm is not None
+    atoms = found.atoms
+    stated = set(found.conect)
+    pairs, length = bonded_images([a.element for a in atoms], x, found.cell_nm)
+    rows = [
+        (i, j)
+        for (i, j), d in zip(pairs.tolist(), length.tolist(), strict=True)
+        if atoms[i].residue_key == atoms[j].residue_key or (i, j) in stated or links_residues(atoms[i], atoms[j], d)
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def _beside_the_largest(x: FloatArray, cell_nm: FloatArray, pairs: IntArray) -> IntArray:
+    """Return how many of each cell vector bring every molecule nearest to the largest, `(n_atoms, 3)`."""
+    from scipy.spatial import cKDTree
+
+    graph = nx.Graph(pairs.tolist())
+    graph.add_nodes_from(range(len(x)))
+    molecules = [sorted(m) for m in nx.connected_components(graph)]
+    largest = max(molecules, key=len)
+    tree = cKDTree(x[largest])
+    shifts = np.array(sorted(product((-1, 0, 1), repeat=3), key=lambda s: sum(map(abs, s))), dtype=np.int64)
+    gaps = np.stack([tree.query(x + shift @ cell_nm)[0] for shift in shifts])
+    images = np.zeros((len(x), 3), dtype=np.int64)
+    for molecule in molecules:
+        if molecule is not largest:
+            images[molecule] = shifts[int(gaps[:, molecule].min(axis=1).round(6).argmin())]
+    return images
+
+
+# ---- atoms too close ------------------------------------------------------------------------------------------------
+
+
+# Nearer than this two atoms have one place, and nothing says which way they part.
+_COINCIDE_ANGSTROM = 0.1
+# Heavy atoms, a heavy atom and a hydrogen, hydrogens: models have them before any refinement. Whether bonds and
+# stereocentres survive the minimisation is seen then (`md_reference.run.engine.refuse_damaged`).
+_CLOSE_ANGSTROM = (1.5, 1.1, 0.9)
+
+
+def check_contacts(atoms: Sequence[AtomRecord], bonds: npt.NDArray[np.int64]) -> list[str]:
+    """Return a note of atoms that are close, with more than three bonds between them; none where all keep apart.
+
+    Raises PreparationError for atoms that have the same place.
+    """
+    neighbours: dict[int, set[int]] = {}
+    for i, j in bonds.tolist():
+        neighbours.setdefault(i, set()).add(j)
+        neighbours.setdefault(j, set()).add(i)
+    x = np.array([a.position_angstrom for a in atoms])
+    found = []
+    for i, j in near_pairs(x, max(_CLOSE_ANGSTROM), "the structure").tolist():
+        gap = float(np.linalg.norm(x[i] - x[j]))
+        kind = sum(atoms[k].element == "H" for k in (i, j))
+        if gap < _CLOSE_ANGSTROM[kind] and not _is_near(neighbours, i, j):
+            found.append((gap, i, j))
+    if not found:
+        return []
+    gap, i, j = min(found)
+    more = f", and {len(found) - 1} pairs more are close" if len(found) > 1 else ""
+    what = f"{atom_label(atoms[i])} and {atom_label(atoms[j])} are {gap:.2f} Å apart and not bonded{more}"
+    if gap < _COINCIDE_ANGSTROM:
+        raise PreparationError(f"{what}: atoms have the same place; take one of them out, or model them again.")
+    return [f"{what}; minimising has to part them"]
+
+
+def _is_near(neighbours: dict[int, set[int]], i: int, j: int, n_bonds: int = 3) -> bool:
+    reached = {i}
+    for _ in range(n_bonds):
+        reached |= {b for a in reached for b in neighbours.get(a, ())}
+    return j in reached
