@@ -91,7 +91,7 @@ def harmonic_frames(alanine_dipeptide):
 @pytest.fixture(scope="session")
 def small_model_config():
     """A model small enough to train in a second."""
-    from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+    from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 
     return LamSlideConfig(
         autoencoder=AutoencoderConfig(latent_dim=12, width=64, head_dim=16, random_identifiers=0.0),
@@ -104,8 +104,8 @@ def small_weights_file(tmp_path_factory, harmonic_frames, small_model_config) ->
     """Weights trained for a second on the synthetic frames: good for plumbing, not for chemistry."""
     from dataclasses import replace
 
-    from surrogate.data.weights import load_weights, save_weights
     from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
+    from surrogate.models.weights import load_weights, save_weights
 
     out = tmp_path_factory.mktemp("weights") / "small.safetensors"
     config = TrainingConfig(stage_one_steps=60, stage_two_steps=30, stage_one_batch=32, stage_two_batch=8, bf16=False)
@@ -119,6 +119,6 @@ def small_weights_file(tmp_path_factory, harmonic_frames, small_model_config) ->
 @pytest.fixture(scope="session")
 def small_weights(small_weights_file):
     """The same, read."""
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     return load_weights(small_weights_file)

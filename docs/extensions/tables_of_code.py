@@ -1,5 +1,5 @@
-"""The directives `definitions`, `flags` and `formats`: what the code says of the judge's terms, of frames' flags and of
-other programs' files, as tables."""
+"""The directives `definitions`, `metrics`, `flags` and `formats`: what the code says of the judge's terms and metrics,
+of frames' flags and of other programs' files, as tables."""
 
 from __future__ import annotations
 
@@ -21,6 +21,19 @@ class Definitions(SphinxDirective):
             source = f" *{_plain(one.source)}*" if one.source else ""
             parts.append(f"{_plain(one.term)}\n: {_plain(one.meaning)}{source}\n")
         return self.parse_text_to_nodes("\n".join(parts))
+
+
+class MetricsTable(SphinxDirective):
+    """`{metrics}`: what is measured, its kind and its time scale."""
+
+    def run(self) -> list[nodes.Node]:
+        from surrogate.judge.metrics import METRICS
+
+        lines = ["| metric | kind | time scale |", "|---|---|---|"]
+        lines += [
+            f"| {_plain(m.name)} | {m.kind} | {'' if m.kind == 'information' else m.time_scale} |" for m in METRICS
+        ]
+        return self.parse_text_to_nodes("\n".join(lines))
 
 
 class FlagsTable(SphinxDirective):
@@ -54,6 +67,7 @@ def _plain(text: str) -> str:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     app.add_directive("definitions", Definitions)
+    app.add_directive("metrics", MetricsTable)
     app.add_directive("flags", FlagsTable)
     app.add_directive("formats", FormatTable)
     return {"parallel_read_safe": True}

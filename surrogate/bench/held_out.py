@@ -10,7 +10,7 @@ from systems.errors import InputError
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 
 def refuse_trained_on(
@@ -21,12 +21,13 @@ def refuse_trained_on(
     Refused are: frames that stand in the provenance of the weights, of those they began from and so on; a run of the
     same conditions and seed as one of these (a part of it, or saved otherwise); conditions other than those of
     training; an interval between the frames that are compared (`lag_ps`, or all) that the weights do not step to; and
-    motion that reference and replicate have in common (`data.splits.refuse_leaks`).
+    motion that reference and replicate have in common (`data.frames.refuse_leaks`).
     """
     from surrogate.data.frames import collect_frames
 
     domain, name = weights.domain, weights.path.name
-    frames = collect_frames(list(reference), canonical=weights.model.canonical, held=list(replicate))
+    canonical = getattr(weights.model.config, "canonical", True)
+    frames = collect_frames(list(reference), canonical=canonical, held=list(replicate))
     try:
         frames.refuse_leaks()
     except InputError as error:

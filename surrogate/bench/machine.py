@@ -10,7 +10,7 @@ def machine_facts() -> dict[str, Any]:
     """Return its name, the load that was there before, what it has for bf16 ('none': neither AMX nor avx512_bf16) and
     what its matrix products take on torch's threads; JSON-able."""
     from md_reference.run.machine import machine_name
-    from surrogate.models.precision import product_speed
+    from surrogate.training.devices import product_speed
 
     speed = product_speed()
     return {

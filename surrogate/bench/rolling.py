@@ -10,7 +10,7 @@ import numpy.typing as npt
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 Frames = npt.NDArray[np.float64]
 

@@ -1,14 +1,11 @@
-"""Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16.
-
-In a windows file they lie uncompressed and are mapped, not read: a training takes from a file larger than memory what
-its windows need.
-"""
+"""Training frames of one scene, read from trajectories: their pose, their split, and int16 to keep them in."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.data.splits import Split, refuse_leaks
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import built, parsed
@@ -28,6 +24,128 @@ if TYPE_CHECKING:
     import h5py
 
     from systems.trajectory.base import TrajectoryReader
+
+
+# The pose of a scene that its own shape decides, so that a molecule that no training saw has one too.
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def fitted_atoms(scene: Scene) -> npt.NDArray[np.int64]:
+    """Return the atoms that frames are superposed by: the heavy ones, all where fewer than three are heavy."""
+    return scene.heavy_idx if len(scene.heavy_idx) >= 3 else np.arange(scene.n_atoms)
+
+
+def standard_turn(scene: Scene) -> FloatArray:
+    """Return the rotation `(3, 3)` R that lays a scene along its own axes: x moves to `x @ R.T`.
+
+    Axes are the principal ones of the fitted atoms, the longest first; the first two point to where the third moment of
+    all atoms does, the third completes a right-handed system. A scene turned first gives the same result, but for
+    shapes that leave the axes open (one atom, a line, a symmetric top, mirror-symmetric along an axis): there the pose
+    depends on how the scene came.
+    """
+    idx = fitted_atoms(scene)
+    centred = scene.positions_nm - scene.positions_nm[idx].mean(axis=0)
+    _, vectors = np.linalg.eigh(centred[idx].T @ centred[idx])
+    axes = vectors[:, ::-1].T.copy()
+    along = centred @ axes.T
+    for k in (0, 1):
+        if (along[:, k] ** 3).sum() < 0.0:
+            axes[k] = -axes[k]
+    axes[2] = np.cross(axes[0], axes[1])
+    return axes
+
+
+def in_standard_pose(scene: Scene) -> Scene:
+    """Return the scene laid along its own axes (`standard_turn`), the middle of the fitted atoms at the origin."""
+    centred = scene.positions_nm - scene.positions_nm[fitted_atoms(scene)].mean(axis=0)
+    return scene.with_positions(centred @ standard_turn(scene).T)
+
+
+# Splits of frames into training and validation, and the proof that no stretch of motion is in both.
+
+# Successive frames that must agree for a leak: one may coincide by chance in a system of one particle, a run does not.
+RUN = 4
+_LEAK_BLOCK = 8192
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Split:
+    """By time: the last `share` of each trajectory is held out. By trajectory: those of the numbers `held` are, whole,
+    and `share` plays no part."""
+
+    share: float = 0.05
+    held: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.share < 1.0:
+            raise InputError(f"the held-out share must lie between 0 and 1, not {self.share:g}.")
+
+    def ranges(self, starts: npt.NDArray[Any], *, validation: bool) -> list[tuple[int, int]]:
+        """Return first and last-plus-one frames of the training or validation stretches.
+
+        `starts`: first frame of each trajectory and, last, the number of frames.
+        """
+        found = []
+        for k, (begin, end) in enumerate(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)):
+            cut = int(end - round((end - begin) * self.share))
+            if self.held:
+                cut = begin if k in self.held else end
+            found.append((cut, end) if validation else (begin, cut))
+        return [(low, high) for low, high in found if high > low]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"share": self.share, "held": list(self.held)}
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> Split:
+        """Rebuild a split. Raises ValueError for what is none."""
+        return built(Split, record)
+
+
+def refuse_leaks(coordinates: npt.NDArray[Any], starts: npt.NDArray[Any], split: Split,
+                 name: Callable[[int], str]) -> None:  # fmt: skip
+    """Raise InputError when a run of RUN held-out frames is also trained on, as when a trajectory is given twice, or
+    once whole and once in part.
+
+    `coordinates` (n_frames, n_atoms, 3) int16, in one pose, so that the same frame has the same numbers; read in
+    blocks. `name(k)`: what trajectory k is called.
+    """
+    known = np.unique(np.concatenate([runs for _, runs in _runs(coordinates, split.ranges(starts, validation=False))]
+                                     or [np.zeros(0, np.uint64)]))  # fmt: skip
+    for first, runs in _runs(coordinates, split.ranges(starts, validation=True)):
+        place = np.searchsorted(known, runs).clip(max=max(len(known) - 1, 0))
+        seen = np.flatnonzero(known[place] == runs) if len(known) else np.zeros(0, np.int64)
+        moving = [k for k in seen.tolist() if (coordinates[first + k] != coordinates[first + k + RUN - 1]).any()]
+        if moving:
+            frame = first + moving[0]
+            which = int(np.searchsorted(starts, frame, side="right")) - 1
+            raise InputError(
+                f"{name(which)}: frame {frame - int(starts[which])} and {len(moving) - 1} later stretches are held out "
+                "for validation and trained on as well, under the same or another name; give each trajectory once."
+            )
+
+
+def _runs(coordinates: npt.NDArray[Any], ranges: list[tuple[int, int]]) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
+    """First frame and fingerprints of all runs of RUN frames, in blocks that end with a range."""
+    rng = np.random.default_rng(0)
+    factors = rng.integers(0, 2**64, size=coordinates[0].size, dtype=np.uint64) | np.uint64(1)
+    for low, high in ranges:
+        for start in range(low, high - RUN + 1, _LEAK_BLOCK):
+            block = coordinates[start : min(start + _LEAK_BLOCK + RUN - 1, high)]
+            # Products and sums wrap: a fingerprint modulo 2^64.
+            marks = block.reshape(len(block), -1).astype(np.int64).view(np.uint64) @ factors
+            n = len(marks) - RUN + 1
+            runs = np.zeros(n, dtype=np.uint64)
+            for k in range(RUN):
+                runs = runs * np.uint64(0x9E3779B97F4A7C15) + marks[k : k + n]
+            yield start, runs
+
+
+# Training frames of one scene in compact form: read from trajectories, canonicalised once, kept as int16.
+# In a windows file they lie uncompressed and are mapped, not read: a training takes from a file larger than memory what
+# its windows need.
 
 # One unit of the int16 coordinates: 0.0002 nm, range +-6.5 nm. Thermal motion of a bond is ten times larger.
 QUANTUM_NM = 2e-4
@@ -350,7 +468,7 @@ def at_rest(vectors: npt.NDArray[Any], masses_da: npt.NDArray[Any]) -> npt.NDArr
 
 def canonicalise(frames_nm: npt.NDArray[Any], template: Scene) -> npt.NDArray[Any]:
     """Superpose frames on the centred template by heavy atoms; all atoms where fewer than three are heavy."""
-    idx = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+    idx = fitted_atoms(template)
     target = template.positions_nm - template.positions_nm[idx].mean(axis=0)
     return superpose(frames_nm, target, idx=idx)
 

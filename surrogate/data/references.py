@@ -1,18 +1,194 @@
-"""References of a training: trajectories or windows files, surveyed first and read when their frames are needed."""
+"""References of a training: files of one molecule or several, surveyed first and read when frames are needed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames
-from surrogate.data.molecules import FrameSets, collect_sets
-from surrogate.models.architecture import Survey
+from surrogate.data.frames import (
+    Split,
+    TrainingFrames,
+    collect_frames,
+    in_standard_pose,
+    is_windows,
+    load_frames,
+    standard_turn,
+)
+from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.scene import Scene
+
+# Training frames of several molecules: trajectories grouped by topology, split by system, laid in standard poses.
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSets:
+    """Frames of several molecules. Those `trained` on hold their own validation stretches; those of `unseen` are held
+    out whole: curves are measured on them, and nothing is learned from them."""
+
+    trained: tuple[TrainingFrames, ...]
+    unseen: tuple[TrainingFrames, ...] = ()
+
+    @property
+    def names(self) -> str:
+        return ", ".join(frames.scene.name for frames in self.trained)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """How much reference is trained on, and of which files, as the record of a training has it."""
+        sources = [source for frames in self.trained for source in frames.sources]
+        return {"reference_ns": sum(frames.total_ps for frames in self.trained) * 1e-3, "sources": sources}
+
+
+def collect_sets(paths: list[Path], *, held: list[Path] | None = None, spool: Path | None = None) -> FrameSets:
+    """Read reference trajectories, or windows files, of any number of molecules, canonical and in standard poses.
+
+    Trajectories in `held` of a molecule that is trained on are its validation; molecules that appear in `held` alone
+    are held out as systems. Raises InputError when save intervals or temperatures differ, when one molecule comes in
+    two atom orders, so that it would be trained on under one and held out under the other, and for leaks of frames.
+    """
+    seen, also = _by_topology(paths), _by_topology(held or [])
+    trained = [_read(files, also.pop(key, []), spool) for key, files in seen.items()]
+    unseen = [_hold_out(_read(files, [], spool)) for files in also.values()]
+    sets = FrameSets(tuple(map(_pose, trained)), tuple(map(_pose, unseen)))
+    refuse_mixtures(sets)
+    return sets
+
+
+def refuse_mixtures(sets: FrameSets) -> None:
+    """Raise InputError for sets that one model cannot learn from, and for a system both trained on and held out."""
+    first, keys = sets.trained[0], dict[str, TrainingFrames]()
+    for frames in (*sets.trained, *sets.unseen):
+        name = frames.scene.name
+        if not np.isclose(frames.lag_ps, first.lag_ps, rtol=1e-4):
+            raise InputError(
+                f"{name} is saved every {frames.lag_ps:g} ps, {first.scene.name} every {first.lag_ps:g} ps; one model "
+                "learns one interval (and multiples of it)."
+            )
+        asked, known = (f.conditions.get("temperature_k") for f in (frames, first))
+        if asked != known:
+            raise InputError(f"{name} was made at {asked} K, {first.scene.name} at {known} K; this model takes none.")
+        other = keys.setdefault(molecule_key(frames.scene), frames)
+        if other is not frames:
+            both = " and would be both trained on and held out" if frames in sets.unseen else ""
+            raise InputError(
+                f"{name} and {other.scene.name} are one molecule in two atom orders{both}; give it in one."
+            )
+        frames.refuse_leaks()
+
+
+def _by_topology(paths: list[Path]) -> dict[str, list[Path]]:
+    from systems.trajectory.codec import open_trajectory
+
+    found: dict[str, list[Path]] = {}
+    for path in paths:
+        if is_windows(path):
+            found[f"windows {path}"] = [path]
+            continue
+        with open_trajectory(path) as reader:
+            if reader.scene is None:
+                raise InputError(f"{path} carries no topology; give an HDF5 file written by surromd or MDTraj.")
+            found.setdefault(reader.scene.topology_hash, []).append(path)
+    return found
+
+
+def _read(paths: list[Path], held: list[Path], spool: Path | None) -> TrainingFrames:
+    if is_windows(paths[0]):
+        frames = load_frames(paths[0])
+        if not frames.canonical:
+            raise InputError(f"{paths[0]} holds frames in their own pose; make it without `velocities=True`.")
+        return frames
+    return collect_frames(paths, held=held, spool=spool)
+
+
+def _hold_out(frames: TrainingFrames) -> TrainingFrames:
+    return replace(frames, split=Split(held=tuple(range(len(frames.starts) - 1))))
+
+
+def _pose(frames: TrainingFrames) -> TrainingFrames:
+    """Return the frames with their template along its own axes; they are turned as they are read."""
+    return replace(frames, scene=in_standard_pose(frames.scene), turn=standard_turn(frames.scene))
+
+
+# Windows of frames that stand one, two, ... up to a thousand spacings apart, for a model that takes the lag.
+
+_PER_DECADE = 8
+
+
+def strides_up_to(longest: int) -> tuple[int, ...]:
+    """Return strides from 1 to `longest`, evenly spaced in their logarithm, about eight a decade."""
+    n = max(2, round(_PER_DECADE * np.log10(longest)) + 1)
+    return tuple(sorted({round(float(x)) for x in np.geomspace(1, longest, n)})) if longest > 1 else (1,)
+
+
+@dataclass(frozen=True, eq=False)
+class StrideSampler:
+    """Draws windows of any of `strides`, each as likely; `starts[k]` (n_k,) are the first frames of those of stride
+    k."""
+
+    strides: tuple[int, ...]
+    starts: tuple[Tensor, ...]
+
+    @staticmethod
+    def of(frames: TrainingFrames, length: int, strides: Sequence[int], *, validation: bool = False) -> StrideSampler:
+        """Return the sampler of windows of `length` frames. Raises InputError where one of the longest does not fit
+        into a training stretch; validation takes those that fit."""
+        found: list[tuple[int, Tensor]] = []
+        for stride in strides:
+            span = (length - 1) * stride + 1
+            try:
+                found.append((stride, torch.from_numpy(frames.window_starts(span, validation=validation))))
+            except InputError as error:
+                if validation and found:
+                    break
+                raise InputError(
+                    f"{frames.scene.name}: no window of {length} frames {stride * frames.lag_ps:g} ps apart fits; give "
+                    "longer trajectories, a shorter `longest_lag_ps` or shorter chunks."
+                ) from error
+        return StrideSampler(tuple(s for s, _ in found), tuple(starts for _, starts in found))
+
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return first frames `(n,)` and strides `(n,)`."""
+        which = torch.randint(len(self.strides), (n,), generator=generator)
+        place = torch.rand(n, generator=generator, dtype=torch.float64)
+        sizes = torch.tensor([len(starts) for starts in self.starts])
+        first = torch.empty(n, dtype=torch.int64)
+        for k, starts in enumerate(self.starts):
+            rows = which == k
+            first[rows] = starts[(place[rows] * sizes[k]).long()]
+        return first, torch.tensor(self.strides)[which]
+
+
+# References of a training: trajectories or windows files, surveyed first and read when their frames are needed.
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A summary of the trajectories to train on, made without reading their frames.
+
+    `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of
+    the longest trajectory of each of `scenes`, `n_frames` all that are trained on. `lag_ps`: time between frames.
+    `velocities`: whether all files carry them. `equilibrium`: whether all were simulated at constant temperature.
+    """
+
+    scenes: tuple[Scene, ...]
+    unseen: tuple[Scene, ...]
+    longest: tuple[int, ...]
+    n_frames: int
+    lag_ps: float
+    velocities: bool
+    equilibrium: bool
+
+    @property
+    def one_molecule(self) -> bool:
+        return len(self.scenes) == 1 and not self.unseen
 
 
 @dataclass(frozen=True)
@@ -81,7 +257,7 @@ class References:
         return frames
 
     def sets(self) -> FrameSets:
-        """Return the frames of any number of molecules (`data.molecules.collect_sets`)."""
+        """Return the frames of any number of molecules (`data.references.collect_sets`)."""
         return collect_sets(list(self.paths), held=list(self.held), spool=self.spool)
 
 

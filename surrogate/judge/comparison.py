@@ -2,47 +2,34 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from surrogate.judge import remarks, verdict
-from surrogate.judge.convergence import Convergence, convergence_of
-from surrogate.judge.explained import NOTHING_OPEN, Explained, explain
-from surrogate.judge.in_short import in_short
+from surrogate.judge.convergence import NOTHING_OPEN, Convergence, Explained, convergence_of, explain
 from surrogate.judge.measure.movie import Movie, make_movie
 from surrogate.judge.measure.slow_motion import longest_correlation
 from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
-from surrogate.judge.measure.structure import Backbone, Features, Yardstick
+from surrogate.judge.measure.structure import Backbone, Features, Yardstick, first_invalid_ps
+from surrogate.judge.metrics import METRICS, measure_all
 from surrogate.judge.read.ensemble import Ensemble, alike
-from surrogate.judge.rows import curves, metrics
-from surrogate.judge.rows.account import Account, Faults, account_of, cost_ratio, faults_of, speed_ratio
-from surrogate.judge.rows.charts import Chart
-from surrogate.judge.rows.curves import Curves
-from surrogate.judge.rows.intervention_rows import intervention_rows
-from surrogate.judge.rows.motion import relaxation_rows
-from surrogate.judge.rows.motion.forecast import find_pairs, forecast_charts
-from surrogate.judge.rows.motion.lifetimes import lifetime_rows
-from surrogate.judge.rows.motion.msm_rows import msm_rows
-from surrogate.judge.rows.motion.peptide_protocol import peptide_charts
-from surrogate.judge.rows.motion.survival import survival_charts
-from surrogate.judge.rows.motion.within_rows import within_rows
-from surrogate.judge.rows.rows import Options, Row, Trio, by_group, make_sample
-from surrogate.judge.rows.shape.bond_rows import bond_rows
-from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
-from surrogate.judge.rows.shape.couplings import coupling_rows
-from surrogate.judge.rows.shape.energy_rows import EnergyFn, energy_rows, measure_energies
-from surrogate.judge.rows.shape.peptide_shape import along_time, secondary_structure
-from surrogate.judge.rows.shape.shape_rows import shape_rows
-from surrogate.judge.rows.shape.temperature_row import temperature_rows
-from surrogate.judge.rows.shape.torsion_rows import other_torsion_rows
-from surrogate.judge.rows.shape.wasserstein_rows import wasserstein_rows
-from surrogate.judge.rows.suspicions import bonds_that_are_none, copied_from, copy_rows, jumps, refuse_wrong_topology
+from surrogate.judge.remarks import bonds_that_are_none, copied_from, jumps, refuse_wrong_topology
+from surrogate.judge.rows.charts import Chart, jsonable
+from surrogate.judge.rows.rows import Options, Row, Sample, Trio, by_group, make_sample
+from surrogate.judge.rows.torsion_rows import FEW_RESIDUES
+from surrogate.judge.rows.validity_rows import (
+    EnergyFn,
+    applicable_checks,
+    measure_energies,
+    places_in_chunk,
+)
+from surrogate.judge.verdict import in_short
 from surrogate.judge.worth import Worth, headline, worth_charts
 from surrogate.judge.worth_measures import worths
+from systems.chemistry import validity
 from systems.chemistry.validity import Geometry
 from systems.errors import InputError
 from systems.scene import Scene
@@ -52,32 +39,47 @@ if TYPE_CHECKING:
 
 # Frames whose bonds tell whether a topology fits.
 _FRAMES_FOR_BONDS = 20
-# Rooms of metrics that stand by themselves: each gives rows, charts, and what it skipped with the reason.
-Room = Callable[[Trio], tuple[Sequence[Row], Sequence[Chart], Sequence[tuple[str, str]]]]
-ROOMS: tuple[Room, ...] = (
-    wasserstein_rows,
-    temperature_rows,
-    shape_rows,
-    other_torsion_rows,
-    within_rows,
-    copy_rows,
-    contact_rows,
-    hydrogen_bond_rows,
-    lifetime_rows,
-    coupling_rows,
-    msm_rows,
-    peptide_charts,
-    intervention_rows,
-    survival_charts,
-    energy_rows,
-    secondary_structure,
-    along_time,
-)
-
 _MIN_FRAMES = 20
 # Holm's correction for so many rows must leave the least p-value of a permutation test below 5 %.
 _ROWS_FORESEEN = 60
 _MOST_TIMES_AS_LONG = 20
+
+
+@dataclass(frozen=True)
+class Account:
+    """What one trajectory is: where from, how long, how it was made, what it cost.
+
+    `top` and `stated_lag_ps` are what the user said of the files; `total_ps`, `n_frames` are of the whole input;
+    `length` says it as what it is ('32 replicas of 3.8 ns'); `ns_per_day` and `wall_s` are None where its record holds
+    no cost.
+    """
+
+    label: str
+    sources: tuple[str, ...]
+    top: str | None
+    stated_lag_ps: float | None
+    n_segments: int
+    n_frames: int
+    lag_ps: float
+    total_ps: float
+    settings: dict[str, Any]
+    wall_s: float | None
+    ns_per_day: float | None
+    cost: dict[str, Any]
+    length: str = ""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """How many of the compared frames carry each validity flag, when the first invalid one comes, and how many chunks
+    they were made in."""
+
+    label: str
+    n_frames: int
+    counts: dict[str, int]
+    n_invalid: int
+    first_invalid_ps: float | None
+    n_chunks: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,7 @@ class Judgement:
     faults: tuple[Faults, Faults, Faults]
     skipped: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
-    curves: Curves
+    charts: tuple[Chart, ...]
     worth: tuple[Worth, ...] = ()
     worth_words: str = ""
     left_open: Explained = NOTHING_OPEN
@@ -161,29 +163,11 @@ class Comparison:
         residue; where there is no backbone, its torsions' histograms."""
         from surrogate.judge.report.overview import overview
 
-        drawn = [(j.account.label, j.curves.ramachandran, j.curves.histograms) for j in self.judgements]
-        return overview(drawn, self.temperature_k)
+        return overview([(j.account.label, j.charts) for j in self.judgements], self.temperature_k)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; what is not finite becomes None."""
-        apart = ("judgements", "reference", "replicate", "options", "movies", "convergence")
-        plain: dict[str, Any] = _jsonable({k: v for k, v in vars(self).items() if k not in apart})
-        plain["reference"] = _jsonable(asdict(self.reference))
-        plain["replicate"] = None if self.replicate is None else _jsonable(asdict(self.replicate))
-        plain["options"] = _jsonable(asdict(self.options))
-        plain["convergence"] = None if self.convergence is None else _jsonable(asdict(self.convergence))
-        plain["judgements"] = []
-        for judgement in self.judgements:
-            nested = ("rows", "curves", "account", "faults", "worth", "left_open")
-            out = _jsonable({k: v for k, v in vars(judgement).items() if k not in nested})
-            out["account"] = _jsonable(asdict(judgement.account))
-            out["faults"] = [_jsonable(asdict(f)) for f in judgement.faults]
-            out["worth"] = [_jsonable(asdict(w)) for w in judgement.worth]
-            out["left_open"] = _jsonable(asdict(judgement.left_open))
-            out["rows"] = [r.to_dict() for r in judgement.rows]
-            out["curves"] = judgement.curves.to_dict()
-            plain["judgements"].append(out)
-        return plain
+        """Return JSON-able values of all but the movies; what is not finite becomes None."""
+        return {name: jsonable(value) for name, value in vars(self).items() if name != "movies"}
 
 
 def compare(
@@ -251,7 +235,6 @@ def compare(
         temperature = 300.0
         notes.append("The reference does not state its temperature; free energies are drawn for 300 K.")
     accounts = [account_of(e) for e in everyone]
-    beside = None if floor is None else find_pairs(thinned[0], floor)
     setting = _Setting(
         stage,
         yardstick.torsions,
@@ -266,10 +249,7 @@ def compare(
         convergence,
     )
     judgements = tuple(
-        _with_forecast(
-            _judge(setting, features, account),
-            *forecast_charts(find_pairs(thinned[0], rolled), beside, thinned[0].lag_ps),
-        )
+        _judge(setting, features, account, (thinned[0], rolled, floor))
         for features, account, rolled in zip(measured[1:], accounts[1:], thinned[1 : 1 + len(candidates)], strict=False)
     )
     notes += [f"Validity check left out: {x}." for x in yardstick.geometry.excluded]
@@ -309,21 +289,17 @@ class _Setting(NamedTuple):
     convergence: Convergence
 
 
-def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgement:
-    """Judge one candidate; `account`: what its file says of it."""
+def _judge(
+    setting: _Setting, candidate: Features, account: Account, trajectories: tuple[Ensemble, Ensemble, Ensemble | None]
+) -> Judgement:
+    """Judge one candidate; `account`: what its file says of it; `trajectories`: see `Trio`."""
     trio, correlation, own = _equal_terms(setting, candidate)
+    trio = replace(trio, trajectories=trajectories)
     reference, replicate, options = setting.reference, setting.replicate, setting.options
-    rows = metrics.validity_rows(trio)
-    lengths, bonds = bond_rows(trio)
-    rows += lengths + metrics.population_rows(trio) + metrics.torsion_rows(trio)
-    kinetic, correlations, skipped = relaxation_rows.correlation_rows(trio)
-    slowest, projected, without_tica = relaxation_rows.tica_rows(trio)
-    seams, without_seams = relaxation_rows.boundary_row(trio)
-    rooms = [room(trio) for room in ROOMS]
-    more = [row for found, _, _ in rooms for row in found]
+    found_rows, charts, skipped = measure_all(METRICS, trio)
     n_compared = round(trio.compared_ps / trio.reference.features.lag_ps)
     samples = effective_samples(n_compared, correlation)
-    every = by_group([*rows, *kinetic, *slowest, *seams, *more])
+    every = list(found_rows)
     left_open = explain(setting.known, candidate, setting.torsions, setting.convergence, seed=options.seed)
     if samples < remarks.LEAST_FOR_TESTS or left_open.why:
         every = verdict.untested(every, start=bool(left_open.why))
@@ -358,27 +334,14 @@ def _judge(setting: _Setting, candidate: Features, account: Account) -> Judgemen
             faults_of(trio.candidate, setting.geometry),
             faults_of(trio.replicate, setting.geometry),
         ),
-        skipped=(
-            *remarks.skipped(trio),
-            *skipped,
-            *without_tica,
-            *without_seams,
-            *(x for _, _, why in rooms for x in why),
-        ),
+        skipped=(*remarks.skipped(trio), *skipped),
         notes=tuple(
             remarks.trimming(trio, reference, candidate, replicate)
             + (["Equivalent MD time is withheld: it takes a converged reference."] * bool(left_open.why))
             + remarks.unlike(judged, options)
             + copied_from(trio)[1]
         ),
-        curves=Curves(
-            ramachandran=curves.ramachandran_maps(trio),
-            histograms=(*curves.torsion_histograms(trio), *projected),
-            correlations=tuple(correlations),
-            timelines=tuple(curves.timeline(s.features) for s in trio.samples),
-            bonds=tuple(bonds),
-            charts=(*(chart for _, charts, _ in rooms for chart in charts), *worth_charts(worth)),
-        ),
+        charts=(*worth_charts(worth), *charts),
         worth=worth,
         worth_words=words,
         left_open=left_open,
@@ -404,7 +367,7 @@ def _equal_terms(setting: _Setting, candidate: Features) -> tuple[Trio, float, f
     slowest = longest_correlation(cut[0], cut[2])
     own = longest_correlation(cut[1])
     each = block_length(n, max(slowest, own))
-    n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * metrics.FEW_RESIDUES)
+    n_rows = _ROWS_FORESEEN + 8 * min(len(torsions.phi) + len(torsions.psi), 2 * FEW_RESIDUES)
     options = replace(setting.options, n_permutations=max(setting.options.n_permutations, 50 * n_rows))
     truth, rolled, other = (
         make_sample(f, make_blocks(f.segment_lengths, each), options, stream, n) for stream, f in enumerate(cut)
@@ -419,11 +382,6 @@ def _worth_words(found: Sequence[Worth], account: Account, reference: Account) -
     return headline(found, lambda w: cost_ratio(w.worth_ps, w.share, account, reference), account.total_ps)
 
 
-def _with_forecast(judgement: Judgement, charts: Sequence[Chart], skipped: Sequence[tuple[str, str]]) -> Judgement:
-    drawn = replace(judgement.curves, charts=(*judgement.curves.charts, *charts))
-    return replace(judgement, curves=drawn, skipped=(*judgement.skipped, *skipped))
-
-
 def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
@@ -436,13 +394,55 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _jsonable(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_jsonable(v) for v in value]
-    if isinstance(value, np.generic):
-        return _jsonable(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
+def faults_of(sample: Sample, geometry: Geometry) -> Faults:
+    """Count the flags of the frames of one sample, of those checks that the geometry has something for."""
+    features = sample.features
+    flags = np.concatenate(list(features.flags))
+    counts = {validity.flag_names(c.mask)[0]: int(((flags & c.mask) != 0).sum()) for c in applicable_checks(geometry)}
+    return Faults(
+        features.label,
+        len(flags),
+        counts,
+        int(((flags & validity.INVALID) != 0).sum()),
+        first_invalid_ps(features, validity.INVALID),
+        int((places_in_chunk(features) == 0).sum()),
+    )
+
+
+def account_of(ensemble: Ensemble) -> Account:
+    """Return what `ensemble` says of itself; simulated time and wall seconds are those of the whole input."""
+    record = ensemble.record
+    cost = record.get("cost") if isinstance(record.get("cost"), dict) else {}
+    assert isinstance(cost, dict)
+    wall = cost.get("wall_s")
+    wall_s = float(wall) if isinstance(wall, (int, float)) and wall > 0 else None
+    settings = {k: v for k, v in record.items() if k != "cost" and isinstance(v, (str, int, float, bool))}
+    return Account(
+        label=ensemble.label,
+        sources=ensemble.sources,
+        top=ensemble.top,
+        stated_lag_ps=ensemble.stated_lag_ps,
+        n_segments=len(ensemble.segments),
+        n_frames=ensemble.n_frames,
+        lag_ps=ensemble.lag_ps,
+        total_ps=ensemble.total_ps,
+        settings=settings,
+        wall_s=wall_s,
+        ns_per_day=None if wall_s is None else ensemble.total_ps * 1e-3 * 86_400.0 / wall_s,
+        cost=dict(cost),
+        length=ensemble.length_words,
+    )
+
+
+def speed_ratio(candidate: Account, reference: Account) -> float | None:
+    """Return simulated time per wall second over the reference's; None when one of the two holds no cost."""
+    if candidate.ns_per_day is None or reference.ns_per_day is None:
+        return None
+    return candidate.ns_per_day / reference.ns_per_day
+
+
+def cost_ratio(worth_ps: float, share: float, candidate: Account, reference: Account) -> float | None:
+    """Return the wall time of `worth_ps` of the reference's MD over that of a share of the candidate, or None."""
+    if candidate.wall_s is None or reference.wall_s is None:
+        return None
+    return worth_ps / reference.total_ps * reference.wall_s / (share * candidate.wall_s)

@@ -3,7 +3,8 @@
 Halves of one set share its start, so neither a replicate nor a bootstrap can see that a set still depends on it. Time
 can: equilibrium MD looks the same forwards and backwards, so that whatever grows along the replicas, more often than
 swapped signs of time would give, has not ended. What cannot drift because it never moves is counted: transitions,
-replicas that left their start, their length against the slowest relaxation.
+replicas that left their start, their length against the slowest relaxation. What an unconverged reference leaves open
+of a candidate's difference, and what differs all the same, is told by `explain`.
 """
 
 from __future__ import annotations
@@ -12,22 +13,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure import kinetics
-from surrogate.judge.measure.equal_atoms import evenly
+from surrogate.judge.measure.probes import evenly
 from surrogate.judge.measure.slow_motion import tic_0
+from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.measure.structure import Backbone, Features, Yardstick
+from surrogate.judge.measure.torsions import Segments, Wells, find_wells
 from surrogate.judge.read.ensemble import Ensemble, length_words
+from surrogate.judge.rows.rows import Row
 from systems.scene import Scene
 from systems.units import format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Segments = Sequence[npt.NDArray[Any]]
 
 # A replica shorter than so many relaxation times remembers its start, whatever the starts are.
 LEAST_RELAXATIONS = 5.0
@@ -41,13 +43,16 @@ _SIGNIFICANCE = 0.01
 _FLIPS = 2000
 _LEAST_REPLICAS = 8
 _MOST_TORSIONS, _MOST_MAPS = 64, 16
-_BINS, _MAP_BINS, _LEAST_FRAMES = 72, 18, 16
-# Peaks of an angle are two states where the density between them falls below this share of the lower one.
-_SADDLE = 0.5
-_LEAST_PEAK = 1e-3
+_MAP_BINS, _LEAST_FRAMES = 18, 16
 _MENTIONED = 3
 # Of quarters, the straight line through them.
 _CONTRAST = np.array([-3.0, -1.0, 1.0, 3.0])
+_TOLERANCE = 0.05
+# Entries by the candidate's own rates that a reference must have missed to rule a state out; so many times as few.
+_ENTRIES_TO_RULE_OUT = 20.0
+_TIMES_FEWER = 5.0
+# Standard errors beyond what the reference allows.
+_SURELY = 3.0
 
 
 @dataclass(frozen=True)
@@ -166,82 +171,6 @@ def convergence_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Wells:
-    """States of one angle: `of_bin` `(72,)` holds the state of each bin of 5 degrees, -1 on a rim between two."""
-
-    torsion: str
-    of_bin: IntArray
-    names: tuple[str, ...]
-
-    def assign(self, segments: Segments) -> list[IntArray]:
-        """Return the state of every frame: on a rim, that which was left last."""
-        out = []
-        for values in segments:
-            angle = np.asarray(values, dtype=np.float64)
-            finite = np.isfinite(angle)
-            raw = np.where(finite, self.of_bin[_bins_of(np.where(finite, angle, 0.0))], -1)
-            known = np.flatnonzero(raw >= 0)
-            if not len(known):
-                out.append(np.zeros(len(raw), dtype=np.int64))
-                continue
-            before = np.searchsorted(known, np.arange(len(raw)), side="right") - 1
-            out.append(raw[known[np.maximum(before, 0)]])
-        return out
-
-
-def find_wells(torsion: str, *samples: Segments) -> Wells:
-    """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts."""
-    density = np.zeros(_BINS)
-    for segments in samples:
-        values = np.concatenate([np.asarray(x, dtype=np.float64) for x in segments])
-        values = values[np.isfinite(values)]
-        if len(values):
-            density += np.bincount(_bins_of(values), minlength=_BINS) / len(values)
-    # What vibrates by 10 degrees is one peak, of however few frames.
-    kernel = np.exp(-0.5 * (np.arange(-6, 7) / 2.0) ** 2)
-    smooth = sum(w * np.roll(density, k) for k, w in zip(range(-6, 7), kernel / kernel.sum(), strict=True))
-    assert isinstance(smooth, np.ndarray)
-    edges = _minima(smooth)
-    if len(edges) < 2:
-        return Wells(torsion, np.zeros(_BINS, dtype=np.int64), ("",))
-    of_bin = np.searchsorted(edges, np.arange(_BINS), side="right") - 1
-    of_bin = np.where(of_bin < 0, len(edges) - 1, of_bin)
-    degrees = [5 * e - 180 for e in edges]
-    names = tuple(f"{a}° to {b}°" for a, b in zip(degrees, degrees[1:] + degrees[:1], strict=True))
-    rim = np.concatenate([(edges - 2) % _BINS, (edges - 1) % _BINS, edges, (edges + 1) % _BINS])
-    cores = of_bin.copy()
-    cores[rim] = -1
-    # A state that is all rim keeps its bins.
-    for k in range(len(names)):
-        if not (cores == k).any():
-            cores[of_bin == k] = k
-    return Wells(torsion, cores, names)
-
-
-def _minima(smooth: FloatArray) -> IntArray:
-    """Return the bins at which states of a circular density begin, ascending: the minima between its peaks."""
-    before, after = np.roll(smooth, 1), np.roll(smooth, -1)
-    peaks = np.flatnonzero((smooth > before) & (smooth >= after) & (smooth > _LEAST_PEAK / 10)).tolist()
-
-    def saddle(a: int, b: int) -> tuple[float, int]:
-        path = np.arange(a, b + _BINS * (b <= a) + 1) % _BINS
-        # The middle of a level minimum, such as of empty bins.
-        lowest = np.flatnonzero(smooth[path] <= smooth[path].min() + 1e-12)
-        return float(smooth[path].min()), int(path[lowest[len(lowest) // 2]])
-
-    while len(peaks) > 1:
-        depth = [saddle(a, b)[0] / min(smooth[a], smooth[b]) for a, b in zip(peaks, peaks[1:] + peaks[:1], strict=True)]
-        worst = int(np.argmax(depth))
-        if depth[worst] <= _SADDLE:
-            break
-        pair = (worst, (worst + 1) % len(peaks))
-        peaks.pop(min(pair, key=lambda i: smooth[peaks[i]]))
-    if len(peaks) < 2:
-        return np.empty(0, dtype=np.int64)
-    return np.sort([saddle(a, b)[1] for a, b in zip(peaks, peaks[1:] + peaks[:1], strict=True)])
-
-
-@dataclass(frozen=True, eq=False)
 class Column:
     """One coordinate along all replicas: `series` 0 or 1 where it `is_state`."""
 
@@ -327,10 +256,6 @@ def long_enough(sets: Sequence[Features]) -> list[Features]:
             offset += n
         out += [f] if len(parts) == len(f.segment_lengths) else parts
     return out
-
-
-def _bins_of(angle: FloatArray) -> IntArray:
-    return np.floor((angle + math.pi) / (2 * math.pi) * _BINS).astype(np.int64) % _BINS
 
 
 def _normal_scores(segments: Sequence[FloatArray]) -> list[FloatArray]:
@@ -520,3 +445,122 @@ def _summed_up(states: Sequence[State], map_p: float, lengths: Sequence[int], la
         map_p=map_p,
         states=tuple(states),
     )
+
+
+@dataclass(frozen=True)
+class Excess:
+    """A state whose share in the candidate, with its standard error, is none that the reference allows: it allows
+    `low` to `high`."""
+
+    state: State
+    share: float
+    error: float
+    low: float
+    high: float
+
+    def row(self) -> Row:
+        """Return the row that says so."""
+        from scipy.special import ndtr
+
+        s = self.state
+        beyond = max(self.low - self.share, self.share - self.high)
+        p = float(2.0 * ndtr(-beyond / max(self.error, 1e-6)))
+        allowed = f"{100 * self.low:.2g} to {100 * self.high:.2g}"
+        own = Estimate(100 * self.share, 100 * (self.share - 2 * self.error), 100 * (self.share + 2 * self.error),
+                       100 * self.error)  # fmt: skip
+        truth = Estimate(100 * s.share, 100 * self.low, 100 * self.high, 100 * s.error)
+        return Row(
+            f"allowed:{s.label}", "populations", f"Share of {s.label}, against what the reference allows", "%",
+            "observable", truth, own, None, None, p, 1.0, 100 * _TOLERANCE, "± 5 points",
+            f"{s.label} is held {100 * self.share:.3g} % of the time, where the reference allows {allowed} %, whatever "
+            "it has not converged in",
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What an unconverged reference, or one too short to have seen a state, leaves open (`why`, a line each; empty:
+    nothing), and what differs all the same."""
+
+    why: tuple[str, ...] = ()
+    excess: tuple[Excess, ...] = ()
+
+    def in_words(self, found: Convergence) -> str:
+        """Return why a verdict must wait; empty where it need not."""
+        if not self.why:
+            return ""
+        if not found.converged:
+            return f"the reference is {found.verdict.removesuffix('.')}; {found.remedy}"
+        return f"the reference, {found.length}, is too short to tell: {'; '.join(self.why[:3])}"
+
+
+NOTHING_OPEN = Explained()
+
+
+def explain(
+    reference: Sequence[Features], candidate: Features, torsions: Backbone, found: Convergence, *, seed: int = 0
+) -> Explained:
+    """Return what of a candidate's difference the reference's start or length can explain, and what it cannot.
+
+    `found` is the reference's convergence. A state is ruled out where the candidate's share lies outside what the
+    reference allows, whatever its unconverged states come to (these shift others by as much as they depend on them), or
+    where the candidate enters it so often that the reference must have seen it: that is left to the other rows.
+    """
+    theirs, own = long_enough(reference), long_enough([candidate])
+    if not theirs or not own:
+        return Explained(found.reasons)
+    pairs = zip(angles_of(theirs, torsions), angles_of(own, torsions), strict=True)
+    wells = [find_wells(name, a, b) for (name, a), (_, b) in pairs]
+    truths, mine = state_columns(theirs, torsions, wells), state_columns(own, torsions, wells)
+    total_ps = sum(f.total_ps for f in theirs)
+    unseen, outside = [], [np.zeros(len(x), dtype=np.bool_) for x in mine[0].series] if mine else []
+    for truth, column in zip(truths, mine, strict=True):
+        line = _unseen(truth, column, found, total_ps, candidate.lag_ps)
+        if line:
+            unseen.append(line)
+            outside = [o | (x > 0) for o, x in zip(outside, column.series, strict=True)]
+    if found.converged and not unseen:
+        return NOTHING_OPEN
+    allowed = convergence_of(theirs, torsions, wells=wells, seed=seed).states
+    open_ones = [(s, c) for s, c in zip(allowed, truths, strict=False) if s.fault]
+    excess = []
+    for state, truth, column in zip(allowed, truths, mine, strict=False):
+        parts = [x[~o] for x, o in zip(column.series, outside, strict=True) if not o.all()]
+        if not parts:
+            continue
+        left = Column(column.torsion, column.name, parts)
+        # Of two states of one torsion only one need be open for both to be.
+        shift = max(
+            (max(s.high - s.share, s.share - s.low) * _dependence(truth, c)
+             for s, c in open_ones if s.torsion != state.torsion), default=0.0,
+        )  # fmt: skip
+        low, high = max(state.low - shift, 0.0), min(state.high + shift, 1.0)
+        if max(low - left.share, left.share - high) > _TOLERANCE + _SURELY * left.error:
+            excess.append(Excess(state, left.share, left.error, low, high))
+    return Explained((*(() if found.converged else found.reasons), *unseen), tuple(excess))
+
+
+def _unseen(truth: Column, column: Column, found: Convergence, total_ps: float, lag_ps: float) -> str:
+    """Return in a line that the reference hardly ever saw a state of the candidate and could not; empty otherwise."""
+    entries, exits = truth.passages()
+    if entries + exits >= LEAST_PASSAGES or truth.share >= RARE_BELOW:
+        return ""
+    if column.share <= max(_TOLERANCE, _TIMES_FEWER * truth.share):
+        return ""
+    n_outside = sum(int((x == 0).sum()) for x in column.series)
+    expected = column.passages()[0] / max(n_outside * lag_ps, lag_ps) * (1.0 - truth.share) * total_ps
+    if expected >= _ENTRIES_TO_RULE_OUT and entries <= expected / _TIMES_FEWER:
+        return ""
+    times = "once" if entries == 1 else f"{entries} times" if entries else "never"
+    return (
+        f"{truth.torsion} {truth.name}, {100 * column.share:.2g} % of the candidate, is {times} entered in "
+        f"{found.length}, which by the candidate's own rates would enter it {expected:.2g} times"
+    )
+
+
+def _dependence(truth: Column, other: Column) -> float:
+    """Return by how much the share of one state differs between frames in and out of another, in the reference."""
+    a, b = np.concatenate(list(truth.series)), np.concatenate(list(other.series)) > 0
+    if b.all() or not b.any():
+        return 0.0
+    return float(abs(a[b].mean() - a[~b].mean()))

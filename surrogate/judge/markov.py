@@ -17,6 +17,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from surrogate.judge.measure.msm import block_transitions
+from surrogate.judge.measure.statistics import Blocks, Piece
 from systems.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
@@ -183,13 +185,8 @@ def _units(micro: list[IntArray], lag: int) -> list[tuple[int, int, int]]:
 
 def _counts(micro: list[IntArray], units: list[tuple[int, int, int]], n: int, lag: int) -> FloatArray:
     """Return sliding transition counts `(n_units, n, n)` at a lag; a pair belongs to where it begins."""
-    out = np.zeros((len(units), n, n))
-    for u, (k, start, stop) in enumerate(units):
-        head = micro[k][start : min(stop, max(len(micro[k]) - lag, 0))]
-        tail = micro[k][start + lag : start + lag + len(head)]
-        known = (head >= 0) & (tail >= 0)
-        out[u] = np.bincount(head[known] * n + tail[known], minlength=n * n).reshape(n, n)
-    return out
+    pieces = tuple(Piece(k, start, stop, u) for u, (k, start, stop) in enumerate(units))
+    return block_transitions(micro, Blocks(pieces, len(units), 0), n, lag).reshape(-1, n, n)
 
 
 def _components(counts: FloatArray) -> IntArray:

@@ -19,7 +19,7 @@ from surrogate.judge.measure import kinetics, msm
 from surrogate.judge.measure.distributions import is_alpha
 from surrogate.judge.measure.slow_motion import SLOW_KINDS
 from surrogate.judge.measure.structure import Backbone, backbone
-from surrogate.judge.measure.torsions import Torsion, find_torsions
+from surrogate.judge.measure.torsions import Torsion, find_torsions, find_wells
 from surrogate.judge.read.ensemble import Ensemble
 from systems.chemistry.validity import INVALID
 from systems.errors import InputError
@@ -32,8 +32,6 @@ _TICA_LAG_PS = 10.0
 _DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
 _CLUSTERED_FRAMES = 10_000
 _MAP_BINS = 36
-# A well is deeper than kT on either side.
-_WELL_BINS, _SMOOTHED, _WELL_DEPTH = 72, 3, math.e
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
 # A state that has a smaller share of a rollout is no reason to begin there.
@@ -307,45 +305,16 @@ def _named_states(torsions: _Torsions, angles: list[FloatArray], own: list[Float
         found.append((residue.label, labels, ("α", "β", "left-handed"), rolled))
     first = torsions.n_phi + torsions.n_psi
     for k, torsion in enumerate(torsions.others):
-        pooled = np.concatenate([a[:, first + k] for a in (*angles, *(own or []))])
-        cuts = wells(pooled)
-        if len(cuts) < 2:
+        of_md, of_own = ([a[:, first + k] for a in segments or []] for segments in (angles, own))
+        wells = find_wells(torsion.label, of_md, of_own)
+        if len(wells.names) < 2:
             continue
-        labels, rolled = both(lambda x, cuts=cuts: np.searchsorted(cuts, x) % len(cuts), first + k)
-        found.append((torsion.label, labels, _well_names(pooled, cuts, torsion.fold), rolled))
+        labels, rolled = wells.labels(of_md), None if own is None else wells.labels(of_own)
+        values, state = np.concatenate([*of_md, *of_own]), np.concatenate([*labels, *(rolled or [])])
+        names = tuple(f"{math.degrees(msm.circular_mean(values[state == s]) / torsion.fold):.0f}°"
+                      for s in range(len(wells.names)))  # fmt: skip
+        found.append((torsion.label, labels, names, rolled))
     return found
-
-
-def wells(angles: FloatArray) -> FloatArray:
-    """Return where the wells of a torsion are divided, ascending in rad: at the minima of its density that lie below
-    both maxima beside them by kT; fewer than two where there is one well."""
-    values = angles[np.isfinite(angles)]
-    counts = np.histogram(values, bins=_WELL_BINS, range=(-math.pi, math.pi))[0].astype(np.float64)
-    kernel = np.ones(_SMOOTHED)
-    for _ in range(2):
-        counts = np.convolve(np.concatenate([counts[-1:], counts, counts[:1]]), kernel, "valid") / _SMOOTHED
-    counts = np.maximum(counts, 0.1)
-    low = [i for i in range(_WELL_BINS) if counts[i] <= counts[i - 1] and counts[i] < counts[(i + 1) % _WELL_BINS]]
-    while len(low) > 1:
-        # Drop the cut of the shallowest well, until all are deep.
-        tops = [_between(counts, low[i], low[(i + 1) % len(low)]) for i in range(len(low))]
-        walls = [min(tops[i - 1], tops[i]) / counts[low[i]] for i in range(len(low))]
-        shallow = int(np.argmin(walls))
-        if walls[shallow] >= _WELL_DEPTH:
-            break
-        del low[shallow]
-    return np.array([-math.pi + 2 * math.pi * (i + 0.5) / _WELL_BINS for i in low])
-
-
-def _between(counts: FloatArray, start: int, stop: int) -> float:
-    """Return the largest count from one bin round the circle to another."""
-    return float(counts[np.arange(start, stop if stop > start else stop + _WELL_BINS) % _WELL_BINS].max())
-
-
-def _well_names(angles: FloatArray, cuts: FloatArray, fold: int) -> tuple[str, ...]:
-    labels = np.searchsorted(cuts, angles) % len(cuts)
-    means = [msm.circular_mean(angles[np.isfinite(angles) & (labels == s)]) / fold for s in range(len(cuts))]
-    return tuple(f"{math.degrees(m):.0f}°" for m in means)
 
 
 def _energies(

@@ -1,4 +1,5 @@
-"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; and one sentence for the whole."""
+"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; one sentence for the whole; and the
+three lines on top of a report: use it or not, for what, why."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from dataclasses import replace
 from typing import Literal, NamedTuple
 
 from surrogate.judge.measure.statistics import holm
-from surrogate.judge.rows.rows import UNLIKE_BELOW, Options, Row, Word
+from surrogate.judge.rows.rows import UNLIKE_BELOW, Group, Options, Row, Word
 from systems.chemistry import validity
 
 Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
@@ -17,11 +18,17 @@ _FAILS_AT = 10.0
 _SHARE_SIGNIFICANCE = 0.01
 _SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
 _MENTIONED = 3
-_WITHIN_KEYS = ("phi_given", "torsions_given", "torsion_step", "hydrogen_bond_lifetime")
-_STATE_KEYS = ("phi_given", "torsions_given", "hydrogen_bond_lifetime")
-_FAST_KEYS = ("valid:", "copies", "bond_", "angle_", "temperature", "energy_", "chunk_step", *_WITHIN_KEYS)
 FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
 ALL_KEY = "valid:all"
+_WHAT: dict[Group, str] = {
+    "validity": "single structures",
+    "structure": "bonds, angles, shape and contacts",
+    "populations": "populations of states",
+    "distributions": "distributions and free energies of torsions",
+    "kinetics": "relaxation times and rates",
+}
+_MENTIONED_WHY = 2
+_GOOD, _BAD = ("agrees", "close"), ("differs", "fails")
 
 
 class Doubts(NamedTuple):
@@ -45,18 +52,18 @@ def judge_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
     close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
     reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
     """
-    corrected = holm([math.nan if r.kind == "share" else r.p_value for r in rows])
+    corrected = holm([math.nan if r.form == "share" else r.p_value for r in rows])
     judged = [
         replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
         for row, p in zip(rows, corrected, strict=True)
     ]
-    hard = [r.verdict for r in judged if r.kind == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
+    hard = [r.verdict for r in judged if r.form == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
     worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
     return tuple(replace(r, verdict=worst) if r.key == ALL_KEY else r for r in judged)
 
 
 def _word(row: Row, p: float, significance: float) -> Word:
-    if row.kind == "share":
+    if row.form == "share":
         return _share_word(row)
     value = row.candidate.value
     if not math.isfinite(value):
@@ -67,19 +74,19 @@ def _word(row: Row, p: float, significance: float) -> Word:
     within = _within_tolerance(row)
     if p < significance and not _beats_replicate(row):
         return "close" if within else "differs"
-    if row.kind == "distance":
+    if row.form == "distance":
         return "agrees" if within else "undecided"
     return "agrees" if _resolution(row) <= row.tolerance else "undecided"
 
 
 def _beats_replicate(row: Row) -> bool:
     """Whether a distance is no greater than the replicate's own: nothing is off by it."""
-    return row.kind == "distance" and row.ratio is not None and row.ratio.value <= 1.0
+    return row.form == "distance" and row.ratio is not None and row.ratio.value <= 1.0
 
 
 def _within_tolerance(row: Row) -> bool:
     """A distance is held against the floor (or a bound, where it has no ratio), a number against the reference's."""
-    if row.kind == "distance":
+    if row.form == "distance":
         measured = row.candidate.value if row.ratio is None else row.ratio.value
         return measured <= row.tolerance
     if row.reference is None:
@@ -121,11 +128,9 @@ def untested(rows: Sequence[Row], *, start: bool = False) -> list[Row]:
     """
 
     def tested(row: Row) -> bool:
-        if not row.key.startswith(_FAST_KEYS):
+        if row.time_scale == "slow" or (start and row.time_scale == "within states"):
             return False
-        if start and row.key.startswith(_STATE_KEYS):
-            return False
-        return not (row.key.startswith(_WITHIN_KEYS) and row.p_replicate < UNLIKE_BELOW)
+        return row.time_scale == "fast" or not row.p_replicate < UNLIKE_BELOW
 
     return [r if tested(r) else replace(r, p_value=math.nan, p_replicate=math.nan) for r in rows]
 
@@ -139,11 +144,11 @@ def status(rows: Sequence[Row], doubts: Doubts = SURE) -> Status:
         return "broken"
     if doubts.copied:
         return "undecided"
-    if doubts.apart and not any(r.verdict == "differs" and r.group == "validity" for r in rows):
+    if doubts.apart and not any(r.verdict == "differs" and r.kind == "validity" for r in rows):
         return "undecided"
     if "differs" in words:
         return "different"
-    statistical = [r.verdict for r in rows if r.kind != "share"]
+    statistical = [r.verdict for r in rows if r.form != "share"]
     if doubts.short or doubts.start:
         return "undecided"
     if statistical and statistical.count("undecided") > 0.5 * len(statistical):
@@ -157,13 +162,13 @@ def findings(rows: Sequence[Row]) -> tuple[str, ...]:
     # Beside what is wrong, what is within its tolerance is no finding.
     if any(_SEVERITY[r.verdict] > _SEVERITY["close"] for r in bad):
         bad = [r for r in bad if r.verdict != "close"]
-    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.key != FINITE_KEY, r.group != "validity", -_excess(r)))
+    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.key != FINITE_KEY, r.kind != "validity", -_excess(r)))
     return tuple(r.statement for r in bad)
 
 
 def replicate_differs(rows: Sequence[Row], options: Options) -> tuple[str, ...]:
     """Return the metrics in which reference and replicate differ from each other (Holm over all rows)."""
-    corrected = holm([math.nan if r.kind == "share" else r.p_replicate for r in rows])
+    corrected = holm([math.nan if r.form == "share" else r.p_replicate for r in rows])
     return tuple(r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance)
 
 
@@ -172,10 +177,10 @@ def _excess(row: Row) -> float:
     value = row.candidate.value
     if not math.isfinite(value):
         return math.inf
-    if row.kind == "distance":
+    if row.form == "distance":
         off = value if row.ratio is None else row.ratio.value - 1.0
     else:
-        off = abs(value - (100.0 if row.kind == "share" or row.reference is None else row.reference.value))
+        off = abs(value - (100.0 if row.form == "share" or row.reference is None else row.reference.value))
     return off / row.tolerance if row.tolerance > 0 else off
 
 
@@ -208,3 +213,46 @@ def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, doubts: D
         f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics differs significantly "
         f"from it.{tail}"
     )
+
+
+def in_short(
+    rows: Sequence[Row], status: Status, findings: Sequence[str], doubts: Doubts = SURE, worth: str = ""
+) -> tuple[str, str, str]:
+    """Return the three lines: whether to use the trajectory in place of reference MD, for what, and why."""
+    good, bad, unknown = _sorted(rows)
+    why = "; ".join(findings[:_MENTIONED_WHY])
+    for_what = f"Right: {_listed(good) or 'nothing that could be tested'}."
+    for_what += f" Wrong: {_listed(bad)}." if bad else ""
+    for_what += f" Not known: {_listed(unknown)}." if unknown else ""
+    ends = f" {worth}" if worth else ""
+    if status == "broken":
+        return "Do not use it.", "For nothing: frames are no molecules, or do not move as one.", f"Why: {why}."
+    if status == "undecided":
+        reason = next(filter(None, reversed(doubts)), "the error bars are wider than what would matter")
+        return "Not known yet whether it can be used.", for_what, f"Why: {reason}.{ends}"
+    if status == "different":
+        waits = f" What is not known waits: {doubts.start}." if doubts.start else ""
+        return "Do not use it for what is wrong in it.", for_what, f"Why: {why}.{waits}{ends}"
+    if status == "close":
+        return "Use it within its tolerances.", for_what, f"Why: {why}, each within its tolerance.{ends}"
+    return "Use it.", for_what, f"Why: nothing measured differs from reference MD by more than chance.{ends}"
+
+
+def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
+    """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
+    good, bad, unknown = [], [], []
+    for group, name in _WHAT.items():
+        words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
+        if not words:
+            continue
+        if any(w in _BAD for w in words):
+            bad.append(name)
+        elif 2 * sum(w in _GOOD for w in words) >= len(words):
+            good.append(name)
+        else:
+            unknown.append(name)
+    return good, bad, unknown
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

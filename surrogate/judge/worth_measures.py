@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from surrogate.judge.measure import distributions, kinetics
 from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS, Bins
-from surrogate.judge.measure.equal_atoms import MOST_HISTOGRAMS, evenly
+from surrogate.judge.measure.probes import MOST_HISTOGRAMS, evenly
 from surrogate.judge.measure.slow_motion import SLOW_KINDS, longest_correlation, tica_features
 from surrogate.judge.measure.statistics import Blocks, Piece, block_length, make_blocks
 from surrogate.judge.measure.structure import Backbone, Features
-from surrogate.judge.rows.metrics import MOST_MAPS
-from surrogate.judge.rows.motion.relaxation_rows import turning
+from surrogate.judge.rows.relaxation_rows import turning
 from surrogate.judge.rows.rows import Options
+from surrogate.judge.rows.torsion_rows import MOST_MAPS
 from surrogate.judge.worth import Measure, Worth, worth_by
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,6 +1,6 @@
-"""An architecture as a value: how its network is built from a record, how it is trained, and which references it suits.
+"""An architecture as a value: its settings, its model, its training, the references it suits; and which there are.
 
-A package offers one by an entry point of the group `surromd.architectures` (`surrogate.models.registry`):
+A package offers one by an entry point of the group `surromd.architectures`:
 
     [project.entry-points."surromd.architectures"]
     my-model = "my_package:MY_MODEL"
@@ -10,35 +10,59 @@ with `MY_MODEL = Architecture("my-model", MyConfig.from_dict, MyModel, my_traine
 
 from __future__ import annotations
 
+import json
+import tomllib
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from systems.errors import InputError, UnknownNameError, first_line, nearest
+from systems.files.schema import built
 
 if TYPE_CHECKING:
-    from surrogate.models.interface import Surrogate
-    from systems.scene import Scene
+    from surrogate.data.references import References, Survey
+    from surrogate.models.propagator import Propagator
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """A summary of the trajectories to train on, made without reading their frames.
+T = TypeVar("T")
 
-    `scenes`: each molecule trained on once; `unseen`: those that appear in the validation alone. `longest`: frames of
-    the longest trajectory of each of `scenes`, `n_frames` all that are trained on. `lag_ps`: time between frames.
-    `velocities`: whether all files carry them. `equilibrium`: whether all were simulated at constant temperature.
+
+def build(cls: type[T], record: dict[str, Any], prefix: str = "") -> T:
+    """Return the settings `cls` of a record. Raises InputError as `systems.files.schema.built` does."""
+    try:
+        return built(cls, record, prefix)
+    except ValueError as error:
+        raise InputError(f"settings: {error}.") from error
+
+
+def toml_text(record: dict[str, Any], table: str = "") -> str:
+    """Return a record as the TOML of `systems.options.read_toml`; keys whose value is None are left out.
+
+    Values are texts, numbers, booleans, and lists and tables of these; tables in lists are written in one line.
     """
+    kept = {key: value for key, value in record.items() if value is not None}
+    lines = [f"{key} = {_inline(value)}" for key, value in kept.items() if not isinstance(value, dict)]
+    text = "".join(f"{line}\n" for line in lines)
+    if table and (lines or not kept):
+        text = f"[{table}]\n{text}"
+    for key, value in kept.items():
+        if isinstance(value, dict):
+            text += ("\n" if text else "") + toml_text(value, f"{table}.{key}" if table else key)
+    return text
 
-    scenes: tuple[Scene, ...]
-    unseen: tuple[Scene, ...]
-    longest: tuple[int, ...]
-    n_frames: int
-    lag_ps: float
-    velocities: bool
-    equilibrium: bool
 
-    @property
-    def one_molecule(self) -> bool:
-        return len(self.scenes) == 1 and not self.unseen
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        pairs = [f"{key} = {_inline(each)}" for key, each in value.items() if each is not None]
+        return "{" + ", ".join(pairs) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_inline(each) for each in value) + "]"
+    # JSON's texts, booleans and finite numbers are TOML's.
+    return json.dumps(value)
 
 
 @dataclass(frozen=True)
@@ -58,12 +82,212 @@ class Architecture:
     """One kind of surrogate, under the name that weights files and `arch` have for it.
 
     `config` builds a configuration from a record (InputError for unknown keys), `model` the network from that.
-    `trainer` imports the training code and returns its `surrogate.training.trainer.Trainer`: rollouts do not call it.
+    `trainer` returns its `Trainer`; rollouts do not call it, so that it may import what only training needs.
     `suits` returns how well the architecture suits references, None where it does not.
     """
 
     name: str
     config: Callable[[dict[str, Any]], Any]
-    model: Callable[[Any], Surrogate]
+    model: Callable[[Any], Propagator]
     trainer: Callable[[], Any]
     suits: Callable[[Survey], Suitability | None] = never
+
+
+# The interface between the verb `train` and an architecture: choices for the references, settings, the training.
+
+# (stage, share of all that is to be done) -> None
+AdvanceFn = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """A request for a training. Times in s and ps; `device` is torch's name.
+
+    `start_from`: weights to go on from. `longest_lag_ps`: every spacing of frames up to this one is to be learned.
+    `model`, `training`: the tables of the configuration file, as far as they are filled in.
+    """
+
+    arch: str
+    out: Path
+    budget_s: float | None = None
+    steps: int | None = None
+    start_from: Path | None = None
+    longest_lag_ps: float | None = None
+    seed: int = 0
+    device: str = "cpu"
+    resume: bool = False
+    model: dict[str, Any] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def with_choices(self, choices: tuple[Choice, ...]) -> TrainingRequest:
+        """Return the request with what was chosen in its tables."""
+        tables = {"model": _copied(self.model), "training": _copied(self.training)}
+        for choice in choices:
+            *path, last = choice.key.split(".")
+            table: dict[str, Any] = tables
+            for name in path:
+                table = table.setdefault(name, {})
+            table[last] = choice.value
+        return replace(self, model=tables["model"], training=tables["training"])
+
+    def settings(self, kind: type[T], asked: dict[str, Any]) -> T:
+        """Return the training's settings `kind`: the table `training` and what was `asked` for on the command line,
+        which the table may not hold as well. Raises InputError for unknown keys."""
+        if twice := sorted(asked.keys() & self.training):
+            raise InputError(f"training.{twice[0]} is set on the command line, not in the configuration file.")
+        return build(kind, {**self.training, **asked}, "training.")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting that was chosen for these references: `key` ('model.graph') in the configuration file, its value, and
+    the reason in a few words."""
+
+    key: str
+    value: Any
+    reason: str
+
+    def line(self) -> str:
+        """Return it for people: 'model.graph = true: 28 molecules, atoms known by their bonds'."""
+        shown = str(self.value).lower() if isinstance(self.value, bool) else self.value
+        return f"{self.key} = {shown}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The configuration of a model and of its training, as they will be used: frozen dataclasses.
+
+    `settled`: names of those of the training that the command line decides (budget, seed, ...), and of those of the
+    model that training finds; neither belongs into a configuration file.
+    """
+
+    model: Any
+    training: Any
+    settled: frozenset[str] = frozenset()
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the tables of the configuration file that gives these settings; what is None is left out."""
+        found = {}
+        for name, value in (("model", self.model), ("training", self.training)):
+            if value is not None:
+                record = value.to_dict() if name == "model" else {f.name: getattr(value, f.name) for f in fields(value)}
+                found[name] = {key: v for key, v in record.items() if key not in self.settled}
+        return found
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A training whose references have been read and found fit: `start(advance)` does it and returns the weights."""
+
+    scene: str
+    start: Callable[[AdvanceFn], Path]
+
+
+class Trainer(ABC):
+    """Trains one architecture. `choose` and `settings` say how, `prepare` reads the frames."""
+
+    # Fitted in one go: takes neither a budget nor settings.
+    fitted: ClassVar[bool] = False
+    # Knows how to go on from weights (`start_from`), and how to learn several spacings of frames (`longest_lag_ps`).
+    goes_on: ClassVar[bool] = False
+    learns_lags: ClassVar[bool] = False
+
+    def check(self, request: TrainingRequest) -> None:
+        """Raise InputError for what was asked for and means nothing here; no reference has been read yet."""
+        if self.fitted:
+            given = {"`budget_s`": request.budget_s, "`steps`": request.steps,
+                     "`config`": request.model or request.training or None}  # fmt: skip
+            _refuse(request.arch, [k for k, v in given.items() if v is not None], "is fitted in one go")
+        elif request.budget_s is None and request.steps is None:
+            raise InputError("say how long to train: `budget_s='30min'` or `steps=10000`.")
+        unknown = []
+        if request.start_from is not None and not self.goes_on:
+            unknown.append("`start_from`")
+        if request.longest_lag_ps is not None and not self.learns_lags:
+            unknown.append("`longest_lag_ps`")
+        _refuse(request.arch, unknown, "does not know it")
+        if request.start_from is not None:
+            if request.longest_lag_ps is not None:
+                raise InputError("`start_from` takes the configuration of its weights; leave `longest_lag_ps` out.")
+            if request.model:
+                raise InputError("`start_from` takes the configuration of its weights; leave [model] of `config` out.")
+
+    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+        """Return the settings that suit the references where they differ from the defaults; those that the request
+        has already stay as they are."""
+        return ()
+
+    @abstractmethod
+    def settings(self, request: TrainingRequest) -> Settings:
+        """Return all settings. Raises InputError for unknown keys and values that do not go together."""
+
+    @abstractmethod
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """Read the frames. Raises InputError where they do not suit the settings."""
+
+
+def _refuse(arch: str, options: list[str], why: str) -> None:
+    if options:
+        raise InputError(f"{', '.join(options)}: {arch} {why}; leave it out.")
+
+
+def _copied(table: dict[str, Any]) -> dict[str, Any]:
+    return {key: _copied(value) if isinstance(value, dict) else value for key, value in table.items()}
+
+
+# The installed architectures: entry points of the group `surromd.architectures`, loaded when they are used.
+
+GROUP = "surromd.architectures"
+
+
+def names() -> list[str]:
+    """Return the names of all installed architectures; none is imported."""
+    return sorted(_found())
+
+
+@cache
+def architecture(name: str) -> Architecture:
+    """Return the architecture of this name.
+
+    Raises UnknownNameError, naming the nearest, and InputError where its package cannot be imported or offers
+    something else under that name.
+    """
+    found = _found().get(name)
+    if found is None:
+        raise UnknownNameError(f"unknown architecture {name!r}; known: {', '.join(names())}.{nearest(name, names())}")
+    try:
+        loaded = found.load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"architecture {name!r} ({found.value}) cannot be loaded: {first_line(error)}.") from error
+    if not isinstance(loaded, Architecture) or loaded.name != name:
+        raise InputError(f"architecture {name!r}: {found.value} is no Architecture of this name; correct its package.")
+    return loaded
+
+
+@cache
+def _found() -> dict[str, EntryPoint]:
+    """Return the entry points by name. Raises InputError where two packages offer different ones under one name."""
+    own = _own()
+    found = {point.name: point for point in own}
+    for point in entry_points(group=GROUP):
+        if own and point.dist is not None and point.dist.name == "surromd":
+            continue  # a source tree's own stand for those of an installed version
+        known = found.setdefault(point.name, point)
+        if known.value != point.value:
+            raise InputError(
+                f"two installed packages offer the architecture {point.name!r} ({known.value} and {point.value}); "
+                "uninstall one."
+            )
+    return found
+
+
+def _own() -> list[EntryPoint]:
+    """Return surromd's own entry points of a source tree, which may be used without being installed."""
+    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    if not project.is_file():
+        return []
+    record = tomllib.loads(project.read_text("utf-8")).get("project", {})
+    if record.get("name") != "surromd":
+        return []
+    declared = record.get("entry-points", {}).get(GROUP, {})
+    return [EntryPoint(name, value, GROUP) for name, value in declared.items()]

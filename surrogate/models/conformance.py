@@ -1,7 +1,7 @@
-"""The contract of `surrogate.models.interface` as tests that any model inherits.
+"""The contracts of `surrogate.models.propagator` and `.potential` as tests that any model inherits.
 
-    class TestMyModel(SurrogateContract):
-        def make(self, n_atoms: int) -> Surrogate: ...
+    class TestMyModel(PropagatorContract):
+        def make(self, n_atoms: int) -> Propagator: ...
 
 pytest runs every `test_` method; each raises AssertionError with what is wrong. A claim that a model does not make
 (`equivariant`, `uses_noise`, ...) is switched off in the subclass, where a reader sees it.
@@ -15,8 +15,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from surrogate.models.interface import Chunk, Molecule, Surrogate, draw_noise
-from surrogate.models.registry import architecture
+from surrogate.models.architecture import architecture
+from surrogate.models.potential import Potential
+from surrogate.models.propagator import Chunk, Molecule, Propagator, draw_noise
 
 # Positions in nm: what float32 arithmetic on coordinates of this size may differ by.
 ROUNDING_NM = 2e-6
@@ -45,7 +46,7 @@ def orthogonal(*, reflect: bool) -> Tensor:
     return q * (torch.sign(torch.linalg.det(q)) * (-1.0 if reflect else 1.0))
 
 
-class SurrogateContract:
+class PropagatorContract:
     """Every test of the contract. `sizes`: atom counts tried; `n_atoms`: that of the other tests."""
 
     sizes: ClassVar[tuple[int, ...]] = (1, 2, 500)
@@ -58,25 +59,25 @@ class SurrogateContract:
     noise_is_vectors: ClassVar[bool] = False
     uses_noise: ClassVar[bool] = True
     uses_frames: ClassVar[bool] = True
+    uses_velocities: ClassVar[bool] = False
     # Largest error under bf16 autocast, as a share of the frames' deviation from the last known one; None: no network.
     bf16_error: ClassVar[float | None] = 0.03
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         """Return a model in evaluation mode whose every path carries signal, able to take `n_atoms` atoms."""
         raise NotImplementedError
 
     def molecule(self, n_atoms: int) -> Molecule:
         return branched_chain(n_atoms)
 
-    def state(self, n_atoms: int, batch: int, model: Surrogate) -> tuple[Tensor, Tensor]:
+    def state(self, n_atoms: int, batch: int, model: Propagator) -> tuple[Tensor, Tensor]:
         return random_state(n_atoms, batch, model.n_conditioning)
 
-    def call(self, model: Surrogate, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
-        given = velocities if model.carries_velocities else None
+    def call(self, model: Propagator, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
         with torch.no_grad():
-            return model.next_chunk(frames, molecule, noise, solver_steps=4, last_velocities_nm_ps=given)
+            return model.next_chunk(frames, molecule, noise, solver_steps=4, last_velocities_nm_ps=velocities)
 
-    def given(self, batch: int = 3) -> tuple[Surrogate, Tensor, Molecule, Tensor, Tensor]:
+    def given(self, batch: int = 3) -> tuple[Propagator, Tensor, Molecule, Tensor, Tensor]:
         model = self.make(self.n_atoms)
         frames, velocities = self.state(self.n_atoms, batch, model)
         noise = draw_noise(model, self.n_atoms, [torch.Generator().manual_seed(s) for s in range(batch)])
@@ -91,7 +92,7 @@ class SurrogateContract:
             assert chunk.frames_nm.shape == (2, model.n_new, n_atoms, 3), f"{n_atoms} atoms: {chunk.frames_nm.shape}"
             assert chunk.frames_nm.dtype == torch.float32, f"frames are {chunk.frames_nm.dtype}"
             assert torch.isfinite(chunk.frames_nm).all(), f"{n_atoms} atoms: frames are not finite"
-            assert (chunk.velocities_nm_ps is not None) == model.carries_velocities
+            assert (chunk.velocities_nm_ps is not None) == self.uses_velocities
             if chunk.velocities_nm_ps is not None:
                 assert chunk.velocities_nm_ps.shape == (2, n_atoms, 3)
                 assert torch.isfinite(chunk.velocities_nm_ps).all()
@@ -123,9 +124,8 @@ class SurrogateContract:
         other_frames = self.call(model, frames.roll(1, 0), molecule, noise, velocities).frames_nm
         assert ((base - other_noise).abs().max() > 1e-5) == self.uses_noise, "noise"
         assert ((base - other_frames).abs().max() > 1e-5) == self.uses_frames, "frames"
-        if model.carries_velocities:
-            other = self.call(model, frames, molecule, noise, velocities.roll(1, 0)).frames_nm
-            assert (base - other).abs().max() > 1e-4, "velocities"
+        other = self.call(model, frames, molecule, noise, velocities.roll(1, 0)).frames_nm
+        assert ((base - other).abs().max() > 1e-4) == self.uses_velocities, "velocities"
 
     def test_turned_and_shifted_frames_give_turned_and_shifted_chunks(self) -> None:
         if not self.equivariant:
@@ -176,3 +176,47 @@ class SurrogateContract:
         again.eval()
         first, second = (self.call(m, frames, molecule, noise, velocities) for m in (model, again))
         assert torch.equal(first.frames_nm, second.frames_nm), "a rebuilt model answers differently"
+
+
+class PotentialContract(PropagatorContract):
+    """What a potential owes beside what any propagator does."""
+
+    uses_velocities = True
+    equivariant = reflects = permutes = noise_is_vectors = True
+    # Always in the precision of its weights, as bf16 would make steps of energies.
+    bf16_error = None
+    # Largest error of a force against the energy's finite differences, as a share of the largest force.
+    force_error: ClassVar[float] = 1e-5
+
+    def potential(self) -> tuple[Potential, Tensor, Molecule]:
+        """Return a potential in double precision, and frames `(3, n_atoms, 3)` nm of a molecule."""
+        model = self.make(self.n_atoms).double()
+        assert isinstance(model, Potential)
+        return model, self.state(self.n_atoms, 3, model)[0][:, -1].double(), self.molecule(self.n_atoms)
+
+    def test_forces_are_the_gradient_of_the_energy(self) -> None:
+        model, x, molecule = self.potential()
+        found = model.evaluate(x, molecule)
+        assert found.members_kj_mol.shape[0] == len(x) and found.energy_kj_mol.dtype == torch.float64
+        torch.testing.assert_close(found.members_kj_mol.mean(-1), found.energy_kj_mol)
+        step, largest = 1e-5, float(found.forces_kj_mol_nm.abs().max())
+        for atom in (0, self.n_atoms - 1):
+            shift = torch.zeros_like(x)
+            shift[:, atom, 1] = step
+            ahead, behind = (model.evaluate(x + sign * shift, molecule).energy_kj_mol for sign in (1.0, -1.0))
+            off = (behind - ahead) / (2.0 * step) - found.forces_kj_mol_nm[:, atom, 1]
+            assert float(off.abs().max()) < self.force_error * largest, f"atom {atom}: forces are no gradient"
+        assert largest > 1.0, "the control feels no force"
+
+    def test_energy_is_a_scalar_and_momentum_and_angular_momentum_are_kept(self) -> None:
+        model, x, molecule = self.potential()
+        found, turn = model.evaluate(x, molecule), orthogonal(reflect=True)
+        moved = model.evaluate(x @ turn.T + torch.tensor([1.0, -2.0, 0.5]), molecule)
+        torch.testing.assert_close(moved.energy_kj_mol, found.energy_kj_mol, rtol=1e-10, atol=1e-8)
+        forces = found.forces_kj_mol_nm
+        torch.testing.assert_close(moved.forces_kj_mol_nm, forces @ turn.T, rtol=1e-8, atol=1e-7)
+        assert forces.sum(1).abs().max() < 1e-8 * forces.abs().max(), "forces have a sum"
+        assert torch.linalg.cross(x, forces).sum(1).abs().max() < 1e-8 * forces.abs().max(), "forces have a torque"
+        # Negative controls: single torques do not vanish; a squeezed molecule has another energy.
+        assert torch.linalg.cross(x, forces).abs().max() > 1e-2 * forces.abs().max()
+        assert (model.evaluate(0.98 * x, molecule).energy_kj_mol - found.energy_kj_mol).abs().min() > 1e-3

@@ -12,20 +12,19 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.descriptions import describe
-from surrogate.models.compiling import with_compiled_parts
-from surrogate.models.interface import Surrogate, draw_noise
-from surrogate.models.lean import with_lean_parts
-from surrogate.models.memory import keep_freed_memory
-from surrogate.models.precision import choose_precision, torch_threads
+from surrogate.data.frames import fitted_atoms
+from surrogate.models.lean import with_compiled_parts, with_lean_parts
+from surrogate.models.potential import Potential
+from surrogate.models.propagator import Propagator, draw_noise
+from surrogate.training.devices import choose_precision, keep_freed_memory, torch_threads
 from systems.chemistry.geometry import superposition
 from systems.errors import InputError, SimulationError
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 FloatArray = npt.NDArray[np.floating[Any]]
-_Model = TypeVar("_Model", bound=Surrogate)
+_Model = TypeVar("_Model", bound=Propagator)
 # Up to as many replicas one thread was faster than two, on a pair of hardware threads: products of few rows are too
 # small to be shared.
 _ROWS_OF_ONE_THREAD = 16
@@ -63,7 +62,7 @@ class ChunkSampler:
             )
         self.solver = solver or (known[0] if known else None)
         self.solver_steps = solver_steps or model.usual_steps
-        self.precision = choose_precision(precision, suits=model.bf16_by_default)
+        self.precision = choose_precision(precision, suits=model.float32_layers is not None)
         self.batch: int | None = None
         # Chunks drawn, each row one, and the network evaluations they took together.
         self.drawn, self.evaluations = 0, 0.0
@@ -71,8 +70,8 @@ class ChunkSampler:
         self._model = with_lean_parts(plain)
         self._compiled = with_compiled_parts(plain) if compile else None
         self._compiled_rows: int | None = None
-        self._molecule = describe(model, template)
-        self._fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+        self._molecule = model.featurise(template)
+        self._fit = fitted_atoms(template)
         self._target = template.positions_nm - template.positions_nm[self._fit].mean(axis=0)
 
     @property
@@ -133,10 +132,10 @@ class ChunkSampler:
         kind = last_frames_nm.dtype
         last = last_frames_nm.astype(np.float64)
         n_atoms = last.shape[2]
-        # One rigid motion per replica, that of its last frame, carried back onto the new frames. A model that needs no
-        # canonical pose gets its orientation all the same: what the noise draws (velocities) turns with the molecule.
+        # One rigid motion per replica, that of its last frame, carried back onto the new frames. A potential needs no
+        # pose, but what the noise draws (velocities) turns with the molecule.
         rotation, translation = superposition(last[:, -1], self._target, idx=self._fit)
-        if not self._model.canonical:
+        if isinstance(self._model, Potential):
             translation = -np.einsum("rij,rj->ri", rotation, last[:, -1].mean(axis=1))
         canonical = np.einsum("rij,rtnj->rtni", rotation, last) + translation[:, None, None, :]
         noise = draw_noise(self._model, n_atoms, [torch.Generator().manual_seed(seed) for seed in seeds])
@@ -174,7 +173,7 @@ def with_bf16_weights(model: _Model) -> _Model:
     """Return a copy whose matrix weights are bf16 already: autocast would round them anew in every evaluation."""
     copied = copy.deepcopy(model)
     for name, module in copied.named_modules():
-        if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers):
+        if isinstance(module, torch.nn.Linear) and not name.startswith(model.float32_layers or ()):
             module.to(torch.bfloat16)
     return copied
 

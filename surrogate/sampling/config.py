@@ -15,7 +15,7 @@ GUARDS = ("off", "flag", "resample", "repair", "fallback")
 @dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
     """One rollout. `save_every_ps` None keeps every model frame. `lag_ps` is the time between these, of weights that
-    were trained for several; None is what `lags.choose_lag` says. `solver` None is the one that suits the weights, else
+    were trained for several; None is what `choose_lag` says. `solver` None is the one that suits the weights, else
     one that its model knows. `precision` 'bf16' is autocast of the network (coordinates and integration stay fp32),
     'auto' is bf16 where the processor multiplies it faster.
 

@@ -2,26 +2,230 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from surrogate.sampling.coverage import Deviation, bond_types, compare_sets, member_of, torsion_environments
-from surrogate.sampling.lags import at_lag, choose_lag
-from surrogate.sampling.peptide_coverage import cover_peptide, unseen_neighbours
-from systems.chemistry.graph import bonded_graph
+from surrogate.data.frames import in_standard_pose
+from surrogate.data.shipped import shipped_weights
+from surrogate.models.architecture import architecture
+from surrogate.models.peptides.chains import FREE_ENDS
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.potential import Potential
+from surrogate.models.weights import load_weights, read_header
+from systems.chemistry.graph import bonded_graph, rotatable_torsions
 from systems.chemistry.matching import match_atoms
-from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names
-from systems.errors import OutOfDomainError
+from systems.chemistry.validity import INVALID, NOT_FINITE, Geometry, check_frames, flag_names, geometry_from_scene
+from systems.errors import InputError, OutOfDomainError
 from systems.scene import Scene
+from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    # Sampling and training know nothing of each other at run time: the api hands the weights over.
-    from surrogate.data.weights import TrainingDomain, Weights
-    from surrogate.models.interface import Surrogate
-    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.potential import Potential
+    from surrogate.models.propagator import Propagator
+from surrogate.models.weights import TrainingDomain, Weights
+
+# Coverage of a scene by a training domain, and the ways in which one leaves it.
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """One way in which a scene leaves the training domain.
+
+    `what`: elements, size, charge, bond types, torsion environments, connectivity, stereo, start or temperature, of an
+    unseen peptide also residues or ends. `reason`: the two sides, in words. `forcible`: whether the model can be run
+    nevertheless.
+    """
+
+    what: str
+    reason: str
+    forcible: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a trajectory's record keeps of it."""
+        return {"what": self.what, "reason": self.reason}
+
+
+def member_of(scene: Scene, domain: TrainingDomain) -> TrainingDomain | None:
+    """Return the domain of the one molecule that a scene is, of all that weights were trained on; None of another.
+
+    Weights for one molecule have one domain, and it is returned whatever the scene.
+    """
+    if not domain.transferable:
+        return domain
+    for member in domain.members:
+        try:
+            match_atoms(scene, member.scene)
+        except OutOfDomainError:
+            continue
+        return replace(member, further=(), transferable=False)
+    return None
+
+
+def compare_sets(
+    what: str, scene: Scene, known: list[Scene], of: Callable[[Scene], set[str]], *, forcible: bool
+) -> list[Deviation]:
+    """Return a deviation that names what `of(scene)` holds and that of no known scene does."""
+    new = sorted(of(scene) - set().union(*(of(one) for one in known)))
+    if not new:
+        return []
+    listed = ", ".join(new[:6]) + (f" and {len(new) - 6} more" if len(new) > 6 else "")
+    return [Deviation(what, f"{listed} not seen in training", forcible=forcible)]
+
+
+def bond_types(scene: Scene) -> set[str]:
+    """Return the kinds of bonds by elements and order: {'C-H', 'C=O', 'C:N', ...}; ~ where no order is given.
+
+    A bond between C, N or O inside an aromatic ring or a delocalised group has the order that its source draws.
+    """
+    symbol = {0.0: "~", 1.0: "-", 1.5: ":", 2.0: "=", 3.0: "#"}
+    kinds = set()
+    for (i, j), order in zip(scene.bonds.tolist(), scene.bond_orders.tolist(), strict=True):
+        a, b = sorted((scene.elements[i], scene.elements[j]))
+        kinds.add(f"{a}{symbol.get(order, '~')}{b}")
+    return kinds
+
+
+def torsion_environments(scene: Scene) -> set[str]:
+    """Return the surroundings of each rotatable bond: the two atoms, each with its other neighbours.
+
+    'C(C,H,N)-C(N,O)' is psi of alanine. Names, order and positions play no part.
+    """
+    near = scene.neighbours()
+
+    def end(atom: int, other: int) -> str:
+        rest = Counter(scene.elements[k] for k in near[atom] if k != other)
+        return f"{scene.elements[atom]}({','.join(sorted(rest.elements()))})"
+
+    return {"-".join(sorted((end(b, c), end(c, b)))) for _, b, c, _ in rotatable_torsions(scene).tolist()}
+
+
+# Peptides that weights by residues cover: any chain of residues that were trained on, whatever its sequence.
+
+_CAPS = ("ACE", "NME", "NH2")
+
+
+def cover_peptide(
+    scene: Scene, domain: TrainingDomain, config: PeptideConfig
+) -> tuple[TrainingDomain, npt.NDArray[np.int64], tuple[Deviation, ...]]:
+    """Return the domain of an unseen peptide, the order of its atoms in the model, and how it leaves the training.
+
+    The molecule is the scene under standard names; a valid frame has the bond lengths and angles that residues of its
+    kinds have on average in the training references. A residue, or an end of a chain, that no training peptide has
+    cannot be forced; more residues than any of them has, and a strained start, can. So can a residue at a free end that
+    none has there, whose side chain the charge turns elsewhere, and more residues between free ends than any has, since
+    what charges do to each other reaches along a chain.
+    """
+    try:
+        standard, order = standard_peptide(scene)
+        chain = chain_features(standard, config)
+    except InputError as error:
+        return domain, np.arange(0), (Deviation("residues", str(error).rstrip("."), forcible=False),)
+    found = []
+    free = any(_free_ends(standard))
+    alike = [member.scene for member in domain.members if any(_free_ends(member.scene)) or not free]
+    most = max((_n_amino_acids(scene) for scene in alike), default=0)
+    if (n := _n_amino_acids(standard)) > most:
+        what = f"{n} amino acids{' with free ends' if free else ''}; trained on up to {most}"
+        found.append(Deviation("size", what, forcible=True))
+    first, last = FREE_ENDS
+    if unborne := [x for x in unseen_neighbours(standard, domain) if x.startswith(first) or x.endswith(last)]:
+        found.append(Deviation("ends", f"free ends that no training peptide has: {', '.join(unborne)}", forcible=True))
+    tokens = chain.code.encode(torch.tensor(standard.positions_nm))
+    turning = torch.zeros(tokens.numel(), dtype=torch.bool)
+    turning[chain.code.turning_at] = turning[chain.code.turning_at + 1] = True
+    usual = chain.code.decode(torch.where(turning, tokens.flatten(), 0.0).reshape(tokens.shape))
+    geometry = geometry_from_scene(standard.with_positions(usual.double().numpy()))
+    flags = int(check_frames(standard.positions_nm, geometry)[0]) & INVALID
+    if flags:
+        reason = f"the starting structure is unlike frames of such residues ({', '.join(flag_names(flags))})"
+        found.append(Deviation("start", reason, forcible=True))
+    conditions = {
+        key: value if all(member.conditions.get(key) == value for member in domain.members) else None
+        for key, value in domain.conditions.items()
+    }
+    own = replace(
+        domain, scene=in_standard_pose(standard), conditions=conditions, geometry=geometry.to_dict(), limits=None,
+        further=(), transferable=False,
+    )  # fmt: skip
+    return own, order, tuple(found)
+
+
+def unseen_neighbours(scene: Scene, domain: TrainingDomain) -> list[str]:
+    """Return the pairs of neighbouring residues of a standard peptide that no training peptide has, as 'LEU-SER', or,
+    where residues bear free ends, 'NH3+-LEU'."""
+    known = {pair for member in domain.members for pair in _pairs(member.scene)}
+    return [f"{a}-{b}" for a, b in dict.fromkeys(_pairs(scene)) if (a, b) not in known]
+
+
+def _pairs(scene: Scene) -> list[tuple[str, str]]:
+    first, last = ([end] * free for end, free in zip(FREE_ENDS, _free_ends(scene), strict=True))
+    return list(pairwise([*first, *scene.residue_names, *last]))
+
+
+def _free_ends(scene: Scene) -> tuple[bool, bool]:
+    """Return whether a chain's first residue bears an end of its own, and whether its last does."""
+    return scene.residue_names[0] not in _CAPS, scene.residue_names[-1] not in _CAPS
+
+
+def _n_amino_acids(scene: Scene) -> int:
+    return sum(name not in _CAPS for name in scene.residue_names)
+
+
+# Lag of a rollout, the time between its frames: the weights' one spacing, or any in the range of their training.
+
+_ROUNDING = 1e-6
+
+
+def choose_lag(weights: Weights, lag_ps: float | None, save_every_ps: float | None) -> float:
+    """Return the lag of a rollout: the one asked for, else the longest that the save interval is a multiple of, so that
+    no frame is computed that nobody keeps; without either the shortest. Weights for one lag have that one.
+
+    Raises InputError for a lag that the weights were not trained for.
+    """
+    domain, name = weights.domain, weights.path.name
+    low, high = domain.lag_ps, domain.longest_lag_ps
+    if not domain.jumps:
+        if lag_ps is not None and not math.isclose(lag_ps, low, rel_tol=_ROUNDING):
+            raise InputError(f"{name} steps {format_time_ps(low)} and takes no other lag; leave `lag_ps` out.")
+        return low
+    if lag_ps is None:
+        if save_every_ps is None:
+            return low
+        lag_ps = save_every_ps / max(1, math.ceil(save_every_ps / high - _ROUNDING))
+    if not low * (1 - _ROUNDING) <= lag_ps <= high * (1 + _ROUNDING):
+        raise InputError(
+            f"{name} was trained for lags of {format_time_ps(low)} to {format_time_ps(high)}, not for "
+            f"{format_time_ps(lag_ps)}; choose `lag_ps`, or `save_every_ps`, inside that range."
+        )
+    return lag_ps
+
+
+def at_lag(weights: Weights, domain: TrainingDomain, lag_ps: float) -> Weights:
+    """Return the weights with a model that steps `lag_ps`, for one molecule's `domain`, with limits of jumps at that
+    lag."""
+    if not domain.jumps:
+        return weights if domain is weights.domain else replace(weights, domain=domain)
+    limits = domain.limits
+    if limits is not None:
+        lags, least, most = np.array(domain.jumps).T
+        after = int(np.clip(np.searchsorted(lags, lag_ps * (1 - _ROUNDING)), 0, len(lags) - 1))
+        # Between two measured lags the wider of their limits.
+        around = slice(after if math.isclose(lags[after], lag_ps, rel_tol=_ROUNDING) else max(after - 1, 0), after + 1)
+        limits = {**limits, "jump_min_nm": float(least[around].min()), "jump_max_nm": float(most[around].max())}
+    return replace(
+        weights, model=weights.model.at_lag(lag_ps), domain=replace(domain, lag_ps=lag_ps, limits=limits, jumps=())
+    )
+
 
 __all__ = [
     "Deviation", "DomainMatch", "bond_types", "find_deviations", "fit_weights", "match_domain",
@@ -53,7 +257,7 @@ class DomainMatch:
 
 
 def find_deviations(
-    scene: Scene, domain: TrainingDomain, *, model: Surrogate | None = None, temperature_k: float | None = None
+    scene: Scene, domain: TrainingDomain, *, model: Propagator | None = None, temperature_k: float | None = None
 ) -> tuple[Deviation, ...]:
     """Return how a scene leaves a training domain, the gravest first; nothing where the weights cover it.
 
@@ -123,8 +327,11 @@ def fit_weights(
 def in_bath(weights: Weights, asked: dict[str, Any]) -> Weights:
     """Return weights that integrate as asked (`RolloutConfig.bath`), where they are a potential; a temperature asked
     of others is compared with theirs (`match_domain`). Raises InputError for anything else asked of these."""
-    if not weights.model.integrates:
-        asked = {name: value for name, value in asked.items() if name != "temperature_k"}
+    if not isinstance(weights.model, Potential):
+        if others := sorted(asked.keys() - {"temperature_k"}):
+            named = ", ".join(f"`{name}`" for name in others)
+            raise InputError(f"{weights.model.arch} learned its bath with its frames; leave {named} out.")
+        return weights
     if not asked:
         return weights
     model, domain = weights.model.in_bath(asked), weights.domain
@@ -142,8 +349,8 @@ def match_scene(scene: Scene, weights: Weights) -> npt.NDArray[np.int64]:
     return match_domain(scene, weights).order
 
 
-def _peptides(model: Surrogate) -> PeptideConfig | None:
-    return model.config if model.knows_chains else None
+def _peptides(model: Propagator) -> PeptideConfig | None:
+    return model.config if isinstance(model, PeptideSlide) else None
 
 
 def _compare(
@@ -223,3 +430,68 @@ def _order_without_stereo(scene: Scene, template: Scene) -> npt.NDArray[np.int64
     )
     image = next(matcher.isomorphisms_iter(), None)
     return None if image is None else np.array([image[k] for k in range(template.n_atoms)], dtype=np.int64)
+
+
+# Choice of the shipped weights that roll a scene, where the user names none.
+
+
+def choose_weights(
+    scene: Scene, *, temperature_k: float | None = None, conditions: Mapping[str, Any] | None = None
+) -> tuple[Weights, str]:
+    """Return the shipped weights that cover a scene, and why these.
+
+    Weights that were trained on the molecule come before those that know molecules like it; those that draw frames
+    before potentials, which take far longer; those that step as far as frames are saved before those for one lag.
+    Headers tell all of this: only those chosen are loaded.
+    `conditions`: force field and solvent that they must have been trained under; all do where nothing is said.
+    Raises OutOfDomainError, which says what the nearest lack, when none covers the scene.
+    """
+    found, refusals, levels = [], [], {}
+    for name, path in shipped_weights().items():
+        header = read_header(path)
+        arch = architecture(header.arch)
+        config = arch.config(header.config)
+        peptides = config if isinstance(config, PeptideConfig) else None
+        try:
+            match = match_known(scene, header.domain, path.name, peptides, temperature_k=temperature_k)
+        except OutOfDomainError as error:
+            refusals.append((not error.forcible, len(error.args[0].split("; ")), name, error))
+            continue
+        try:
+            check_conditions(header.domain.conditions, conditions or {}, path.name)
+        except OutOfDomainError as error:
+            refusals.append((False, 0, name, error))  # nothing else is apart
+            continue
+        is_potential = isinstance(arch.model, type) and issubclass(arch.model, Potential)
+        levels[name] = header.domain.conditions.get("force_field")
+        found.append((not match.seen, is_potential, not header.domain.jumps, name, path))
+    if not found:
+        nearest = min(refusals, key=lambda one: one[:3])[3] if refusals else OutOfDomainError("none are shipped.")
+        raise OutOfDomainError(
+            f"no shipped weights cover {scene.name}, and none are named. The nearest: {nearest}", brief=nearest.brief
+        )
+    unseen, *_, name, path = min(found)
+    others = sorted(other for other, level in levels.items() if other != name and level == levels[name])
+    why = "they cover it without having seen it" if unseen else "they were trained on this molecule"
+    beside = f"; {', '.join(others)} would do, too" if others else ""
+    return load_weights(path), f"weights not named, taken are the shipped {name}: {why}{beside}"
+
+
+def check_conditions(known: Mapping[str, Any], asked: Mapping[str, Any], name: str) -> None:
+    """Raise OutOfDomainError where weights of that name say that they were trained under other conditions."""
+    apart = [f"{key} {known[key]}, not {value}" for key, value in asked.items() if known.get(key) not in (None, value)]
+    if apart:
+        raise OutOfDomainError(f"{name} was trained under other conditions: {', '.join(apart)}")
+
+
+def weights_to_go_on_from(scene: Scene) -> str | None:
+    """Return the name of shipped weights of peptides that know all residues of a scene, so that a training on MD of it
+    may begin with them, whatever keeps them from covering it; None where none do."""
+    for name, path in shipped_weights().items():
+        header = read_header(path)
+        config = architecture(header.arch).config(header.config)
+        if isinstance(config, PeptideConfig):
+            with suppress(OutOfDomainError):
+                match_known(scene, header.domain, path.name, config, force=True)
+                return name
+    return None

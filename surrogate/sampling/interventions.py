@@ -13,22 +13,178 @@ unlucky but wrong: the rollout stops. Under 'flag', which draws once, it stops a
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
-from surrogate.sampling.guards import Flags, Guard, caught, finite
-from surrogate.sampling.openmm.coupling import Coupling
-from surrogate.sampling.openmm.energy_checks import EnergyCheck, MemberSpread
-from surrogate.sampling.rollout_account import DRAWN_AGAIN, MD_AFTER_FAILURE, MD_BETWEEN, REPAIRED, Clock, Tally
-from systems.chemistry.validity import ENERGY, INVALID, JUMP, STILL, UNSURE, flag_names
+from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread
+from systems.chemistry.validity import (
+    ANGLE,
+    DRIFT,
+    ENERGY,
+    INVALID,
+    JUMP,
+    NOT_FINITE,
+    PLANARITY,
+    STILL,
+    UNSURE,
+    Geometry,
+    Limits,
+    check_frames,
+    check_limits,
+    flag_names,
+)
 from systems.errors import SimulationError
 
+if TYPE_CHECKING:
+    from surrogate.models.weights import TrainingDomain
+
+# Guard of a rollout: checks every frame as it is made, before it is written or conditions the next chunk.
+
 FloatArray = npt.NDArray[np.floating[Any]]
+Flags = npt.NDArray[np.uint16]
+
+# Any of these bits, and a frame does not pass.
+CAUGHT = INVALID | ANGLE | PLANARITY | JUMP | DRIFT | ENERGY | STILL | UNSURE
+
+
+class Guard:
+    """The checks of one training domain, with thresholds that its reference set (`systems.chemistry.validity`,
+    `.limits`)."""
+
+    def __init__(self, domain: TrainingDomain) -> None:
+        self._geometry = Geometry.from_dict(domain.geometry)
+        self._limits = None if domain.limits is None else Limits.from_dict(domain.limits)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What is not checked, because the reference changes it or the weights are older than the check."""
+        missing: tuple[str, ...] = ()
+        if self._limits is None:
+            missing = ("angles, flat centres, jumps, stillness and drift: the weights carry no limits",)
+        elif self._limits.jump_min_nm == 0.0:
+            missing = ("stillness: the weights carry no limit of it",)
+        return (*self._geometry.excluded, *missing)
+
+    def check(self, frames_nm: FloatArray, before_nm: FloatArray, *, from_start: bool = False) -> Flags:
+        """Return the flags `(b, n)` of frames `(b, n, n_atoms, 3)` nm that follow `before_nm (b, n_atoms, 3)`.
+
+        `from_start`: the frames before are the user's structure, which need not be one of the ensemble, so that the
+        first step away from it does not count as a jump.
+        """
+        n_rows, n_frames = frames_nm.shape[:2]
+        flat = frames_nm.reshape(-1, *frames_nm.shape[2:])
+        flags = check_frames(flat, self._geometry)
+        if self._limits is not None:
+            previous = np.concatenate([before_nm[:, None], frames_nm[:, :-1]], axis=1).reshape(flat.shape)
+            found = check_limits(flat, self._limits, previous).reshape(n_rows, n_frames)
+            if from_start:
+                found[:, 0] &= ~np.uint16(JUMP | DRIFT)
+            flags |= found.reshape(-1)
+        return flags.reshape(n_rows, n_frames)
+
+
+def caught(flags: Flags) -> npt.NDArray[np.bool_]:
+    """Return which frames do not pass."""
+    found: npt.NDArray[np.bool_] = (flags & np.uint16(CAUGHT)) != 0
+    return found
+
+
+def finite(flags: Flags) -> npt.NDArray[np.bool_]:
+    """Return which frames are finite."""
+    found: npt.NDArray[np.bool_] = (flags & np.uint16(NOT_FINITE)) == 0
+    return found
+
+
+# The account of what a rollout did about its own failures: what stands in the file, and what it cost.
+
+# The column `intervention` of a trajectory: what a frame is, if it is not the surrogate's first draw.
+DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE, MD_BETWEEN = 1, 2, 3, 4
+MARKS = {
+    DRAWN_AGAIN: "drawn again",
+    REPAIRED: "repaired",
+    MD_AFTER_FAILURE: "MD after a failure",
+    MD_BETWEEN: "MD between chunks",
+}
+# What frames of each kind may do to the statistics of a trajectory.
+BIAS = {
+    DRAWN_AGAIN: "states from which the surrogate fails are visited less, and left in other ways than it would leave "
+    "them",
+    REPAIRED: "repaired frames have relaxed bonds and angles, colder than the ensemble's, and later frames follow from "
+    "them",
+    MD_AFTER_FAILURE: "MD stands where the surrogate failed: ensemble and kinetics are a mixture, and each stretch of "
+    "MD starts from a relaxed frame with new velocities and warms up within about 1 ps",
+    MD_BETWEEN: "MD stands between chunks: ensemble and kinetics are a mixture of the two",
+}
+_LOGGED = 200
+
+
+@dataclass
+class Tally:
+    """One replica's account. All numbers are of model frames, whether they are kept in the file or not.
+
+    `chunks` drawn, of which `chunks_caught` held a frame that a guard caught; `frames_caught` and `reasons` count the
+    frames of first draws, `frames` those that an intervention left, `draws` the further draws. `md_in_a_row`: chunks
+    that MD had to finish since the surrogate last got through one. `invalid_in_a_row`: frames of the chunks since the
+    last one that held a valid frame. `log` holds the first 200 interventions.
+    """
+
+    chunks: int = 0
+    chunks_caught: int = 0
+    frames_caught: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, int] = field(default_factory=dict)
+    draws: int = 0
+    md_in_a_row: int = 0
+    invalid_in_a_row: int = 0
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    def note_caught(self, flags: npt.NDArray[np.uint16], first_step: int) -> None:
+        """Enter the caught frames of a first draw, `flags (k,)` each with its bits; `first_step` is the earliest's."""
+        self.chunks_caught += 1
+        self.frames_caught += len(flags)
+        names = Counter(name for bits in flags.tolist() for name in flag_names(bits))
+        for name, count in names.items():
+            self.reasons[name] = self.reasons.get(name, 0) + count
+        if len(self.log) < _LOGGED:
+            self.log.append({"chunk": self.chunks, "step": first_step, "reasons": sorted(names)})
+
+    def note_marks(self, marks: npt.NDArray[np.uint8]) -> None:
+        """Enter what the frames of a finished chunk are, `marks (n,)`."""
+        for mark, name in MARKS.items():
+            count = int((marks == mark).sum())
+            if count:
+                self.frames[name] = self.frames.get(name, 0) + count
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what a trajectory's record keeps of it."""
+        kept = {k: v for k, v in asdict(self).items() if not k.endswith("_in_a_row")}
+        bias = [why for mark, why in BIAS.items() if self.frames.get(MARKS[mark])]
+        return {**kept, "share_of_chunks": self.chunks_caught / max(self.chunks, 1), "bias": bias}
+
+
+@dataclass
+class Clock:
+    """Wall seconds of a whole batch by what they went into: `draw`, `check`, `draw again`, `relax`, `md`, `energy`,
+    `energy limit`."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timed(self, what: str) -> Iterator[None]:
+        """Add the time that the block takes."""
+        started = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[what] = self.seconds.get(what, 0.0) + perf_counter() - started
+
 
 MOST_DRAWS = 8
 _DRAWS_FROM_LAST_VALID = 4
@@ -44,7 +200,7 @@ _WRONG_SHARE = 0.1
 
 @dataclass(eq=False)
 class Chunk:
-    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`account.MARKS`) and, where they were
+    """Frames of all replicas: positions `(b, n, n_atoms, 3)` nm; flags, marks (`MARKS`) and, where they were
     computed, what the energy check found in kJ/mol, `(b, n)`; velocities `(b, n_atoms, 3)` nm/ps at the end, of a model
     that carries them, NaN where they are unknown. `failure`: why the rollout cannot go on, and in which replica."""
 
@@ -56,17 +212,12 @@ class Chunk:
     failure: tuple[int, str] | None = None
 
 
-def none_through(
-    tallies: Sequence[Tally], n_new: int, *, at_end: bool, may_jump: bool = False
-) -> tuple[int, str] | None:
+def none_through(tallies: Sequence[Tally], n_new: int, *, at_end: bool) -> tuple[int, str] | None:
     """Return the worst replica and what is wrong, where a model has drawn no chunk of `n_new` frames that passes.
 
-    None as long as one has passed, or may yet: `at_end` says that no chunk follows. Jumps count unless the model
-    `may_jump`.
+    None as long as one has passed, or may yet: `at_end` says that no chunk follows.
     """
     chunks, frames = sum(t.chunks for t in tallies), sum(t.frames_caught for t in tallies)
-    if may_jump:
-        frames -= sum(t.reasons.get(flag_names(JUMP)[0], 0) for t in tallies)
     if any(t.chunks_caught < t.chunks for t in tallies) or frames <= max(1.0, _WRONG_SHARE * chunks * n_new):
         return None
     if not at_end and tallies[0].chunks < _CHUNKS_TO_PROVE:

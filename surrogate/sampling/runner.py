@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
+from surrogate.models.potential import Potential
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import GUARDS, RolloutConfig
-from surrogate.sampling.domain import fit_weights, in_bath
-from surrogate.sampling.guards import Guard
-from surrogate.sampling.interventions import Chunk, Interventions, none_through
-from surrogate.sampling.openmm.coupling import Coupling
-from surrogate.sampling.openmm.energy_checks import EnergyCheck, MemberSpread, RelaxedEnergy, TruthDifference
-from surrogate.sampling.record import Speed, close_account, new_record, why_stopped
-from surrogate.sampling.rollout_account import Clock, Tally
-from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
-from surrogate.sampling.rollout_plan import Plan, settle_plan
+from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
+from surrogate.sampling.interventions import Chunk, Clock, Guard, Interventions, Tally, none_through
+from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread, RelaxedEnergy, TruthDifference
 from systems.chemistry.validity import INVALID, Geometry, check_frames
-from systems.errors import InputError, SimulationError
-from systems.files.outside import check_disk
+from systems.errors import InputError, SimulationError, first_line
+from systems.files.outside import UNREADABLE, arrays_in, check_disk
+from systems.files.schema import built
 from systems.interrupts import deferred_interrupt
-from systems.scene import Scene, part_of
+from systems.scene import Scene, part_of, select_atoms
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
+    Checkpoint,
     checkpoint_path,
     claimed_outputs,
     new_header,
@@ -40,9 +42,254 @@ from systems.trajectory.checkpoint import (
     writer_at,
 )
 from systems.trajectory.codec import open_trajectory
+from systems.units import format_time_ps, whole_steps
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
+
+# Plan of a rollout: everything that is settled before the first chunk.
+
+# Farther from the origin float32 coordinates are too coarse for a molecule; frames are then written about it.
+_FAR_NM = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a rollout works with, settled before the first chunk."""
+
+    scene: Scene
+    weights: Weights
+    config: RolloutConfig
+    match: DomainMatch
+    kept_atoms: npt.NDArray[np.int64]  # of the scene
+    shift_nm: npt.NDArray[np.float64]  # added to frames when they are written
+    save_every_ps: float
+    stride: int
+    n_frames: int
+    n_between: int
+    settings: dict[str, Any]
+
+    @property
+    def n_steps(self) -> int:
+        return self.n_frames * self.stride
+
+
+def settle_plan(
+    scene: Scene, weights: Weights, match: DomainMatch, config: RolloutConfig, sampler: ChunkSampler, *, n_replicas: int
+) -> Plan:
+    """Turn durations into numbers of frames; `weights` and `match` are what `domain.fit_weights` made of the scene.
+
+    Raises UnitError for intervals that do not divide, InputError for a selection that means no atom.
+    """
+    lag_ps = weights.domain.lag_ps
+    save_every_ps = lag_ps if config.save_every_ps is None else config.save_every_ps
+    stride = whole_steps(save_every_ps, lag_ps, "save interval in the weights' frame spacing")
+    n_frames = whole_steps(config.time_ps, save_every_ps, "rollout length in save intervals")
+    n_between = 0
+    if config.md_between_ps:
+        n_between = whole_steps(config.md_between_ps, lag_ps, "MD between chunks in the weights' frame spacing")
+    kept = np.arange(scene.n_atoms) if config.atoms == "all" else scene.heavy_idx
+    if config.select is not None:
+        kept = np.intersect1d(kept, select_atoms(scene, config.select))
+    if not len(kept):
+        raise InputError(f"the selection leaves no atom of {scene.name} to write.")
+    if config.anneal_ps and not isinstance(weights.model, Potential):
+        raise InputError("`anneal_ps` is for learned potentials; these weights learned frames. Leave it out.")
+    centre = scene.positions_nm.mean(axis=0)
+    settings = {
+        **asdict(config),
+        "solver": sampler.solver,
+        "bf16": sampler.precision.bf16,
+        "weights_hash": weights.hash,
+        "replicas": n_replicas,
+        "start": hashlib.sha256(scene.positions_nm.tobytes()).hexdigest()[:16],
+    }
+    del settings["time_ps"]  # a rollout may be resumed to become longer
+    for key in ("lag_ps", "compile", "friction_per_ps", "timestep_ps", "ensemble", "anneal_ps"):
+        if settings[key] in (None, False):
+            del settings[key]  # as checkpoints of earlier versions have it
+    return Plan(
+        scene=scene,
+        weights=weights,
+        config=config,
+        match=match,
+        kept_atoms=kept,
+        shift_nm=centre if np.abs(centre).max() <= _FAR_NM else np.zeros(3),
+        save_every_ps=save_every_ps,
+        stride=stride,
+        n_frames=n_frames,
+        n_between=n_between,
+        settings=settings,
+    )
+
+
+# Checkpoint of a rollout: written beside its first file after each flush, read by `resume`.
+
+Float32Array = npt.NDArray[np.float32]
+
+
+@dataclass
+class Progress:
+    """Where a rollout stands between two chunks.
+
+    `last_frames (replicas, n_conditioning, n_atoms, 3)` nm, in the model's atom order and the user's pose, relative to
+    where the scene's centre was; `velocities (replicas, n_atoms, 3)` nm/ps of a model that carries them. `steps`: model
+    frames done, kept or not. `batch`: replicas computed at once, if memory has run out before. `drawn`: chunks drawn of
+    all replicas, further draws included, which took `evaluations` of the network together.
+    """
+
+    last_frames: Float32Array
+    velocities: Float32Array | None = None
+    chunks: int = 0
+    steps: int = 0
+    wall_s: float = 0.0
+    batch: int | None = None
+    drawn: int = 0
+    evaluations: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)
+    tallies: list[Tally] = field(default_factory=list)
+
+
+def packed_progress(progress: Progress) -> tuple[dict[str, Any], bytes]:
+    """Return what a checkpoint keeps of a rollout: JSON for its header, and arrays."""
+    arrays: dict[str, Any] = {k: v for k, v in vars(progress).items() if isinstance(v, np.ndarray)}
+    plain = {k: v for k, v in asdict(progress).items() if k not in arrays}
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return plain, buffer.getvalue()
+
+
+def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) -> Progress:
+    """Return where a rollout of these settings stood, or of any (None), by one state in its checkpoint `path`.
+
+    Raises InputError when it cannot be read, or the rollout was started with other settings.
+    """
+    header, blob = state
+    try:
+        arrays = arrays_in(io.BytesIO(blob))
+        known, progress = dict(header["settings"]), built(Progress, {**header["progress"], **arrays}, "progress.")
+    except UNREADABLE as error:
+        raise InputError(
+            f"checkpoint {path} cannot be read ({first_line(error)}); start again with `overwrite=True`."
+        ) from error
+    wanted = known if settings is None else settings
+    for key in {**known, **wanted}:
+        was, now = known.get(key), wanted.get(key)
+        if was != now:
+            raise InputError(f"{path}: this rollout was started with {key} = {was!r}, not {now!r}.")
+    return progress
+
+
+# Record of a rollout: settings, provenance and account in its files, and the lines shown while it runs.
+
+# Options that stand in a part of the record, by its name.
+_ACCOUNTS = {"interventions": ("guard", "energy_every", "md_between_ps"), "selection": ("atoms", "select")}
+
+
+def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int) -> dict[str, Any]:
+    """Return the record that a replica's file begins with."""
+    config, weights = plan.config, plan.weights
+    record = {
+        "kind": "rollout",
+        "model": weights.model.arch,
+        "weights": weights.path.name,
+        "weights_hash": weights.hash,
+        "program": {"torch": torch.__version__},
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "completed": False,
+        "replica": replica,
+        **_asked(config),
+        "save_every_ps": plan.save_every_ps,
+        "lag_ps": weights.domain.lag_ps,
+        "precision": sampler.precision.name,
+        "precision_reason": sampler.precision.reason,
+        "solver": sampler.solver,
+        "chunk_frames": sampler.n_new,
+        **weights.domain.conditions,
+        "interventions": _interventions(plan, Tally(), {}, checks),
+    }
+    if not plan.match.seen:
+        record["unseen_molecule"] = True
+    if plan.match.deviations:
+        record["out_of_domain"] = [deviation.to_dict() for deviation in plan.match.deviations]
+    if len(plan.kept_atoms) < plan.scene.n_atoms:
+        record["selection"] = {**_asked(config, "selection"), "of_atoms": plan.scene.n_atoms}
+    if plan.shift_nm.any() != plan.scene.positions_nm.mean(axis=0).any():
+        record["moved_nm"] = (-plan.scene.positions_nm.mean(axis=0)).tolist()
+    return record
+
+
+def _asked(config: RolloutConfig, account: str = "") -> dict[str, Any]:
+    """Return the options of one account of the record, else all that stand in none. How long it is, its frames say."""
+    options = asdict(config)
+    apart = {"time_ps", *chain(*_ACCOUNTS.values())}
+    return {name: options[name] for name in _ACCOUNTS.get(account) or (name for name in options if name not in apart)}
+
+
+def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: Guard) -> dict[str, Any]:
+    return {
+        **_asked(plan.config, "interventions"),
+        **tally.to_record(),
+        "seconds": {key: round(value, 3) for key, value in seconds.items()},
+        "unchecked": list(checks.unchecked),
+    }
+
+
+def close_account(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSampler,
+                   writers: Sequence[TrajectoryWriter], *, completed: bool) -> None:  # fmt: skip
+    """Enter what was done and what it cost, by now or in all."""
+    for writer, tally in zip(writers, state.tallies, strict=True):
+        done = {"completed": True} if completed else {}
+        account = _interventions(plan, tally, state.seconds, checks)
+        writer.update_record(
+            {"interventions": account, "cost": _cost(plan, state, tally, sampler, len(writers)), **done}
+        )
+
+
+def _cost(plan: Plan, state: Progress, tally: Tally, sampler: ChunkSampler, n_replicas: int) -> dict[str, Any]:
+    """A replica's share of the batch: wall seconds and network evaluations divided by the replicas."""
+    wall_s = max(state.wall_s, 1e-9) / n_replicas
+    n_frames = min(state.steps // plan.stride, plan.n_frames)
+    return {
+        "wall_s": wall_s,
+        "batch_wall_s": state.wall_s,
+        "network_evaluations": round((state.chunks + tally.draws) * sampler.evaluations_per_chunk),
+        "ns_per_day": n_frames * plan.save_every_ps * 1e-3 / wall_s * 86400.0,
+        "guard_share": sum(v for k, v in state.seconds.items() if k != "draw") / max(state.wall_s, 1e-9),
+        "batch": sampler.batch or n_replicas,
+    }
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Speed since this process began: what an interrupted run did before does not count."""
+
+    steps: int
+    since: float
+
+    def describe(self, plan: Plan, state: Progress, n_replicas: int) -> str:
+        """Return '24200 ns/day, 290 frames/s, 3 helped': of all replicas together; chunks that were helped."""
+        elapsed = max(time.monotonic() - self.since, 1e-9)
+        per_s = (state.steps - self.steps) * n_replicas / elapsed
+        helped = sum(tally.chunks_caught for tally in state.tallies)
+        word = "caught" if plan.config.guard in ("off", "flag") else "helped"
+        ns_per_day = per_s * plan.weights.domain.lag_ps * 86.4
+        return f"{ns_per_day:.3g} ns/day, {per_s / plan.stride:.3g} frames/s, {helped} {word}"
+
+
+def why_stopped(plan: Plan, state: Progress, chunk: Chunk, outs: Sequence[Path]) -> str:
+    """Return why a rollout cannot go on, where, and what to do."""
+    assert chunk.failure is not None
+    row, reason = chunk.failure
+    at = f"after {format_time_ps(state.steps * plan.weights.domain.lag_ps)}" if state.steps else "in its first chunk"
+    if plan.config.guard in ("off", "flag"):
+        advice = f"the frames are marked in {outs[row]}. Try `precision='fp32'`, `guard='repair'` or other weights."
+        if plan.config.guard == "flag":
+            advice += " With `guard='off'` nothing stops it."
+    else:
+        advice = f"the frames before are in {outs[row]}. Use other weights, or `surromd reference` for this molecule."
+    return f"replica {row}, {at}: {reason}; {advice}"
+
 
 __all__ = ["GUARDS", "RolloutConfig", "rollout"]
 
@@ -70,8 +317,8 @@ def rollout(
     """Roll a scene forward, one replica per path in `outs`, all in one batch; return the paths.
 
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
-    marked with its chunk, its validity flags (systems.chemistry.validity, systems.chemistry.validity) against the
-    training reference, and what was done about it (column `intervention`, `account.MARKS`); the record's
+    marked with its chunk, its validity flags (systems.chemistry.validity) against the
+    training reference, and what was done about it (column `intervention`, `interventions.MARKS`); the record's
     `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
     replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
     and SIGTERM stop between two chunks, with everything on disk: KeyboardInterrupt. Memory that does not suffice for
@@ -129,7 +376,7 @@ def rollout(
         if config.needs_openmm:
             coupling = Coupling(weights)
             stack.callback(coupling.close)
-        learned = weights.model.integrates
+        learned = isinstance(weights.model, Potential)
         energy: EnergyCheck | None = None
         if config.energy_every and coupling is not None:
             energy = TruthDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
@@ -168,7 +415,7 @@ def rollout(
             state.wall_s = time.monotonic() - started
             if chunk.failure is None and config.guard == "flag":
                 at_end = state.steps + chunk.frames_nm.shape[1] >= plan.n_steps
-                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end, may_jump=weights.model.leaps)
+                chunk.failure = none_through(state.tallies, sampler.n_new, at_end=at_end)
             if chunk.failure is not None:
                 if config.guard in ("off", "flag"):
                     _buffer(plan, state, chunk, buffers)

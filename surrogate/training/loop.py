@@ -1,27 +1,34 @@
-"""One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume."""
+"""One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, exact resume, curves."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import math
+import re
+import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from surrogate.data.tensor_checksums import tensor_checksum
-from surrogate.models.memory import keep_freed_memory
-from surrogate.models.precision import bf16_pays
-from surrogate.training.devices import average_gradients, open_fabric
-from surrogate.training.health import Watch, first_not_finite
-from surrogate.training.muon import Muon
+from surrogate.training.devices import (
+    average_gradients,
+    bf16_pays,
+    is_first_process,
+    keep_freed_memory,
+    open_fabric,
+    wait_for_all,
+)
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.schema import built, parsed
 from systems.files.whole_file import create_whole
@@ -30,11 +37,171 @@ from systems.interrupts import stop_if_asked
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
+
+# Early warnings: a training that is about to diverge says so before its loss is no number any more.
+
+# A gradient this many times the usual one, so often in a row, is a warning.
+FACTOR, IN_A_ROW = 10.0, 3
+_USUAL = 200
+
+
+class Watch:
+    """Compares each step's gradient norm (before clipping) with the median of the last 200 ordinary ones."""
+
+    def __init__(self) -> None:
+        self._norms: deque[float] = deque(maxlen=_USUAL)
+        self._high = 0
+        self.n_warnings = 0
+
+    def see(self, step: int, norm: float) -> str | None:
+        """Return a warning, one for each time that the norm stays high, or None."""
+        usual = statistics.median(self._norms) if len(self._norms) >= 20 else math.inf
+        if norm <= FACTOR * usual:
+            self._norms.append(norm)
+            self._high = 0
+            return None
+        self._high += 1
+        if self._high != IN_A_ROW:
+            return None
+        self.n_warnings += 1
+        return (
+            f"at step {step} the gradient is {norm / usual:.0f} times its median for {IN_A_ROW} steps in a row; if "
+            "this goes on the training will diverge: lower the learning rate."
+        )
+
+
+def first_not_finite(module: nn.Module) -> str:
+    """Name the first parameter whose gradient, or else value, holds something that is no number; '' if none does."""
+
+    def broken(tensor: Tensor | None) -> bool:
+        return tensor is not None and not bool(tensor.isfinite().all())
+
+    named = list(module.named_parameters())
+    for found in ([n for n, p in named if broken(p)], [n for n, p in named if broken(p.grad)]):
+        if found:
+            return found[0]
+    return ""
+
+
+# Muon: momentum of matrices, made orthogonal before it is a step (Jordan et al., kellerjordan.github.io/posts/muon).
+# Potentials learn more by it in the same time (docs/studies/quantum/optimisers.py). torch has one of its own from 2.9
+# on, matrix by matrix; this one takes matrices of one shape together, since those of a small network cost little but
+# calls.
+
+MOMENTUM = 0.95
+# Of the quintic iteration that brings singular values near one.
+_A, _B, _C = 3.4445, -4.7750, 2.0315
+_ITERATIONS = 5
+
+
+def orthogonalised(matrices: Tensor) -> Tensor:
+    """Matrices `(k, n, m)` -> of each about U V^T of its singular value decomposition U S V^T: singular values come out
+    near one, the smallest of them below."""
+    x = matrices / (matrices.norm(dim=(1, 2), keepdim=True) + 1e-12)
+    tall = x.shape[1] > x.shape[2]
+    if tall:
+        x = x.mT
+    for _ in range(_ITERATIONS):
+        a = x @ x.mT
+        x = torch.baddbmm(x, torch.baddbmm(a, a, a, beta=_B, alpha=_C), x, beta=_A)
+    return x.mT if tall else x
+
+
+class Muon(torch.optim.Optimizer):
+    """Steps of `lr` times the orthogonalised momentum of each matrix, times the root of rows over columns where there
+    are more rows; `weight_decay` as AdamW's."""
+
+    def __init__(self, params: Iterable[nn.Parameter], lr: float, weight_decay: float = 0.0) -> None:
+        super().__init__(params, {"lr": lr, "weight_decay": weight_decay})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        """Take a step; there is no closure."""
+        assert closure is None
+        for group in self.param_groups:
+            alike: dict[Any, list[nn.Parameter]] = defaultdict(list)
+            for p in group["params"]:
+                if p.grad is not None:
+                    alike[p.shape].append(p)
+            for shape, matrices in alike.items():
+                grads = [p.grad for p in matrices if p.grad is not None]
+                momenta = [self._momentum(p) for p in matrices]
+                torch._foreach_lerp_(momenta, grads, 1.0 - MOMENTUM)
+                way = orthogonalised(torch.stack(torch._foreach_lerp(grads, momenta, MOMENTUM)))
+                weights: list[Tensor] = list(matrices)
+                torch._foreach_mul_(weights, 1.0 - group["lr"] * group["weight_decay"])
+                longer = max(1.0, shape[0] / shape[1]) ** 0.5
+                torch._foreach_add_(weights, list(way.unbind()), alpha=-group["lr"] * longer)
+
+    def _momentum(self, p: nn.Parameter) -> Tensor:
+        state = self.state[p]
+        if not state:
+            state["momentum"] = torch.zeros_like(p)
+        momentum: Tensor = state["momentum"]
+        return momentum
+
+
+# The curves of a training as a picture: NAME.svg beside the CSV that the loop writes.
+
+Rows = list[dict[str, str]]
+
+
+def read_curves(path: Path) -> dict[str, Rows]:
+    """Return the rows of a training's CSV by stage, in the order of the training."""
+    stages: dict[str, Rows] = {}
+    with path.open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            stages.setdefault(row["stage"], []).append(row)
+    return stages
+
+
+def series(rows: Rows, column: str) -> tuple[list[float], list[float]]:
+    """Return the steps and values of one column, where it has any."""
+    kept = [row for row in rows if row.get(column)]
+    return [float(row["step"]) for row in kept], [float(row[column]) for row in kept]
+
+
+def plot_curves(path: Path) -> Path:
+    """Draw one panel per stage, errors in training (broken) and validation (full) over steps; return the .svg."""
+    from matplotlib.figure import Figure
+
+    stages = read_curves(path)
+    figure = Figure(figsize=(5.5 * max(1, len(stages)), 4.0), layout="constrained")
+    for panel, (stage, rows) in zip(figure.subplots(1, len(stages), squeeze=False)[0], stages.items(), strict=True):
+        for column in [c for c in rows[0] if c.startswith(("train_", "validation_"))]:
+            steps, values = series(rows, column)
+            if steps and min(values) > 0.0:
+                held = column.startswith("validation_")
+                panel.plot(steps, values, "-" if held else "--", marker=".", label=column.replace("_", " "))
+        panel.set(title=stage, xlabel="step", ylabel="error or gradient norm", yscale="log")
+        if panel.has_data():
+            panel.legend(fontsize="x-small")
+    out = path.with_suffix(".svg")
+    create_whole(out, lambda temporary: figure.savefig(temporary, format="svg"))
+    return out
+
+
+# The checksum that files of tensors state: what the disk or a copy has changed is noticed when they are read.
+
+
+def tensor_checksum(text: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    """Return the SHA-256 of a file's record and of its tensors with their names, types and shapes, in hexadecimal."""
+    found = hashlib.sha256(text.encode())
+    for name, tensor in sorted(tensors.items()):
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        found.update(tensor.contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+# One optimisation loop for every stage: budget in time or steps, warm-up and cosine, EMA, clipping, exact resume.
+
 # Seeds of one training's processes lie further apart than those of its stages.
 SEEDS_APART = 1_000_003
 # Matrices with fewer rows or columns are no business of Muon's.
 LEAST_MATRIX = 8
 
+# generator of a batch's random numbers -> loss, and its parts by name
+LossFn = Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]]
 # (stage, share of the budget done, latest metrics) -> None
 ProgressFn = Callable[[str, float, dict[str, float]], None]
 
@@ -123,7 +290,7 @@ class StagePlace:
 def run_stage(
     module: nn.Module,
     config: StageConfig,
-    loss_fn: Callable[[torch.Generator], tuple[Tensor, dict[str, Tensor]]],
+    loss_fn: LossFn,
     validate_fn: Callable[[], dict[str, float]],
     place: StagePlace,
     *,
@@ -210,6 +377,60 @@ def run_stage(
             progress(config.name, config.share_done(step, spent_s), {})
     ema.copy_to(module)
     return spent_s
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage of a training: the `module` that it trains, and `config`, `loss` and `validate` as `run_stage` takes
+    them. `saves`: weights are written at each validation, not after the last stage alone."""
+
+    module: nn.Module
+    config: StageConfig
+    loss: LossFn
+    validate: Callable[[], dict[str, float]]
+    saves: bool = True
+
+
+def train_stages(
+    stages: Iterable[Stage],
+    out: Path,
+    write: Callable[[list[float]], None],
+    *,
+    device: torch.device,
+    resume: bool = False,
+    progress: ProgressFn | None = None,
+) -> None:
+    """Train stage after stage and write the weights `out`; beside them stand a CSV of the curves and, until all is
+    done, the state of each stage (NAME.STAGE.train.safetensors), from which `resume` goes on.
+
+    The next stage is asked for when one has ended, so that a generator may prepare it from what that has learned, and
+    do what is left to do after the last. `write(spent_s)` writes the weights, given the seconds of training of each
+    stage so far. Of several processes the first alone writes. Raises SimulationError when a loss stops being finite.
+    """
+    log, spent_s = out.with_suffix(".csv"), list[float]()
+    own = re.compile(re.escape(out.stem) + r"\.[^.]+\.train\.safetensors")
+
+    def forget(*more: Path) -> None:
+        if is_first_process():
+            for path in (*more, *(path for path in out.parent.iterdir() if own.fullmatch(path.name))):
+                path.unlink(missing_ok=True)
+
+    if not resume:
+        forget(log)
+    for stage in stages:
+        save = partial(_write_with, write, list(spent_s)) if stage.saves else None
+        place = StagePlace(out.with_name(f"{out.stem}.{stage.config.name}.train.safetensors"), log, device, resume)
+        spent_s.append(
+            run_stage(stage.module, stage.config, stage.loss, stage.validate, place, progress=progress, on_save=save)
+        )
+    if is_first_process():
+        write(spent_s)
+    forget()
+    wait_for_all()
+
+
+def _write_with(write: Callable[[list[float]], None], before_s: list[float], spent_s: float) -> None:
+    write([*before_s, spent_s])
 
 
 def optimisers_of(module: nn.Module, config: StageConfig) -> list[torch.optim.Optimizer]:

@@ -58,7 +58,7 @@ def _run(folder: Path) -> dict[str, Any] | None:
 
 
 def _coverage(path: Path, scene: str) -> dict[str, Any]:
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import match_domain
     from systems.library.named_scenes import prepare
 
@@ -198,7 +198,7 @@ def _windows(path: Path) -> dict[str, Any]:
 
 
 def _weights(path: Path) -> dict[str, Any]:
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     weights = load_weights(path)
     n_parameters = sum(p.numel() for p in weights.model.parameters())

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surrogate.models.registry import architecture
+from surrogate.models.architecture import architecture
 from surrogate.verbs.options import TrainOptions, Trajectories
 from surrogate.verbs.scene_listing import prepare_scene
 from surrogate.verbs.telling import tell
@@ -16,7 +16,7 @@ from systems.options import Preparation
 from systems.scene import Scene
 
 if TYPE_CHECKING:
-    from surrogate.training.trainer import TrainingRequest
+    from surrogate.models.architecture import TrainingRequest
 
 POTENTIAL = "painet-potential"
 

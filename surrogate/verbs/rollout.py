@@ -53,13 +53,13 @@ def rollout(
     file = None if weights is None else weights_path(weights)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
 
-    from surrogate.data.weights import load_weights
-    from surrogate.sampling.lags import choose_lag
+    from surrogate.models.weights import load_weights
+    from surrogate.sampling.domain import choose_lag
     from surrogate.sampling.runner import rollout as roll
 
     config = part_of(options, RolloutConfig)
     if file is None:
-        from surrogate.sampling.choice import choose_weights
+        from surrogate.sampling.domain import choose_weights
 
         loaded, why = choose_weights(molecule, temperature_k=config.temperature_k)
         if not options.quiet:

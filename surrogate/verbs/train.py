@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from surrogate.data.shipped import weights_path
-from surrogate.models.registry import architecture, names
+from surrogate.models.architecture import architecture, names
 from surrogate.progress import progress_bar
 from surrogate.verbs.learn_molecule import learn_molecule
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
@@ -21,7 +21,7 @@ from systems.options import takes
 
 if TYPE_CHECKING:
     from surrogate.data.references import References
-    from surrogate.training.trainer import Choice, Trainer, TrainingRequest
+    from surrogate.models.architecture import Choice, Trainer, TrainingRequest
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     Architecture and settings that are not given are chosen to suit the references, and each choice is said with its
     reason (`explain_training` returns them all); one molecule at one spacing of frames gets lam-slide as it is.
 
-    `arch`: an installed architecture (`surrogate.models.registry.names`): lam-slide; lam-slide-peptides; painet or its
+    `arch`: an installed architecture (`models.architecture.names`): lam-slide; lam-slide-peptides; painet or its
     decoder alone, egnn, which learn from velocities (a reference made with `save_velocities=True` and natural hydrogen
     masses); or a baseline that is fitted in one go: frozen, constant-velocity, resampling, normal-modes, msm. The
     others end after `budget_s` seconds of training or `steps` optimiser steps over all stages, whichever is given.
@@ -114,7 +114,7 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
     Given as `config` of `train` it gives the same training. What was chosen stands at its head, with the reasons.
     Budget, seed and device belong to the command and are left out. Raises InputError, TrajectoryError.
     """
-    from surrogate.models.settings import toml_text
+    from surrogate.models.architecture import toml_text
 
     plan = _plan(references, options.validation, _asked(options, Path("explained.safetensors")), explained=True)
     head = "".join(f"# {line}\n" for line in plan.lines())
@@ -126,12 +126,12 @@ def explain_training(references: Trajectories, options: TrainOptions) -> str:
 
 def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     """Return the request; `arch` is empty where nothing names one. Raises InputError for an unknown one."""
-    from surrogate.training.trainer import TrainingRequest
+    from surrogate.models.architecture import TrainingRequest
 
     start, arch = options.start_from, options.arch
     file = None if start is None else weights_path(start)
     if arch is None and file is not None:
-        from surrogate.data.weights import read_header
+        from surrogate.models.weights import read_header
 
         arch = read_header(file).arch
     if arch is not None:
@@ -150,6 +150,14 @@ def _asked(options: TrainOptions, out: Path) -> TrainingRequest:
     )
 
 
+def _check_start(request: TrainingRequest) -> None:
+    """Raise InputError for weights to go on from that are of another architecture."""
+    from surrogate.models.weights import read_header
+
+    if request.start_from is not None and (found := read_header(request.start_from).arch) != request.arch:
+        raise InputError(f"{request.start_from} holds {found}, not {request.arch}.")
+
+
 def _trainer(name: str) -> Trainer:
     trainer: Trainer = architecture(name).trainer()
     return trainer
@@ -166,6 +174,8 @@ def _plan(references: Trajectories, validation: Trajectories | None, asked: Trai
     """Find the references and choose what is not asked for."""
     from surrogate.data.references import References
 
+    if asked.arch:
+        _check_start(asked)
     paths = find_trajectories(references, verify=True)
     held = [] if validation is None else find_trajectories(validation, verify=True)
     found = References(tuple(paths), tuple(held), spool=asked.out.parent)
@@ -211,7 +221,7 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
     """Draw the curves and try the weights; say what they are good for."""
     curves = written.with_suffix(".csv")
     if curves.exists():
-        from surrogate.training.loss_curves import plot_curves
+        from surrogate.training.loop import plot_curves
 
         plot_curves(curves)
     if fitted:

@@ -15,8 +15,8 @@ from systems.files.whole_file import create_whole
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import TrainingDomain, Weights
-    from surrogate.models.painet.potential.model import PainetPotential
+    from surrogate.models.potential import Potential
+    from surrogate.models.weights import TrainingDomain, Weights
     from systems.scene import Scene
 
 # Frames that pass the guards, in per cent: from the first on the weights can be rolled as they are, from the second on
@@ -77,8 +77,8 @@ def judge_training(path: Path) -> TrainingVerdict:
 
     Draws each chunk once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError.
     """
-    from surrogate.data.weights import load_weights
-    from surrogate.training.loss_curves import read_curves, series
+    from surrogate.models.weights import load_weights
+    from surrogate.training.loop import read_curves, series
 
     weights = load_weights(path)
     rolled = _roll(weights)
@@ -103,12 +103,12 @@ def judge_training(path: Path) -> TrainingVerdict:
     )
 
 
-def trial_s(model: PainetPotential, scene: Scene) -> float:
+def trial_s(model: Potential, scene: Scene) -> float:
     """Return about how many seconds the rollout of `judge_training` takes with a potential of a scene, by timing its
     forces."""
     import torch
 
-    from surrogate.models.interface import Molecule
+    from surrogate.models.propagator import Molecule
 
     molecule = Molecule.of(scene)
     frames = torch.tensor(scene.positions_nm)[None].expand(_REPLICAS, -1, -1)
@@ -180,7 +180,7 @@ def _roll(weights: Weights) -> _Rolled:
 def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
     import numpy as np
 
-    from surrogate.sampling.guards import caught
+    from surrogate.sampling.interventions import caught
     from systems.chemistry.validity import flag_names
     from systems.trajectory.codec import open_trajectory
 
@@ -198,11 +198,11 @@ def _count(found: _Rolled, path: Path, domain: TrainingDomain) -> None:
 
 def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _Rolled) -> list[str]:
     """Return what would help, what is likeliest first."""
-    from surrogate.training.loss_curves import series
+    from surrogate.training.loop import series
 
     found = _nearer_weights(weights)
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
-    if weights.model.integrates:
+    if isinstance(weights.model, Potential):
         n_frames = 0  # it learned from states, which need be no MD
     rows = list(stages.values())[-1] if stages else []
     column = next((c for c in (rows[-1] if rows else {}) if c.startswith("validation_")), "")
@@ -222,7 +222,7 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
 def _nearer_weights(weights: Weights) -> list[str]:
     """Name shipped weights that know this molecule, or molecules like it, under the same conditions."""
     from surrogate.data.shipped import shipped_weights
-    from surrogate.data.weights import read_header
+    from surrogate.models.weights import read_header
     from surrogate.sampling.domain import find_deviations
 
     if "from" in weights.provenance:

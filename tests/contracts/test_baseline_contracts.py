@@ -9,18 +9,19 @@ import pytest
 import torch
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.weights import load_weights
-from surrogate.models.baselines.model import (
+from surrogate.models.baselines import (
     BaselineConfig,
     ConstantVelocity,
     FrozenFrame,
     MarkovStateModel,
     NormalModes,
     TrainingFrameResampling,
+    autoregression,
+    fit_baseline,
 )
-from surrogate.models.baselines.trainer import autoregression, fit_baseline
-from surrogate.models.conformance import SurrogateContract
-from surrogate.models.interface import Molecule, Surrogate
+from surrogate.models.conformance import PropagatorContract
+from surrogate.models.propagator import Molecule, Propagator
+from surrogate.models.weights import load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene
@@ -31,44 +32,44 @@ def normal(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 
 
-class TestFrozenFrame(SurrogateContract):
+class TestFrozenFrame(PropagatorContract):
     equivariant = reflects = permutes = True
     uses_noise = False
     bf16_error = None
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return FrozenFrame(BaselineConfig(n_new=4))
 
 
 class TestConstantVelocity(TestFrozenFrame):
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return ConstantVelocity(BaselineConfig(n_new=4))
 
 
-class TestResampling(SurrogateContract):
+class TestResampling(PropagatorContract):
     uses_frames = False
     bf16_error = None
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         model = TrainingFrameResampling(BaselineConfig(4, n_atoms, n_frames=50))
         model.frames_nm.copy_(normal(50, n_atoms, 3))
         return model
 
 
-class TestNormalModes(SurrogateContract):
+class TestNormalModes(PropagatorContract):
     bf16_error = None
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         model = NormalModes(BaselineConfig(4, n_atoms, n_modes=min(5, 3 * n_atoms)))
         model.modes.copy_(torch.linalg.qr(normal(3 * n_atoms, model.config.n_modes))[0].T)
         model.coefficients.copy_(torch.tensor([[1.2], [-0.6], [0.1]]))
         return model
 
 
-class TestMarkovStateModel(SurrogateContract):
+class TestMarkovStateModel(PropagatorContract):
     bf16_error = None
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         model = MarkovStateModel(BaselineConfig(4, n_atoms, n_frames=6, n_states=3))
         model.centres_nm.copy_(normal(3, n_atoms, 3) * 0.1)
         model.frames_nm.copy_(normal(6, n_atoms, 3))
@@ -148,7 +149,7 @@ def test_resampled_and_markov_frames_are_training_frames(tmp_path: Path, harmoni
 def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(alanine_dipeptide: Scene) -> None:
     """Two structures, hopping with probability 0.05 and 0.15 per frame: three quarters of the time in the first."""
     from surrogate.data.frames import canonicalise, quantise
-    from surrogate.models.baselines.trainer import fit_markov_state_model
+    from surrogate.models.baselines import fit_markov_state_model
 
     rng = np.random.default_rng(3)
     state = np.zeros(6000, dtype=int)
@@ -167,3 +168,11 @@ def test_a_markov_state_model_has_the_populations_and_the_rate_of_its_reference(
     assert (which == 0).mean() == pytest.approx((state == 0).mean(), abs=0.04)
     hops = (which[:, 1:] != which[:, :-1]).mean()
     assert hops == pytest.approx((state[1:] != state[:-1]).mean(), rel=0.15)
+
+
+@pytest.mark.parametrize(("arch", "at_random"), [("resampling", True), ("msm", True), ("normal-modes", False)])
+def test_frames_drawn_at_random_have_no_limit_of_jumps(
+    tmp_path: Path, harmonic_frames: TrainingFrames, arch: str, at_random: bool
+) -> None:
+    limits = load_weights(fit_baseline(arch, harmonic_frames, tmp_path / "w.safetensors")).domain.limits
+    assert limits is not None and (len(limits["jump_idx"]) == 0) == at_random

@@ -16,10 +16,11 @@ import pytest
 import torch
 
 from command_line import run
-from surrogate.data.descriptions import describe
-from surrogate.models import registry
-from surrogate.models.conformance import SurrogateContract
-from surrogate.models.interface import Surrogate
+from surrogate.models import architecture as registry
+from surrogate.models.conformance import PotentialContract, PropagatorContract
+from surrogate.models.propagator import Propagator
+from surrogate.models.weights import load_weights
+from surrogate.sampling.chunks import ChunkSampler
 from systems.errors import InputError, UnknownNameError
 from systems.library.named_scenes import load
 from systems.trajectory.codec import open_trajectory, open_writer
@@ -48,10 +49,11 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         forget()
         yield
     forget()
-    sys.modules.pop("random_walk", None)
+    for name in ("random_walk", "springs"):
+        sys.modules.pop(name, None)
 
 
-class TestRandomWalk(SurrogateContract):
+class TestRandomWalk(PropagatorContract):
     equivariant = True
     reflects = True
     permutes = True
@@ -59,12 +61,40 @@ class TestRandomWalk(SurrogateContract):
     # There is no network whose products bf16 would round.
     bf16_error = None
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         toy = importlib.import_module("random_walk")
         model = toy.RandomWalk(toy.WalkConfig(n_new=3))
         with torch.no_grad():
             model.log_step.copy_(torch.linspace(-5.0, -3.0, 119))
         return model.eval().requires_grad_(False)
+
+
+class TestSprings(PotentialContract):
+    def make(self, n_atoms: int) -> Propagator:
+        toy = importlib.import_module("springs")
+        return toy.Springs(toy.SpringConfig(n_bonds=n_atoms - 1, n_new=2, lag_ps=0.002, timestep_ps=0.0005,
+                                            hydrogen_mass_da=None)).eval()  # fmt: skip
+
+
+def test_springs_are_fitted_and_rolled_by_name(tmp_path: Path) -> None:
+    scene, rng = load("alanine-dipeptide"), np.random.default_rng(0)
+    reference, weights, out = (tmp_path / name for name in ("ref.h5", "w.safetensors", "roll.h5"))
+    with open_writer(reference, scene, {"temperature_k": 300.0}) as writer:
+        noise = rng.normal(scale=0.002, size=(400, scene.n_atoms, 3))
+        writer.append(scene.positions_nm + noise, 0.05 * np.arange(1.0, 401.0))
+    fitted = run("train", str(reference), "--arch", "springs", "-o", str(weights))
+    assert fitted.exit_code == 0, fitted.stderr
+    rolled = run("rollout", "alanine-dipeptide", "--weights", str(weights), "--time", "500fs", "--guard", "off", "-o",
+                 str(out), "-q")  # fmt: skip
+    assert rolled.exit_code == 0, rolled.stderr
+    first, second = scene.bonds.T
+    lengths = lambda x: np.linalg.norm(x[:, first] - x[:, second], axis=-1)  # noqa: E731
+    with open_trajectory(out) as reader:
+        x = reader.read()
+    off = lengths(x) - lengths(scene.positions_nm[None])
+    assert reader.n_frames == 10 and 0.001 < off.std() < 0.006, "about as wide as the reference, 0.0028 nm"
+    with pytest.raises(InputError, match="bf16 would round"):
+        ChunkSampler(load_weights(weights), precision="bf16")
 
 
 def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
@@ -96,7 +126,7 @@ def test_it_is_trained_rolled_and_described_by_name(tmp_path: Path) -> None:
 
 def test_what_it_makes_of_a_scene_reaches_its_network() -> None:
     scene, model = load("alanine-dipeptide"), TestRandomWalk().make(22)
-    told = describe(model, scene).to(torch.device("cpu"))
+    told = model.featurise(scene).to(torch.device("cpu"))
     assert told.own.tolist() == np.bincount(scene.bonds.ravel()).tolist()
     noise = torch.ones(1, 22, 3, 3)
     step = model.next_chunk(torch.zeros(1, 1, 22, 3), told, noise).frames_nm[0, 0, :, 0]

@@ -1,4 +1,4 @@
-"""The contract of surrogate.models.interface, held against LaM-SLidE with weights that do something."""
+"""The contract of surrogate.models.propagator, held against LaM-SLidE with weights that do something."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.weights import Weights, load_weights, save_weights
-from surrogate.models.conformance import SurrogateContract, branched_chain, random_state
-from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.conformance import PropagatorContract, branched_chain, random_state
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -44,37 +44,37 @@ def small_model(n_latents: int = 1, *, precondition: bool = True, interpolant: s
     return model.eval().requires_grad_(False)
 
 
-class TestLamSlide(SurrogateContract):
-    def make(self, n_atoms: int) -> Surrogate:
+class TestLamSlide(PropagatorContract):
+    def make(self, n_atoms: int) -> Propagator:
         return small_model(3)
 
 
-class TestLamSlideOneLatent(SurrogateContract):
-    def make(self, n_atoms: int) -> Surrogate:
+class TestLamSlideOneLatent(PropagatorContract):
+    def make(self, n_atoms: int) -> Propagator:
         return small_model(1, precondition=False)
 
 
-class TestLamSlideGvp(SurrogateContract):
-    def make(self, n_atoms: int) -> Surrogate:
+class TestLamSlideGvp(PropagatorContract):
+    def make(self, n_atoms: int) -> Propagator:
         return small_model(3, interpolant="gvp")
 
 
-class TestLamSlideCleanConditioning(SurrogateContract):
-    def make(self, n_atoms: int) -> Surrogate:
+class TestLamSlideCleanConditioning(PropagatorContract):
+    def make(self, n_atoms: int) -> Propagator:
         return small_model(3, n_conditioning=3, clean=True)
 
 
-class TestLamSlideAdaptive(SurrogateContract):
+class TestLamSlideAdaptive(PropagatorContract):
     """With dopri5: rows do not depend on each other's steps."""
 
     # Steps are chosen anew in bf16: held to the error of the whole chain, not of one evaluation.
     bf16_error = 0.1
     sizes = (1, 2)
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return small_model(3)
 
-    def call(self, model: Surrogate, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
+    def call(self, model: Propagator, frames: Tensor, molecule: Molecule, noise: Tensor, velocities: Tensor) -> Chunk:
         with torch.no_grad():
             return model.next_chunk(frames, molecule, noise, solver_steps=1, solver="dopri5")
 

@@ -5,19 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 
 from known_answers import largest_step, pair_energy
-from surrogate.models import compiling
-from surrogate.models.atom_features import features_of_graph
-from surrogate.models.conformance import SurrogateContract, branched_chain, random_state
-from surrogate.models.graphs import BOND, SECOND_NEIGHBOUR, molecular_graph
-from surrogate.models.interface import Molecule, Surrogate
+from surrogate.models import lean
+from surrogate.models.conformance import PropagatorContract, branched_chain, random_state
 from surrogate.models.painet.attention import dense_mean, linear_mean
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import EgnnForecaster, Painet
+from surrogate.models.painet.decoders import BOND, SECOND_NEIGHBOUR, molecular_graph
+from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig
+from surrogate.models.propagator import Molecule, Propagator
 
 SMALL = PainetConfig(n_new=3, width=24, n_heads=2, head_dim=8, n_decoder_layers=2)
 
@@ -37,20 +34,20 @@ def lively(config: PainetConfig, kind: type[Painet] = Painet) -> Painet:
     return model.eval().requires_grad_(False)
 
 
-class TestPainet(SurrogateContract):
-    equivariant = reflects = permutes = noise_is_vectors = True
+class TestPainet(PropagatorContract):
+    equivariant = reflects = permutes = noise_is_vectors = uses_velocities = True
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(SMALL)
 
 
 class TestPainetDense(TestPainet):
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(replace(SMALL, attention="dense"))
 
 
 class TestEgnnAlone(TestPainet):
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(SMALL, EgnnForecaster)
 
 
@@ -60,26 +57,23 @@ class TestPainetWithModes(TestPainet):
     reflects = False
     sizes = (1, 2, 40)
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(replace(SMALL, n_modes=6, free_rotation=True))
 
     def molecule(self, n_atoms: int) -> Molecule:
         molecule = branched_chain(n_atoms)
-        place = random_state(n_atoms, 1, 1, seed=8)[0][0, 0].numpy()
-        bonds, none = molecule.bonds.numpy(), np.zeros(n_atoms)
-        features = features_of_graph(n_atoms, bonds, np.ones(len(bonds)), bonds[:0], none, none, place)
-        return replace(molecule, atoms=features)
+        return replace(molecule, own=random_state(n_atoms, 1, 1, seed=8)[0][0, 0])
 
 
 class TestPainetWithFreeRotation(TestPainet):
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(replace(SMALL, free_rotation=True))
 
 
 class TestPainetAllPairs(TestPainet):
     sizes = (1, 2, 40)
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(replace(SMALL, edges="all"))
 
 
@@ -89,17 +83,17 @@ LEAPFROG = replace(SMALL, decoder="leapfrog", edges="all", n_radial=6, n_scalars
 class TestPainetLeapfrog(TestPainet):
     sizes = (1, 2, 40)
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return lively(LEAPFROG)
 
 
 @pytest.mark.parametrize("kind", [TestPainet, TestPainetWithModes, TestPainetLeapfrog])
 def test_a_compiled_model_answers_alike(kind: type[TestPainet], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling.torch, "compile", partial(torch.compile, backend="eager"))
+    monkeypatch.setattr(lean.torch, "compile", partial(torch.compile, backend="eager"))
     contract = kind()
     model, frames, molecule, noise, velocities = contract.given()
     plain, compiled = (
-        contract.call(m, frames, molecule, noise, velocities) for m in (model, compiling.with_compiled_parts(model))
+        contract.call(m, frames, molecule, noise, velocities) for m in (model, lean.with_compiled_parts(model))
     )
     torch.testing.assert_close(compiled.frames_nm, plain.frames_nm, rtol=0, atol=1e-6)
 

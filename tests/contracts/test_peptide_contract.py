@@ -1,4 +1,4 @@
-"""The model of peptides, held against the contract of surrogate.models.interface and against its own arithmetic."""
+"""The model of peptides, held against the contract of surrogate.models.propagator and against its own arithmetic."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from surrogate.data.descriptions import describe
-from surrogate.data.features.peptide_chains import chain_layout, chain_scale
-from surrogate.models.conformance import SurrogateContract
-from surrogate.models.interface import Molecule, Surrogate
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
+from surrogate.models.conformance import PropagatorContract
+from surrogate.models.peptides.layout import PeptideConfig, chain_layout, chain_scale
+from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.torsion_states import MOST_TORSIONS, told_states
+from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -54,25 +53,25 @@ def small_model(**changes: object) -> PeptideSlide:
     return model.eval().requires_grad_(False)
 
 
-class TestPeptideSlide(SurrogateContract):
+class TestPeptideSlide(PropagatorContract):
     sizes = (22, 33)
     n_atoms = 22
 
     @pytest.fixture(autouse=True)
     def mirrored_from_anywhere(self, monkeypatch: pytest.MonkeyPatch) -> None:
         # Torsions of a model that learned nothing lie anywhere, and which are drawn again would hang on the last digit.
-        monkeypatch.setattr("surrogate.models.peptides.settling._MIRRORED_DEG", 360.0)
+        monkeypatch.setattr("surrogate.models.peptides.chains._MIRRORED_DEG", 360.0)
 
-    def make(self, n_atoms: int) -> Surrogate:
+    def make(self, n_atoms: int) -> Propagator:
         return small_model()
 
     def molecule(self, n_atoms: int) -> Molecule:
-        found = describe(small_model(), scene_of(n_atoms))
-        assert found.chain is not None
+        found = small_model().featurise(scene_of(n_atoms))
+        assert found.own is not None
         # Frames of a model that learned nothing overlap, and which are drawn again would hang on the last digit.
-        return replace(found, chain=replace(found.chain, least_nm=torch.zeros_like(found.chain.least_nm)))
+        return replace(found, own=replace(found.own, least_nm=torch.zeros_like(found.own.least_nm)))
 
-    def state(self, n_atoms: int, batch: int, model: Surrogate) -> tuple[Tensor, Tensor]:
+    def state(self, n_atoms: int, batch: int, model: Propagator) -> tuple[Tensor, Tensor]:
         scene = scene_of(n_atoms)
         return shaken(scene, batch, 1), torch.zeros(batch, n_atoms, 3)
 
@@ -98,7 +97,7 @@ def test_innovations_come_back_and_have_unit_variance_for_a_process_of_these_cor
 
 def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
     model = small_model()
-    chain = describe(model, scene_of(33)).chain
+    chain = model.featurise(scene_of(33)).own
     assert chain is not None
     n_slots = model.token_mean.shape[-1]
     o, known = torch.randn(2, 5, 4, n_slots), torch.randn(2, 4, n_slots)
@@ -131,4 +130,4 @@ def test_a_long_lag_makes_shorter_chunks_and_none_beyond_what_was_trained() -> N
 
 def test_a_residue_that_training_never_saw_is_refused() -> None:
     with pytest.raises(InputError, match="GLY"):
-        describe(small_model(), build_peptide("ACE-GLY-NME"))
+        small_model().featurise(build_peptide("ACE-GLY-NME"))

@@ -113,7 +113,7 @@ def within_file_size(line: Connection, weights: Path, outs: list[Path], config: 
 
 
 def _roll(weights: Path, outs: list[Path], config: Any, **more: Any) -> None:
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
     from surrogate.sampling.runner import rollout
     from systems.library.named_scenes import load
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.weights import TrainingDomain, Weights
-from surrogate.models.interface import Chunk, Molecule, Surrogate
+from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.weights import TrainingDomain, Weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -23,11 +23,10 @@ CONDITIONS = {"force_field": "ff14SB", "solvent": "obc2", "temperature_k": 300.0
 Fault = Callable[[Tensor, Tensor], Tensor]
 
 
-class Scripted(Surrogate):
+class Scripted(Propagator):
     """Trembles about the last frame by 0.0005 nm; what goes wrong is written in `fault`."""
 
     arch: ClassVar[str] = "scripted"
-    canonical = True
     n_conditioning = 1
     n_new = N_NEW
     largest_batch = 1000

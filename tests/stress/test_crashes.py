@@ -26,7 +26,7 @@ from disk_model import LOSSES, NO_SPACE, Disk, watched
 from loop_device import cut, mounted, new_image
 from md_reference.forces.spec import ForceFieldSpec
 from md_reference.run.simulate import MDConfig, simulate
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import StorageError, SurromdError
 from systems.library.named_scenes import load

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate.data.weights import Weights, load_weights
+from surrogate.models.weights import Weights, load_weights
+from surrogate.sampling.interventions import Tally
 from surrogate.sampling.openmm.simulation import Simulation
-from surrogate.sampling.rollout_account import Tally
-from surrogate.sampling.rollout_checkpoint import Progress, packed_progress, progress_of
+from surrogate.sampling.runner import Progress, packed_progress, progress_of
 from systems.errors import SurromdError
 from systems.scene import Scene
 from systems.trajectory.checkpoint import new_header, read_checkpoint, write_checkpoint

@@ -25,9 +25,9 @@ from md_reference.run.simulate import MDConfig, simulate
 from surrogate import api
 from surrogate.cli.render import print_pairs
 from surrogate.data.frames import TrainingFrames, collect_frames, load_frames
-from surrogate.data.tensor_checksums import tensor_checksum
-from surrogate.data.weights import Weights, load_weights
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
+from surrogate.training.loop import tensor_checksum
 from surrogate.verbs.campaign import describe_campaign
 from surrogate.verbs.info import describe_file
 from systems.errors import InputError, SurromdError
@@ -310,7 +310,7 @@ DOORS = {
     r"np\.load(txt)?\(": ("systems/files/outside.py",),
     r"gzip\.(open|decompress)\(": ("systems/chemistry/residues.py", "systems/trajectory/xyz_file.py"),
     r"json\.loads?\(": ("systems/files/schema.py",),
-    r"tomllib\.loads?\(": ("surrogate/models/registry.py",),
+    r"tomllib\.loads?\(": ("surrogate/models/architecture.py",),
 }
 # Benches read what they wrote themselves, in a folder of their own.
 _OWN = ("surrogate/bench/", "docs/")

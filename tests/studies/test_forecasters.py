@@ -21,8 +21,7 @@ from forecasters import (
 )
 
 from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import EgnnForecaster, Painet
+from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig
 from surrogate.models.painet.trainer import PainetTraining
 from systems.errors import InputError
 from systems.scene import Scene

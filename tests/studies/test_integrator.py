@@ -11,8 +11,8 @@ from integrator import IntegratorReport, angles, bonds, judge_integrator
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames, quantise
-from surrogate.models.baselines.model import Baseline, BaselineConfig
-from surrogate.models.interface import Chunk, Molecule
+from surrogate.models.baselines import Baseline, BaselineConfig
+from surrogate.models.propagator import Chunk, Molecule
 from systems.scene import Scene
 
 LAG_PS, STIFFNESS = 0.002, 20_000.0
@@ -35,7 +35,6 @@ class ExactSprings(Baseline):
     """The exact flow of independent harmonic wells; `heating` multiplies every chunk's last velocity."""
 
     arch: ClassVar[str] = "springs"
-    carries_velocities: ClassVar[bool] = True
 
     def __init__(self, scene: Scene, heating: float = 1.0) -> None:
         super().__init__(BaselineConfig(n_new=5))

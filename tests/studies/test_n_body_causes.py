@@ -15,7 +15,7 @@ from n_body_cause_views import InnovationsView, VelocitiesView
 from n_body_data import make_systems
 from n_body_views import ParticleView
 
-from surrogate.models.lam_slide.losses import random_rotations
+from surrogate.models.lam_slide.trainer import random_rotations
 
 NAMES = (
     "set: flow times of the paper, charges in the code",

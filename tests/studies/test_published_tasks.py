@@ -28,7 +28,7 @@ from particle_models import PairForces, PairForcesConfig
 from particle_sets import ParticleSet, check_disjoint, read_set
 from scipy.spatial.transform import Rotation
 
-from surrogate.models.lam_slide.losses import random_rotations
+from surrogate.models.lam_slide.trainer import random_rotations
 from systems.errors import InputError
 
 SPAN = N_GIVEN + N_NEW

@@ -19,10 +19,10 @@ import torsion_profiles
 import torsion_states
 
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights, save_weights
 from surrogate.judge.worth import Worth
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.samples import Samples
+from surrogate.models.painet.potential.trainer import Samples
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.prepare.molecule import scene_from_smiles
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 

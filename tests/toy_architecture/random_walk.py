@@ -11,13 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.data.references import References
-from surrogate.data.weights import save_weights
-from surrogate.models.architecture import Architecture
-from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.models.settings import build
-from surrogate.training.loop import StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of, training_domain
-from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest, build
+from surrogate.models.propagator import Chunk, Molecule, Propagator
+from surrogate.models.weights import provenance_of, save_weights, training_domain
+from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.scene import Scene
 
 
@@ -34,9 +31,8 @@ class WalkConfig:
         return build(WalkConfig, record)
 
 
-class RandomWalk(Surrogate):
+class RandomWalk(Propagator):
     arch: ClassVar[str] = "random-walk"
-    canonical = False
     n_conditioning = 1
 
     def __init__(self, config: WalkConfig) -> None:
@@ -48,9 +44,9 @@ class RandomWalk(Surrogate):
     def n_new(self) -> int:
         return self.config.n_new
 
-    def features(self, scene: Scene) -> Tensor:
-        """How many bonds each atom has, `(n_atoms,)`: atoms at the ends of bonds step further."""
-        return torch.from_numpy(np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)).float()
+    def featurise(self, scene: Scene) -> Molecule:
+        """`own`: how many bonds each atom has, `(n_atoms,)`: atoms at the ends of bonds step further."""
+        return Molecule.of(scene, torch.from_numpy(np.bincount(scene.bonds.ravel(), minlength=scene.n_atoms)).float())
 
     def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
         return n_atoms, self.n_new, 3
@@ -107,13 +103,13 @@ class WalkTrainer(Trainer):
         def start(advance: AdvanceFn) -> Path:
             stage = StageConfig("walk", training.batch, training.learning_rate, training.budget_s, training.steps,
                                 warmup_steps=1, seed=training.seed, bf16=False)  # fmt: skip
-            state = request.out.with_suffix(".walk.train.safetensors")
-            run_stage(model, stage, loss_fn, validate,
-                      StagePlace(state, request.out.with_suffix(".csv"), torch.device("cpu")),
-                      progress=lambda name, share, metrics: advance(name, share))  # fmt: skip
-            state.unlink()
-            provenance = provenance_of(frames.origin, {"seed": training.seed})
-            save_weights(request.out, model, training_domain(frames), provenance)
+
+            def write(spent_s: list[float]) -> None:
+                provenance = provenance_of(frames.origin, {"seed": training.seed})
+                save_weights(request.out, model, training_domain(frames), provenance)
+
+            train_stages([Stage(model, stage, loss_fn, validate)], request.out, write, device=torch.device("cpu"),
+                         progress=lambda name, share, metrics: advance(name, share), resume=request.resume)  # fmt: skip
             return request.out
 
         return Prepared(frames.scene.name, start)

@@ -151,7 +151,7 @@ def count_intervals(runs: Sequence[Ensemble], piece_ps: float) -> Intervals:
     from surrogate.judge.measure.slow_motion import longest_correlation
     from surrogate.judge.measure.statistics import block_length, effective_samples, make_blocks
     from surrogate.judge.measure.structure import Yardstick
-    from surrogate.judge.rows.motion.relaxation_rows import relaxation_of, turning
+    from surrogate.judge.rows.relaxation_rows import relaxation_of, turning
     from surrogate.judge.rows.rows import Options, make_sample
 
     yardstick = Yardstick.of(runs[0])

@@ -12,14 +12,14 @@ from particle_models import EgnnJump, PairForces
 from particle_sets import ParticleSet
 from torch import Tensor
 
-from surrogate.models.lam_slide.losses import (
+from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.trainer import (
     FlowWindows,
     autoencoder_loss,
     draw_flow_times,
     flow_loss,
     random_rotations,
 )
-from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
 from systems.errors import SurromdError
 

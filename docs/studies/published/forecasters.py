@@ -33,13 +33,11 @@ import torch
 from forecast_errors import Estimate, block_means, ratio
 from integrator import cut
 
-from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames, collect_frames
-from surrogate.data.weights import load_weights
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import EgnnForecaster, Painet
+from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig
 from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, train_painet
+from surrogate.models.weights import load_weights
 from systems.errors import InputError
 
 SIZES = (10, 30, 100, 300, 1000, 3000, 10_000)
@@ -167,7 +165,7 @@ def window_errors(
 ) -> npt.NDArray[np.float64]:
     """Return the mean square error over all predicted frames of evenly spaced windows, Å^2 per coordinate, `(n,)`."""
     windows = StateWindows(frames, model.config, torch.device("cpu"))
-    structure = model.structure(describe(model, frames.scene))
+    structure = model.structure(model.featurise(frames.scene))
     starts = thinned(windows.starts, at_most)
     found = []
     for begin in range(0, len(starts), block):

@@ -23,9 +23,9 @@ import numpy.typing as npt
 import torch
 
 from surrogate.data.frames import TrainingFrames, collect_frames
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule, Surrogate
 from surrogate.models.painet.model import Painet
+from surrogate.models.propagator import Molecule, Propagator
+from surrogate.models.weights import load_weights
 from systems.errors import InputError
 from systems.scene import Scene
 
@@ -53,7 +53,7 @@ class IntegratorReport:
     reference_potential: float
 
 
-def judge_integrator(model: Surrogate, frames: TrainingFrames, energy: EnergyFn, *, nve: Surrogate, starts: int,
+def judge_integrator(model: Propagator, frames: TrainingFrames, energy: EnergyFn, *, nve: Propagator, starts: int,
                      chunks: int, seed: int = 0) -> IntegratorReport:  # fmt: skip
     """Roll `chunks` chunks from `starts` evenly spaced frames of `frames` (with velocities), with and without the bath
     (`model`, `nve`), and compare."""
@@ -113,7 +113,7 @@ def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: in
 
 
 @torch.inference_mode()
-def rolled(model: Surrogate, scene: Scene, x: npt.NDArray[np.float32], v: npt.NDArray[np.float32], chunks: int,
+def rolled(model: Propagator, scene: Scene, x: npt.NDArray[np.float32], v: npt.NDArray[np.float32], chunks: int,
            seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return positions and velocities `(b, chunks + 1, n_atoms, 3)` where chunks end, from the start on, and all
     frames."""

@@ -35,9 +35,8 @@ def normal_modes(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fi
     """Independent modes, each an autoregression over two frames (`models.baselines.NormalModes`), without its noise."""
     import torch
 
-    from surrogate.models.baselines.model import NormalModes
-    from surrogate.models.baselines.trainer import normal_modes_of
-    from surrogate.models.interface import Molecule
+    from surrogate.models.baselines import NormalModes, normal_modes_of
+    from surrogate.models.propagator import Molecule
 
     models: dict[str, NormalModes] = {}
     for m in molecules:
@@ -116,7 +115,7 @@ def lam_slide(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitte
     import torch
     from forecaster_training import encode_windows, train_lam_slide_on_windows
 
-    from surrogate.models.lam_slide.losses import random_rotations
+    from surrogate.models.lam_slide.trainer import random_rotations
 
     views = {
         m.name: MoleculeView.of(
@@ -214,7 +213,7 @@ def lam_slide_particles(molecules: Sequence[MoleculeWindows], settings: Settings
 
 def lam_slide_model(settings: Settings, *, large: bool) -> LamSlide:
     """Return the model: Table 11's sizes where there is a GPU for them, else one of four latents in one token."""
-    from surrogate.models.lam_slide.config import AutoencoderConfig
+    from surrogate.models.lam_slide.network import AutoencoderConfig
 
     autoencoder = AutoencoderConfig(n_latents=32 if large else 4, latent_dim=32, n_octaves=3, type_weight=0.01)
     if large:

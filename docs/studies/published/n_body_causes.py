@@ -34,16 +34,15 @@ from torch import Tensor, nn
 
 from md_reference.run.machine import machine_name
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.autoencoder import Decoded
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.losses import (
+from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.lam_slide.network import Decoded, LamSlideConfig
+from surrogate.models.lam_slide.trainer import (
     FlowWindows,
     autoencoder_loss,
     draw_flow_times,
     flow_loss,
     random_rotations,
 )
-from surrogate.models.lam_slide.model import LamSlide
 from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from systems.files.whole_file import create_whole
 

@@ -104,7 +104,7 @@ class ParticleView:
     def drawn(self, data: ParticleSet, *, mirrored: bool) -> DrawParticles:
         """Return a `draw` of training windows, each turned at random (appendix E.3). `mirrored` (beyond the paper):
         half of them are reflected, and half run backwards in time, which the laws of motion allow as well."""
-        from surrogate.models.lam_slide.losses import random_rotations
+        from surrogate.models.lam_slide.trainer import random_rotations
 
         def draw(batch: int, generator: torch.Generator) -> ParticleWindows:
             import torch

@@ -11,7 +11,7 @@ from particle_flow import Given, ParticleFlow
 from torch import Tensor
 
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.losses import TAU_MAX
+from surrogate.models.lam_slide.trainer import TAU_MAX
 
 BATCH, RATE, EMA_DECAY = 256, 2e-3, 0.999
 _BLOCK = 500

@@ -1,7 +1,7 @@
 """Forecasters of small particle systems: an EGNN that jumps, and learned pair forces that are integrated.
 
 Both are equivariant to rotations, reflections, translations and particle order. Every system of a batch has its own
-types and pairs, so they stand beside the contract of `surrogate.models.interface`, which knows one molecule a call.
+types and pairs, so they stand beside the contract of `surrogate.models.propagator`, which knows one molecule a call.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from surrogate.models.egnn import Egnn
-from surrogate.models.graphs import NOT_BONDED, Graph
+from surrogate.models.painet.decoders import NOT_BONDED, Egnn, Graph
 
 # Kinds of pairs that pair forces know.
 N_PAIR_KINDS = 2

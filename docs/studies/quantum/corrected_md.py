@@ -26,9 +26,9 @@ from torch import Tensor
 
 from md_reference.forces.quantum import Potential
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights
-from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights, load_weights
 from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned
 from systems.errors import PreparationError
 from systems.scene import FloatArray, Scene

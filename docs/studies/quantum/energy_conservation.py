@@ -23,9 +23,9 @@ from torch import Tensor
 
 from md_reference.run.machine import machine_name
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
@@ -41,7 +41,7 @@ class Run:
         self.model, self.molecule = model, molecule
         self.masses = model.masses_da(molecule)[:, None]
         self.thermal = (GAS_CONSTANT_KJ_MOL_K * TEMPERATURE_K / self.masses).sqrt()
-        self.fabric, self.generator = model.fabric(molecule), torch.Generator().manual_seed(0)
+        self.generator = torch.Generator().manual_seed(0)
         x = torch.tensor(scene_nm).repeat(REPLICAS, 1, 1)
         draw = torch.randn(*x.shape[:2], round(SETTLE_PS / 0.0005), 3, generator=self.generator, dtype=x.dtype)
         v = self.thermal * torch.randn(x.shape, generator=self.generator, dtype=x.dtype)
@@ -60,7 +60,7 @@ class Run:
         return np.stack(found)
 
     def _total(self, x: Tensor, v: Tensor) -> FloatArray:
-        potential = self.model.evaluate(x, self.fabric).energy_kj_mol
+        potential = self.model.evaluate(x, self.molecule).energy_kj_mol
         total: FloatArray = (potential + 0.5 * (self.masses * v.square()).sum((1, 2))).numpy()
         return total
 

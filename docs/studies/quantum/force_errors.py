@@ -19,8 +19,8 @@ from four_molecules import force_error, frames_of
 import surrogate as sm
 from md_reference.run.teacher import Teacher
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 
 SEED = 977
 
@@ -31,7 +31,7 @@ def main() -> None:
     for name in parser.parse_args().weights:
         weights = load_weights(weights_path(name))
         scene, model = weights.domain.scene, weights.model.eval()
-        fabric = model.fabric(Molecule.of(scene))
+        molecule = Molecule.of(scene)
         with tempfile.TemporaryDirectory() as folder, Teacher(scene) as truth:
             (md,) = sm.reference(scene, Path(folder) / "md.h5", time_ps=20.0, save_every_ps=0.1, equilibrate_ps=2.0,
                                  level="gfn2-xtb", seed=SEED, quiet=True)  # fmt: skip
@@ -39,7 +39,7 @@ def main() -> None:
             sets |= {f"GAFF2, {t:g} K": truth.motion(80, 1.0, t, seed=SEED) for t in (300.0, 500.0, 700.0)}
             for what, states in sets.items():
                 asked = truth.label(states)
-                told = model.evaluate(torch.tensor(asked.positions_nm), fabric)
+                told = model.evaluate(torch.tensor(asked.positions_nm), molecule)
                 error = force_error(told.forces_kj_mol_nm.numpy(), asked.forces_kj_mol_nm)
                 off = (told.energy_kj_mol.numpy() - asked.energies_kj_mol).std()
                 sys.stdout.write(f"{Path(name).stem} | MD by {what} | {len(asked.positions_nm)} | "

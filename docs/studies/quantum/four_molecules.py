@@ -26,10 +26,9 @@ import surrogate as sm
 from md_reference.forces.quantum import Potential
 from md_reference.run.machine import machine_name
 from surrogate.bench.stress.frame_statistics import HALF_ANGSTROM_RULE
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.painet.potential.trainer import samples_path
+from surrogate.models.painet.potential.trainer import Samples, samples_path
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from systems.chemistry.validity import check_frames, geometry_from_frames
 from systems.errors import SimulationError
 from systems.prepare.molecule import scene_from_smiles
@@ -134,7 +133,7 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
     weights = load_weights(file)
     model, trained_s = weights.model, float(weights.provenance["training_s"])
     n_states = len(Samples.load(samples_path(file), scene.topology_hash))
-    answer = model.evaluate(torch.tensor(truth.states), model.fabric(Molecule.of(scene))).forces_kj_mol_nm.numpy()
+    answer = model.evaluate(torch.tensor(truth.states), Molecule.of(scene)).forces_kj_mol_nm.numpy()
     runs = [frames_of(out) for out in outs]
     forces_a_s = sum(map(len, runs)) * SAVE_PS / TIMESTEP_PS / float(spent_s.read_text())
     stable, far = truth.judge(runs, SAVE_PS)

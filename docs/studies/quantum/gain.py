@@ -25,9 +25,9 @@ from corrected_md import SAVE_PS
 import surrogate as sm
 from md_reference.run.machine import machine_name
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
 from surrogate.judge.comparison import Judgement
 from surrogate.judge.worth import Worth
+from surrogate.models.weights import load_weights
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
 from systems.units import format_time_ps, format_wall, parse_time_ps

@@ -19,10 +19,10 @@ from typing import Any
 import torch
 
 from md_reference.run.machine import machine_name
-from surrogate.data.weights import load_weights
-from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.potential.energy import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
 from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, samples_path
+from surrogate.models.weights import load_weights
 from surrogate.training.loop import StageConfig, StagePlace, run_stage
 from systems.units import parse_wall_s
 

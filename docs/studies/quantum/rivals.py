@@ -27,13 +27,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from md_reference.run.machine import machine_name
-from surrogate.data.weights import load_weights
-from surrogate.models.egnn import Egnn
-from surrogate.models.graphs import molecular_graph
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.gradient import gradient_of
-from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.painet.potential.trainer import samples_path
+from surrogate.models.painet.decoders import Egnn, molecular_graph
+from surrogate.models.painet.potential.trainer import Samples, samples_path
+from surrogate.models.potential import gradient_of
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from systems.prepare.molecule import scene_from_smiles
 from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_wall, parse_time_ps, parse_wall_s

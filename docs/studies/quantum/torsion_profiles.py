@@ -22,8 +22,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.machine import machine_name
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from systems.chemistry.graph import bonded_graph, rotatable_torsions, turned
 from systems.scene import FloatArray, Scene
 
@@ -43,12 +43,12 @@ def rows(name: str) -> list[list[str]]:
     weights = load_weights(weights_path(name))
     scene, model = weights.domain.scene, weights.model.eval()
     at, truth, graph = minimum(scene), Potential(scene), bonded_graph(scene)
-    fabric = model.fabric(Molecule.of(scene))
+    molecule = Molecule.of(scene)
     found = []
     for quad in rotatable_torsions(scene, rotors=True).tolist():
         scan = np.stack([turned(at, quad, 2.0 * np.pi * k / STEPS, graph) for k in range(STEPS)])
         asked = np.array([truth(x)[0] for x in scan])
-        told = model.evaluate(torch.tensor(scan), fabric).energy_kj_mol.numpy()
+        told = model.evaluate(torch.tensor(scan), molecule).energy_kj_mol.numpy()
         low = asked - asked.min() < HIGHEST_KJ_MOL
         off = (told - asked)[low] - (told - asked)[low].mean()
         torsion = "-".join(f"{scene.elements[k]}{k}" for k in quad)

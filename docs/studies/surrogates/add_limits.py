@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from surrogate.data.frames import collect_frames
-from surrogate.data.weights import load_weights, save_weights
-from surrogate.training.provenance import training_domain
+from surrogate.models.weights import load_weights, save_weights, training_domain
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError
 from systems.units import whole_steps

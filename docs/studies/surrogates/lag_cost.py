@@ -26,8 +26,8 @@ from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
 from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from systems.chemistry.validity import INVALID, Geometry, check_frames

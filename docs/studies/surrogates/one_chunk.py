@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames, collect_frames
-from surrogate.data.weights import load_weights
 from surrogate.models.painet.model import Painet
+from surrogate.models.weights import load_weights
 from systems.errors import InputError
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -90,7 +89,7 @@ def main() -> None:
     if not isinstance(model, Painet):
         raise InputError(f"{args.weights} ({model.arch}) carries no velocities.")
     frames = collect_frames([args.reference], canonical=False, velocities=True)
-    structure = model.structure(describe(model, weights.domain.scene))
+    structure = model.structure(model.featurise(weights.domain.scene))
 
     @torch.inference_mode()
     def step(x: FloatArray, v: FloatArray) -> State:

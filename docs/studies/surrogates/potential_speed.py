@@ -17,10 +17,10 @@ from functools import partial
 import torch
 
 from md_reference.forces.quantum import Potential
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.config import PotentialConfig
-from surrogate.models.painet.potential.gradient import gradient_of
+from surrogate.models.painet.potential.energy import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.potential import gradient_of
+from surrogate.models.propagator import Molecule
 from systems.prepare.molecule import scene_from_smiles
 
 # Glycol, aspirin, paracetamol.

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights
-from surrogate.models.interface import Molecule
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.trajectory.codec import open_trajectory
 from systems.units import parse_time_ps
@@ -38,8 +38,8 @@ def line(weights: Weights, timestep_ps: float, time_ps: float, folder: Path) -> 
     for out in outs:
         with open_trajectory(out) as reader:
             runs.append(reader.read()[reader.time_ps > DISCARDED_PS].astype(np.float64))
-    model, fabric = weights.model, weights.model.fabric(Molecule.of(scene))
-    energies = [float(model.evaluate(torch.tensor(x), fabric).energy_kj_mol.mean()) for x in runs]
+    model, molecule = weights.model, Molecule.of(scene)
+    energies = [float(model.evaluate(torch.tensor(x), molecule).energy_kj_mol.mean()) for x in runs]
     heavy = [pair for pair in scene.bonds.tolist() if "H" not in (scene.elements[pair[0]], scene.elements[pair[1]])]
     first, second = np.array(heavy).T
     lengths = np.linalg.norm(np.concatenate(runs)[:, first] - np.concatenate(runs)[:, second], axis=-1)

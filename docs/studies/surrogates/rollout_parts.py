@@ -20,11 +20,11 @@ import torch
 
 from surrogate.bench.machine import machine_facts
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import draw_noise
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.propagator import draw_noise
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.guards import Guard
+from surrogate.sampling.interventions import Guard
 from systems.chemistry.geometry import superposition
 from systems.trajectory.codec import open_writer
 

@@ -29,15 +29,13 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from surrogate.bench.machine import machine_facts
-from surrogate.data.descriptions import describe
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.config import ApproximatorConfig
-from surrogate.models.lam_slide.losses import FlowWindows, draw_flow_times, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.transformer import Approximator
+from surrogate.models.lam_slide.network import Approximator, ApproximatorConfig
+from surrogate.models.lam_slide.trainer import FlowWindows, draw_flow_times, flow_loss
+from surrogate.models.propagator import Molecule, draw_noise
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import with_bf16_weights
 
 PAPER = ApproximatorConfig(chunk_frames=30, n_conditioning=10, latents_per_token=1, width=128, n_layers=6, n_heads=4)
@@ -194,7 +192,7 @@ def main() -> None:
         torch.set_num_threads(args.threads)
     weights = load_weights(weights_path(args.weights))
     assert isinstance(weights.model, LamSlide)
-    molecule = describe(weights.model, weights.domain.scene)
+    molecule = weights.model.featurise(weights.domain.scene)
     facts = machine_facts()
     sys.stdout.write(f"{facts['about']}\n")
     peaks, rates = {}, []

@@ -27,7 +27,7 @@ from systems.units import parse_wall_s
 
 if TYPE_CHECKING:
     from surrogate.data.frames import TrainingFrames
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
     from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -57,7 +57,7 @@ class Row:
 def train(references: Sequence[Path], out: Path, *, longest_lag_ps: float, budget_s: float, compile_: bool) -> None:
     """Train one model for all lags; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
-    from surrogate.models.lam_slide.config import ApproximatorConfig, LamSlideConfig
+    from surrogate.models.lam_slide.network import ApproximatorConfig, LamSlideConfig
     from surrogate.models.lam_slide.trainer import TrainingConfig, is_trained, train_lam_slide
 
     if is_trained(out):
@@ -144,7 +144,7 @@ def table(rows: Sequence[Row]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse, train, measure, print the table and keep it in FOLDER."""
     from surrogate.data.frames import collect_frames
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)

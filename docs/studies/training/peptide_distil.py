@@ -8,14 +8,120 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import torch
 from peptide_subset import training_sets
+from torch import Tensor
 
-from surrogate.data.weights import load_weights
-from surrogate.models.peptides.distil import distil
-from surrogate.models.peptides.trainer import PeptideTraining
+from surrogate.data.frames import TrainingFrames
+from surrogate.data.references import FrameSets
+from surrogate.models.lam_slide import flow
+from surrogate.models.lam_slide.trainer import pick
+from surrogate.models.peptides.chains import ChainFeatures
+from surrogate.models.peptides.layout import chain_features
+from surrogate.models.peptides.model import PeptideFlow, PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.torsion_states import told_states
+from surrogate.models.peptides.trainer import PeptideTraining, by_kind, disturbed
+from surrogate.models.weights import Weights, load_weights, provenance_of, save_weights
+from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.units import parse_wall_s
+
+# A flow of peptides that arrives in very few evaluations: taught where its teacher arrives in many.
+# The state of every torsion is drawn before, so what is left to a flow is one basin, and where its solver ends is a
+# smooth map of the noise. A copy of the flow is trained through all steps of its own solver to end where the teacher
+# ends from the same noise (as in progressive distillation, Salimans and Ho, arXiv:2202.00512, but in one round, since
+# so few steps can be differentiated as one). The odds of states are the teacher's.
+
+# Evaluations of the teacher: more of them end in the same distribution.
+_TEACHER_STEPS = 6
+# Two of its steps leave bonds and angles as wide as they are. By `gaussian` a copy had to make up for half of the
+# variance, and left them cold.
+_SOLVER = "angular"
+# Of each molecule, of many fewer of each: validation solves as often as training does, and is to stay a small share.
+_HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL, _HELD_SEED = 32, 2, 256, 0
+
+
+def distil(
+    sets: Sequence[TrainingFrames],
+    start: Weights,
+    out: Path,
+    training: PeptideTraining,
+    *,
+    steps: int,
+    resume: bool = False,
+) -> Path:
+    """Write weights `out` that roll in `steps` evaluations, taught by those of `start` on windows of `sets`; beside it
+    a CSV of how far both end apart, in the units of the flow. Raises SimulationError when training diverges."""
+    torch.manual_seed(training.seed)
+    assert isinstance(start.model, PeptideSlide)
+    device = torch.device(training.device)
+    teacher = start.model.to(device).flow
+    config = replace(start.model.config, usual_steps=steps, usual_solver=_SOLVER)
+    model = PeptideSlide(config).to(device)
+    model.load_state_dict(start.model.state_dict())
+    subjects = [PeptideSubject(f, chain_features(f.scene, model.config).to(device)) for f in sets]
+    n_held = min(_HELD_WINDOWS, max(_LEAST_HELD, _HELD_IN_ALL // len(subjects)))
+    held = [
+        (subject, *subject.windows(n_held, model.config, torch.Generator().manual_seed(_HELD_SEED), validation=True))
+        for subject in subjects
+    ]
+
+    def apart(subject: PeptideSubject, idx: Tensor, times: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        return arrival_loss(model, teacher, subject.chain, *subject.seen(model, idx), times.to(device), generator)
+
+    def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        subject = subjects[pick(subjects, generator)]
+        found = apart(subject, *subject.batch(training.batch, model.config, generator), generator)
+        return found["apart"], {name: term.detach() for name, term in found.items()}
+
+    @torch.no_grad()
+    def validate() -> dict[str, float]:
+        generator = torch.Generator().manual_seed(_HELD_SEED)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=training.bf16):
+            found = [apart(*each, generator) for each in held]
+        return {f"validation_{name}": float(np.mean([float(terms[name]) for terms in found])) for name in found[0]}
+
+    def write(spent_s: list[float]) -> None:
+        settings = {"seed": training.seed, "spent_s": round(sum(spent_s), 1), "distilled_to_steps": steps}
+        save_weights(out, model, start.domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
+
+    stage = StageConfig(
+        "arrival", training.batch, training.learning_rate, training.budget_s, training.steps, seed=training.seed,
+        bf16=training.bf16, validate_every_s=training.validate_every_s,
+    )  # fmt: skip
+    train_stages([Stage(model.flow, stage, loss, validate)], out, write, device=device, resume=resume)
+    return out
+
+
+def arrival_loss(
+    model: PeptideSlide, teacher: PeptideFlow, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Return the mean square of how far from the teacher's the model's innovations end from the same noise, `apart`,
+    and its parts: of torsions' numbers, of stiff ones. `numbers` and `states` of windows as `peptide_loss` takes them,
+    of which only the first frame's numbers are used."""
+    filled = chain.code.filled
+    known = disturbed(numbers[:, 0], chain, model.config, generator)
+    noise = torch.randn(numbers[:, 1:].shape, generator=generator).to(numbers.device) * filled
+    of_states = told_states(states, chain.stated.counts)
+
+    def arrived(by: PeptideFlow, n_steps: int) -> Tensor:
+        told = by.told(known, times_ps, chain.places, of_states)
+
+        def predict(o: Tensor, tau: Tensor) -> Tensor:
+            return torch.where(filled, by(o, tau, told), 0.0)
+
+        return flow.SOLVERS[_SOLVER](predict, noise, n_steps, "linear")
+
+    with torch.no_grad():
+        target = arrived(teacher, _TEACHER_STEPS)
+    error = (arrived(model.flow, model.config.usual_steps) - target).square()
+    return dict(zip(("apart", "turning", "stiff"), by_kind(error, chain, model.config), strict=True))
+
 
 _LEARNING_RATE, _VALIDATE_S = 3e-4, 300.0
 

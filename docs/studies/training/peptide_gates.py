@@ -58,7 +58,7 @@ from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 if TYPE_CHECKING:
     from surrogate.data.frames import TrainingFrames
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 FloatArray = npt.NDArray[np.float64]
 LAGS_PS = (1, 3, 10, 30, 100, 300, 1000)
@@ -75,7 +75,7 @@ def train(
     """Train on one peptide's references; what is there stays, what was interrupted goes on."""
     from surrogate.data.frames import collect_frames
     from surrogate.models.lam_slide.trainer import is_trained
-    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
 
     if is_trained(out):
@@ -127,7 +127,7 @@ def chapman_kolmogorov(weights: Weights, test: TrainingFrames, n_starts: int) ->
 def lag_gate(a: argparse.Namespace) -> None:
     """Train on one peptide, measure each lag and Chapman and Kolmogorov's test, print and keep the table."""
     from surrogate.data.frames import collect_frames
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     name = "lag-plain" if a.plain else "lag"
     train(a.train, a.folder / f"{name}.safetensors", steps=a.steps, innovation=not a.plain)
@@ -147,7 +147,7 @@ def seeds_gate(a: argparse.Namespace) -> None:
     """Train on seeded runs, roll this model and the others, print and keep distances and free energies."""
     from peptide_scores import crossings
 
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     models = {path.stem: path for path in a.weights}
     runs = [] if a.runs is None else sorted(a.runs.glob("run_*.h5"))
@@ -183,7 +183,7 @@ def code_gate(a: argparse.Namespace) -> None:
     from peptide_scores import rebuilt
 
     from surrogate.data.frames import collect_frames
-    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import with_scale
 
     monomers = [p for p in training_peptides() if len(p.residues) == 1]

@@ -22,7 +22,7 @@ from systems.units import parse_wall_s
 if TYPE_CHECKING:
     from peptide_scores import Scores
 
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 _VALIDATE_S = 300.0
 
@@ -39,10 +39,10 @@ def train_on_pairs(
     """
     from peptide_subset import has_frames, training_sets
 
-    from surrogate.data.weights import load_weights
     from surrogate.models.lam_slide.trainer import is_trained
-    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.layout import PeptideConfig
     from surrogate.models.peptides.trainer import PeptideTraining, train_peptides
+    from surrogate.models.weights import load_weights
 
     if is_trained(out):
         return
@@ -115,7 +115,7 @@ def molecule_scores(
 
 def pairs_gate(a: argparse.Namespace) -> None:
     """Train on each number of pairs, roll every test molecule, print and keep the table."""
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     rows = []
     for n_pairs in a.pairs:

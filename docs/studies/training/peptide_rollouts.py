@@ -13,7 +13,7 @@ from surrogate.models.peptides.torsion_states import POSITIVE_PHI_DEG
 from systems.errors import InputError
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
     from systems.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,7 +63,7 @@ def frame_weights(runs: Sequence[FloatArray], phi: int | None = None, positive_k
 
     `positive_kt`: the free energy of phi > 0, where it is known, of the torsion at place `phi`.
     """
-    from surrogate.data.equilibrium import equilibrium_weights
+    from surrogate.models.peptides.subjects import equilibrium_weights
 
     states = shares = None
     if phi is not None and positive_kt is not None:

@@ -26,7 +26,7 @@ from systems.chemistry.graph import backbone_torsions
 from systems.scene import Scene
 
 if TYPE_CHECKING:
-    from surrogate.models.peptides.model import PeptideConfig
+    from surrogate.models.peptides.layout import PeptideConfig
 
 FloatArray = npt.NDArray[np.float64]
 _BINS, _JOINT_BINS = 50, 36
@@ -167,7 +167,7 @@ def rebuilt(scene: Scene, frames_nm: FloatArray, config: PeptideConfig) -> dict[
     mean and most, and the most that a torsion differs (degrees)."""
     import torch
 
-    from surrogate.data.features.peptide_chains import chain_features
+    from surrogate.models.peptides.layout import chain_features
 
     code = chain_features(scene, config).code
     found = code.decode(code.encode(torch.from_numpy(frames_nm).float())).double().numpy()

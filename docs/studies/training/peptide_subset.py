@@ -27,15 +27,13 @@ import numpy.typing as npt
 import torch
 from peptide_list import training_peptides
 
-from surrogate.data.features.peptide_chains import chain_features
-from surrogate.data.frames import TrainingFrames, collect_frames, load_frames
-from surrogate.data.splits import Split
-from surrogate.data.weights import load_weights
+from surrogate.data.frames import Split, TrainingFrames, collect_frames, load_frames
 from surrogate.models.lam_slide.trainer import is_trained
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.state_windows import balanced_starts
+from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject, balanced_starts
 from surrogate.models.peptides.trainer import PeptideTraining, peptide_loss, train_peptides, with_scale
+from surrogate.models.weights import load_weights
 from systems.errors import InputError
 
 MOST_MIB = 60.0

@@ -17,7 +17,7 @@ from surrogate.judge.measure.slow_motion import longest_correlation
 from surrogate.judge.measure.statistics import block_length, estimate, make_blocks
 from surrogate.judge.measure.structure import Features, Yardstick, backbone
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows.motion.relaxation_rows import relaxation_of
+from surrogate.judge.rows.relaxation_rows import relaxation_of
 from surrogate.judge.rows.rows import Options, Sample, make_sample
 from surrogate.judge.worth import Worth, distance_to_truth, errors_by_length, worth_by
 from surrogate.judge.worth_measures import joint_measure

@@ -17,7 +17,7 @@ from systems.errors import SurromdError
 
 if TYPE_CHECKING:
     from md_reference.simd.force_field import SimdReplicas
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
     from surrogate.sampling.chunks import ChunkSampler
 
 TIMESTEPS_PS = (0.001, 0.002, 0.004)

@@ -33,9 +33,9 @@ from surrogate.bench.cost_error.sweep_settings import (
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
-from surrogate.models.precision import torch_threads
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
+from surrogate.training.devices import torch_threads
 from surrogate.verbs.options import Trajectories
 from surrogate.verbs.outputs import find_trajectories
 from systems.errors import InputError, StorageError, SurromdError
@@ -43,7 +43,7 @@ from systems.options import part_of
 from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 ReportFn = Callable[[str], None]
 
@@ -59,7 +59,7 @@ def cost_error(
 ) -> dict[str, Any]:
     """Measure weights, by name or file, at the settings of `choose_settings`; see `run_cost_error`."""
     from surrogate.data.shipped import weights_path
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     loaded = [load_weights(weights_path(name)) for name in weights]
     sweep = part_of(options, Sweep)

@@ -12,7 +12,7 @@ from systems.errors import InputError
 from systems.options import check_options, option
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 STEPS = (2, 3, 4, 6, 10, 20)
 # Ways of MD: OpenMM as it is set up here and as its manual does, and sixteen copies at once (`md_reference.simd`).
@@ -86,7 +86,7 @@ def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
     and in a batch; with `compiled` also compiled. Raises InputError for a solver that the weights do not know.
     """
     from surrogate.models.lam_slide.flow import ADAPTIVE
-    from surrogate.models.precision import choose_precision
+    from surrogate.training.devices import choose_precision
 
     known = weights.model.solvers
     unknown = [name for name in sweep.solvers or () if name not in known]
@@ -103,7 +103,7 @@ def choose_settings(weights: Weights, sweep: Sweep) -> list[Setting]:
     ]
     usual = Setting(chosen[0], own if own in numbers else max(numbers))
     if not (sweep.precisions or sweep.batches):
-        with_bf16 = choose_precision("auto", suits=weights.model.bf16_by_default).bf16
+        with_bf16 = choose_precision("auto", suits=weights.model.float32_layers is not None).bf16
         found += [replace(usual, precision="fp32" if with_bf16 else "bf16")]
         found += [replace(usual, batch=1)]
     if sweep.compiled:

@@ -23,7 +23,7 @@ from systems.scene import Scene, part_of, reordered
 from systems.trajectory.companion_writer import pdb_text
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 FloatArray = npt.NDArray[np.float64]
 NOISE_NM = (0.001, 0.003, 0.01, 0.03, 0.1)

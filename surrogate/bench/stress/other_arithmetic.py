@@ -14,16 +14,16 @@ import torch
 
 from surrogate.bench.rolling import Roller
 from surrogate.bench.stress.frame_statistics import measure_bonds, measure_validity
-from surrogate.data.descriptions import describe
-from surrogate.models.compiling import with_compiled_parts
-from surrogate.models.interface import Surrogate, draw_noise
+from surrogate.data.frames import fitted_atoms
+from surrogate.models.lean import with_compiled_parts
+from surrogate.models.propagator import Propagator, draw_noise
 from surrogate.sampling.chunks import ChunkSampler, noise_seed, with_bf16_weights
 from systems.chemistry.validity import Geometry
 from systems.errors import SurromdError, first_line
 
 if TYPE_CHECKING:
     from md_reference.run.engine import Engine
-    from surrogate.data.weights import TrainingDomain, Weights
+    from surrogate.models.weights import TrainingDomain, Weights
 
 SOLVER_STEPS = (2, 5, 10, 20, 40)
 BATCHES = (1, 8, 64, 512)
@@ -210,8 +210,8 @@ class _Inputs:
 
     def __init__(self, weights: Weights, rows: int, seed: int) -> None:
         template = weights.domain.scene
-        self._molecule = describe(weights.model, template)
-        fit = template.heavy_idx if len(template.heavy_idx) >= 3 else np.arange(template.n_atoms)
+        self._molecule = weights.model.featurise(template)
+        fit = fitted_atoms(template)
         start = template.positions_nm - template.positions_nm[fit].mean(axis=0)
         model = weights.model
         self._last = torch.from_numpy(start).expand(rows, model.n_conditioning, -1, -1)
@@ -219,7 +219,7 @@ class _Inputs:
         self._noise = draw_noise(model, template.n_atoms, generators)
 
     @torch.inference_mode()
-    def chunk(self, model: Surrogate, dtype: torch.dtype, *, autocast: torch.dtype | None = None) -> Frames:
+    def chunk(self, model: Propagator, dtype: torch.dtype, *, autocast: torch.dtype | None = None) -> Frames:
         """Return frames `(rows, n_new, n_atoms, 3)` nm of a model that computes in `dtype`."""
         with torch.autocast("cpu", dtype=autocast or torch.bfloat16, enabled=autocast is not None):
             found = model.next_chunk(

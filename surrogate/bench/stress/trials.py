@@ -21,7 +21,7 @@ from systems.trajectory.codec import open_trajectory
 
 if TYPE_CHECKING:
     from surrogate.bench.stress.stress_options import StressOptions
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
 
 SECTIONS = ("length", "invariance", "inputs", "precision", "batches", "solvers", "openmm")
 _ENERGY_FRAMES = 100
@@ -80,7 +80,7 @@ def stress_weights(
     cannot be written; KeyboardInterrupt says what is kept.
     """
     from surrogate.data.shipped import weights_path
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
     from surrogate.sampling.domain import fit_weights
 
     loaded = load_weights(weights_path(weights))

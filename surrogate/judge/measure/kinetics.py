@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -210,6 +211,21 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     Pairs never cross a segment, nor a frame that is not finite. The sign of TIC 0 is chosen so that its skewness is
     positive: the rare state lies on the right. Source: Perez-Hernandez et al., J. Chem. Phys. 139, 015102 (2013).
     """
+    fitted = tica_model(segments, lag_frames, 1)
+    if fitted is None:
+        return None
+    model, runs = fitted
+    vector = np.real(np.asarray(model.singular_vectors_left)[:, 0]).astype(np.float64)
+    mean = np.asarray(model.mean_0, dtype=np.float64)
+    projected = np.concatenate([(run - mean) @ vector for run in runs])
+    if float(((projected - projected.mean()) ** 3).sum()) < 0:
+        vector = -vector
+    return Tica(mean, vector, lag_frames, float(np.real(model.singular_values[0])))
+
+
+def tica_model(segments: Sequence[FloatArray], lag_frames: int, dim: int) -> tuple[Any, list[FloatArray]] | None:
+    """Return deeptime's model of features `(n_frames, n_features)` and the runs of finite frames it was fitted to; None
+    where `can_be_fitted` says so."""
     from deeptime.decomposition import TICA
 
     runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
@@ -218,13 +234,7 @@ def fit_tica(segments: Sequence[FloatArray], lag_frames: int) -> Tica | None:
     covariance = TICA.covariance_estimator(lagtime=lag_frames)
     for run in runs:
         covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
-    model = TICA(lagtime=lag_frames, dim=1).fit_from_covariances(covariance).fetch_model()
-    vector = np.real(np.asarray(model.singular_vectors_left)[:, 0]).astype(np.float64)
-    mean = np.asarray(model.mean_0, dtype=np.float64)
-    projected = np.concatenate([(run - mean) @ vector for run in runs])
-    if float(((projected - projected.mean()) ** 3).sum()) < 0:
-        vector = -vector
-    return Tica(mean, vector, lag_frames, float(np.real(model.singular_values[0])))
+    return TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model(), runs
 
 
 def can_be_fitted(runs: Sequence[FloatArray]) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.kinetics import PairSums, can_be_fitted, finite_runs, timescale
+from surrogate.judge.measure.kinetics import PairSums, finite_runs, tica_model, timescale
 from surrogate.judge.measure.statistics import Blocks
 
 FloatArray = npt.NDArray[np.float64]
@@ -26,7 +26,6 @@ _CLUSTERED_FRAMES = 10_000
 _KMEANS_SEED = 1
 # A process is slow, and separates states, when it outlives the lag by this factor.
 _SLOW_IN_LAGS = 1.0
-_LEAST_POPULATION = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +87,10 @@ def fit_projection(
 
     Source: Noe and Clementi, J. Chem. Theory Comput. 11, 5002 (2015): coordinates are scaled by their eigenvalues.
     """
-    from deeptime.decomposition import TICA
-
-    runs = [run for s in segments for run in finite_runs(s) if len(run) > lag_frames and run.shape[1]]
-    if not can_be_fitted(runs):
+    fitted = tica_model(segments, lag_frames, dim)
+    if fitted is None:
         return None
-    covariance = TICA.covariance_estimator(lagtime=lag_frames)
-    for run in runs:
-        covariance.partial_fit((run[:-lag_frames], run[lag_frames:]))
-    model = TICA(lagtime=lag_frames, dim=dim).fit_from_covariances(covariance).fetch_model()
+    model, _ = fitted
     values = np.real(np.asarray(model.singular_values))[:dim]
     vectors = np.real(np.asarray(model.singular_vectors_left))[:, : len(values)]
     kept = max(int((values > least).sum()), 1)

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure import hydrogen_bonds, puckers, secondary
-from surrogate.judge.measure.equal_atoms import equal_rows
 from surrogate.judge.measure.torsions import Torsion, find_torsions
 from systems.chemistry.geometry import bond_angle, column_blocks, squared_distance, torsion_angle
 from systems.scene import Scene
@@ -35,6 +33,35 @@ _MANY_ATOMS = 100
 _FLAT_RING_NM = 0.01
 _ROUNDS = 5
 _BACKBONE = ("N", "CA", "C", "O", "OXT")
+_HYDROGEN_BOND_NM = 0.25
+_HYDROGEN_BOND_COSINE = -0.5
+Frames = npt.NDArray[np.floating]
+COIL, HELIX, STRAND = 0, 1, 2
+# A turn of a 3-10 helix spans four residues, and two that follow each other make it a helix.
+LEAST_RESIDUES = 5
+_CODES = {"H": HELIX, "E": STRAND}
+Float64Array = npt.NDArray[np.float64]
+T = TypeVar("T")
+
+# Of more bonds or angles than this, evenly chosen ones have histograms: those of a protein say the same many times.
+MOST_HISTOGRAMS = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """The backbone of every amino acid: atoms N, CA, C, O `(n_residues, 4)`, in order along the chains.
+
+    `chain` `(n_residues,)` counts the chains, `is_proline` `(n_residues,)` marks those without a hydrogen on N, and
+    `labels` are such as 'ALA 2'.
+    """
+
+    atoms: IntArray
+    chain: IntArray
+    is_proline: npt.NDArray[np.bool_]
+    labels: tuple[str, ...]
+
+
+NO_CHAINS = Chains(np.empty((0, 4), np.int64), np.empty(0, np.int64), np.empty(0, bool), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +72,7 @@ class Probes:
     "shape" `(n, 5)`: radius of gyration, RMSD, end-to-end distance (nm), contacts formed, share of the reference's
     contacts kept; "deviation" `(n, n_fit)` squared distance in nm² of each fitted atom from the reference's mean
     structure; "contacts" and "hydrogen_bonds" `(n, k)` bool; "puckers" `(n, 2 n_rings)`: amplitude nm, angle rad;
-    "secondary" `(n, n_residues)` int8, the structure of each residue (`secondary.secondary_structure`). A frame that is
+    "secondary" `(n, n_residues)` int8, the structure of each residue (`secondary_structure`). A frame that is
     not finite has NaN, False in the families of bool, and coil.
 
     `all_contacts` are the pairs counted in "shape", `contacts` and `hydrogen_bonds` those with a column of their own
@@ -69,7 +96,7 @@ class Probes:
     hydrogen_bonds: IntArray
     rings: tuple[tuple[int, ...], ...]
     classes: IntArray
-    chains: secondary.Chains = secondary.NO_CHAINS
+    chains: Chains = NO_CHAINS
     left_out: tuple[tuple[str, str], ...] = ()
     whole: bool = True
 
@@ -82,9 +109,9 @@ class Probes:
             "shape": lambda: ["radius of gyration", "RMSD", "end-to-end distance", "contacts", "contacts kept"],
             "deviation": lambda: [f"{names[i]} ({_residue(scene, i)})" for i in self.fit_idx.tolist()],
             "contacts": lambda: [_pair_label(scene, row) for row in self.contacts.tolist()],
-            "hydrogen_bonds": lambda: [hydrogen_bonds.triplet_label(scene, row) for row in self.hydrogen_bonds],
+            "hydrogen_bonds": lambda: [triplet_label(scene, row) for row in self.hydrogen_bonds],
             "puckers": lambda: [
-                f"{what}, {puckers.ring_label(scene, ring)}" for ring in self.rings for what in ("amplitude", "angle")
+                f"{what}, {ring_label(scene, ring)}" for ring in self.rings for what in ("amplitude", "angle")
             ],
             "secondary": lambda: list(self.chains.labels),
         }
@@ -103,7 +130,7 @@ class Probes:
             "contacts": np.zeros((n, len(self.contacts)), dtype=bool),
             "hydrogen_bonds": np.zeros((n, len(self.hydrogen_bonds)), dtype=bool),
             "puckers": np.empty((n, 2 * len(self.rings)), dtype=np.float32),
-            "secondary": secondary.secondary_structure(frames_nm, self.chains),
+            "secondary": secondary_structure(frames_nm, self.chains),
         }
         quads = np.array([q for t in self.torsions for q in t.equal or (t.quad,)], dtype=np.int64).reshape(-1, 4)
         of_torsion = np.repeat(np.arange(len(self.torsions)), [len(t.equal) or 1 for t in self.torsions])
@@ -120,7 +147,7 @@ class Probes:
                 for k, torsion in enumerate(self.torsions):
                     out["torsions"][part, k] = _folded(angles[of_torsion == k], torsion.fold)
                 out["angles"][part] = bond_angle(x, self.angles).T
-                out["hydrogen_bonds"][part] = hydrogen_bonds.is_formed(x, self.hydrogen_bonds).T
+                out["hydrogen_bonds"][part] = is_formed(x, self.hydrogen_bonds).T
                 out["contacts"][part] = (squared_distance(x, self.contacts) < self.contact_nm**2).T
                 centre = np.einsum("a,xan->xn", masses, x)
                 out["shape"][part, 0] = np.sqrt(np.einsum("a,xan->n", masses, (x - centre[:, None]) ** 2))
@@ -131,7 +158,7 @@ class Probes:
                 if len(self.native):
                     out["shape"][part, 4] = near[self.native].mean(axis=0)
                 for k, ring in enumerate(self.rings):
-                    out["puckers"][part, 2 * k : 2 * k + 2] = puckers.pucker(x, ring).T
+                    out["puckers"][part, 2 * k : 2 * k + 2] = pucker(x, ring).T
         broken = ~np.isfinite(frames_nm).all(axis=(1, 2))
         if broken.any():
             for values in out.values():
@@ -159,20 +186,20 @@ def find_probes(
         for t in find_torsions(whole)
         if all(i in place for i in t.quad)
     )
-    rings = tuple(_placed(r, place) for r in puckers.find_rings(whole) if all(i in place for i in r))
+    rings = tuple(_placed(r, place) for r in find_rings(whole) if all(i in place for i in r))
     left_out: list[tuple[str, str]] = []
     angles = _thin(_angles(scene), "angles", left_out)
     fit = _fitted_atoms(scene)
     contacts, contact_nm = _contact_pairs(scene)
-    triplets = hydrogen_bonds.find_triplets(scene)
+    triplets = find_triplets(scene)
     with np.errstate(invalid="ignore"):
         blocks = [block for _, block in column_blocks(sample_nm, _widest(contacts, triplets, angles))]
     classes = atom_classes(whole)[np.arange(scene.n_atoms) if kept is None else kept]
     equal_contacts, equal_triplets = equal_rows(contacts, classes), equal_rows(triplets, classes)
     in_contact = _share(lambda x: squared_distance(x, contacts) < contact_nm**2, blocks, len(contacts))
-    bonded = _share(lambda x: hydrogen_bonds.is_formed(x, triplets), blocks, len(triplets))
+    bonded = _share(lambda x: is_formed(x, triplets), blocks, len(triplets))
     in_contact, bonded = _evened(in_contact, equal_contacts), _evened(bonded, equal_triplets)
-    amplitude = [np.mean(np.concatenate([puckers.pucker(b, r)[0] for b in blocks])) for r in rings]
+    amplitude = [np.mean(np.concatenate([pucker(b, r)[0] for b in blocks])) for r in rings]
     return Probes(
         scene=scene,
         torsions=torsions,
@@ -187,7 +214,7 @@ def find_probes(
         hydrogen_bonds=triplets[_foremost(bonded, equal_triplets, "hydrogen bonds", left_out)],
         rings=tuple(r for r, q in zip(rings, amplitude, strict=True) if q > _FLAT_RING_NM),
         classes=classes,
-        chains=secondary.find_chains(whole, place),
+        chains=find_chains(whole, place),
         left_out=tuple(left_out),
         whole=kept is None,
     )
@@ -363,3 +390,209 @@ def _angle_label(scene: Scene, row: Sequence[int]) -> str:
 
 def _pair_label(scene: Scene, row: Sequence[int]) -> str:
     return " ... ".join(f"{scene.atom_names[i]} ({_residue(scene, i)})" for i in row)
+
+
+def find_triplets(scene: Scene) -> IntArray:
+    """Return all (donor, hydrogen, acceptor) `(k, 3)`: donors and acceptors are N and O at least three bonds apart."""
+    from systems.chemistry.graph import bonded_graph, exclusions
+
+    graph = bonded_graph(scene)
+    polar = [i for i, e in enumerate(scene.elements) if e in ("N", "O")]
+    near = {tuple(p) for p in exclusions(scene, depth=2).tolist()}
+    rows = [
+        (donor, hydrogen, acceptor)
+        for donor in polar
+        for hydrogen in sorted(graph[donor])
+        if scene.elements[hydrogen] == "H"
+        for acceptor in polar
+        if acceptor != donor and (min(donor, acceptor), max(donor, acceptor)) not in near
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+
+def is_formed(columns: FloatArray, triplets: IntArray) -> npt.NDArray[np.bool_]:
+    """Return `(k, n)`: whether each triplet is a hydrogen bond in each frame of coordinates `(3, n_atoms, n)` nm.
+
+    H...A below 0.25 nm and D-H...A above 120°: Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97 (1984), as in
+    `mdtraj.baker_hubbard`. Frames that are not finite form none.
+    """
+    donor, hydrogen, acceptor = triplets.T
+    with np.errstate(invalid="ignore", over="ignore"):
+        to_acceptor = squared_distance(columns, triplets[:, 1:])
+        to_donor = squared_distance(columns, triplets[:, :2])
+        along = np.zeros_like(to_acceptor)
+        for axis in columns:
+            along += (axis[donor] - axis[hydrogen]) * (axis[acceptor] - axis[hydrogen])
+        bent = along < _HYDROGEN_BOND_COSINE * np.sqrt(to_acceptor * to_donor)
+        formed: npt.NDArray[np.bool_] = bent & (to_acceptor < _HYDROGEN_BOND_NM**2)
+    return formed
+
+
+def triplet_label(scene: Scene, triplet: npt.ArrayLike) -> str:
+    """Return a name for people: 'N-H (NME 3) ... O (ACE 1)'."""
+    donor, hydrogen, acceptor = (int(i) for i in np.asarray(triplet))
+
+    def where(atom: int) -> str:
+        residue = int(scene.residue_of_atom[atom])
+        return f"({scene.residue_names[residue]} {scene.residue_ids[residue]})"
+
+    names = scene.atom_names
+    return f"{names[donor]}-{names[hydrogen]} {where(donor)} ... {names[acceptor]} {where(acceptor)}"
+
+
+def find_rings(scene: Scene) -> tuple[tuple[int, ...], ...]:
+    """Return the rings of 4 to 7 atoms, in order, that hold an atom with four neighbours: those that can pucker."""
+    from systems.chemistry.geometry_rules import small_rings
+    from systems.chemistry.graph import bonded_graph
+
+    graph = bonded_graph(scene)
+    # Without hydrogens, valence does not show in the graph; a flat ring is then found by its amplitude.
+    has_hydrogen = "H" in scene.elements
+    return tuple(
+        _from_lowest(ring, graph)
+        for ring in small_rings(scene)
+        if not has_hydrogen or any(graph.degree(i) == 4 for i in ring)
+    )
+
+
+def _from_lowest(ring: Sequence[int], graph: object) -> tuple[int, ...]:
+    start = ring.index(min(ring))
+    turned = [*ring[start:], *ring[:start]]
+    return tuple(turned if turned[1] < turned[-1] else [turned[0], *turned[:0:-1]])
+
+
+def ring_label(scene: Scene, ring: Sequence[int]) -> str:
+    """Return a name for people: 'ring N-CA-CB-CG-CD (PRO 2)'."""
+    residue = int(scene.residue_of_atom[ring[0]])
+    names = "-".join(scene.atom_names[i] for i in ring)
+    return f"ring {names} ({scene.residue_names[residue]} {scene.residue_ids[residue]})"
+
+
+def pucker(columns: FloatArray, ring: Sequence[int]) -> FloatArray:
+    """Return `(2, n)`: the puckering amplitude Q in nm and an angle in rad, of coordinates `(3, n_atoms, n)` nm.
+
+    The angle is the phase of the second harmonic, phi_2 in [-pi, pi]; for six-membered rings theta in [0, pi] (0 and pi
+    are the chairs, pi/2 boats and twists). The first atom is the lowest in the scene, the second its lower neighbour.
+    Four-membered rings have no second phase: the angle is 0 or pi, the sign of the fold. Source: Cremer and Pople, J.
+    Am. Chem. Soc. 97, 1354 (1975), equations 4 to 14.
+    """
+    n = len(ring)
+    x = columns[:, list(ring)].astype(np.float64)
+    x = x - x.mean(axis=1, keepdims=True)
+    turn = 2.0 * np.pi * np.arange(n) / n
+    first = np.einsum("k,xkn->xn", np.sin(turn), x)
+    second = np.einsum("k,xkn->xn", np.cos(turn), x)
+    normal = np.cross(first, second, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= np.sqrt((normal * normal).sum(0))
+    height = (x * normal[:, None]).sum(0)
+    amplitude = np.sqrt((height**2).sum(0))
+    if n == 4:
+        angle = np.where(height[0] >= 0, 0.0, np.pi)
+    else:
+        in_phase = np.sqrt(2.0 / n) * np.einsum("k,kn->n", np.cos(2 * turn), height)
+        out_of_phase = -np.sqrt(2.0 / n) * np.einsum("k,kn->n", np.sin(2 * turn), height)
+        angle = np.arctan2(out_of_phase, in_phase)
+        if n == 6:
+            q3 = np.einsum("k,kn->n", np.cos(np.pi * np.arange(6)), height) / np.sqrt(6.0)
+            angle = np.arctan2(np.hypot(in_phase, out_of_phase), q3)
+    out: FloatArray = np.stack([amplitude, angle])
+    return out
+
+
+def find_chains(scene: Scene, place: dict[int, int]) -> Chains:
+    """Return the amino acids of `scene`, found in its bond graph, whose four atoms all have a `place` (atom of the
+    scene to column of the frames); none where fewer than `LEAST_RESIDUES` are left."""
+    from systems.chemistry.graph import backbone_torsions, bonded_graph
+
+    graph, found = bonded_graph(scene), backbone_torsions(scene)
+    units = {int(q[2]): (int(q[1]), int(q[2]), int(q[3])) for q in found["phi"]}
+    units |= {int(q[1]): (int(q[0]), int(q[1]), int(q[2])) for q in found["psi"]}
+    following = {int(q[2]): int(q[3]) for q in found["psi"]}
+    of_nitrogen = {n: alpha for alpha, (n, _, _) in units.items()}
+    later = {n for n in following.values() if n in of_nitrogen}
+    rows, chain, labels, proline = [], [], [], []
+    for number, start in enumerate(n for n in of_nitrogen if n not in later):
+        nitrogen: int | None = start
+        while nitrogen in of_nitrogen:
+            n, alpha, carbon = units[of_nitrogen[nitrogen]]
+            oxygens = sorted(i for i in graph[carbon] if scene.elements[i] == "O" and graph.degree(i) == 1)
+            named = [i for i in oxygens if scene.atom_names[i] == "O"]
+            atoms = (n, alpha, carbon, *(named or oxygens)[:1])
+            if len(atoms) == 4 and all(i in place for i in atoms):
+                residue = int(scene.residue_of_atom[alpha])
+                rows.append([place[i] for i in atoms])
+                chain.append(number)
+                labels.append(f"{scene.residue_names[residue]} {scene.residue_ids[residue]}")
+                proline.append(sum(scene.elements[i] == "C" for i in graph[n]) == 3)
+            nitrogen = following.get(carbon)
+    if len(rows) < LEAST_RESIDUES:
+        return NO_CHAINS
+    return Chains(np.array(rows, np.int64), np.array(chain, np.int64), np.array(proline, bool), tuple(labels))
+
+
+def secondary_structure(frames_nm: npt.NDArray[np.floating[Any]], chains: Chains) -> npt.NDArray[np.int8]:
+    """Return `COIL`, `HELIX` or `STRAND` of each residue `(n, n_residues)` in frames `(n, n_atoms, 3)` nm.
+
+    DSSP (Kabsch and Sander, Biopolymers 22, 2577, 1983) as MDTraj computes it, in its three letters: helix is H, G and
+    I, strand E and B, coil the rest. Hydrogens are placed by the backbone. A frame that is not finite is coil.
+    """
+    import mdtraj
+
+    out = np.zeros((len(frames_nm), len(chains.atoms)), dtype=np.int8)
+    if not len(chains.atoms):
+        return out
+    backbone = np.asarray(frames_nm[:, chains.atoms.ravel()], dtype=np.float32)
+    finite = np.isfinite(backbone).all(axis=(1, 2))
+    if finite.any():
+        letters = mdtraj.compute_dssp(mdtraj.Trajectory(backbone[finite], _topology(chains)))
+        codes = np.zeros(letters.shape, dtype=np.int8)
+        for letter, code in _CODES.items():
+            codes[letters == letter] = code
+        out[finite] = codes
+    return out
+
+
+def _topology(chains: Chains) -> Any:
+    """Return MDTraj's topology of the backbones alone: names as DSSP asks for them, whatever the file calls them."""
+    import mdtraj
+    from mdtraj.core import element
+
+    topology = mdtraj.Topology()
+    chain: Any = None
+    for k, proline in enumerate(chains.is_proline):
+        if k == 0 or chains.chain[k] != chains.chain[k - 1]:
+            chain = topology.add_chain()
+        residue = topology.add_residue("PRO" if proline else "ALA", chain)
+        for name, symbol in (("N", "nitrogen"), ("CA", "carbon"), ("C", "carbon"), ("O", "oxygen")):
+            topology.add_atom(name, getattr(element, symbol), residue)
+    return topology
+
+
+def equal_rows(rows: npt.NDArray[np.int64], classes: npt.NDArray[np.int64]) -> list[npt.NDArray[np.intp]]:
+    """Return the groups of `rows` of atoms `(k, m)`, forwards or backwards, that the molecule's symmetry makes equal.
+
+    `classes` `(n_atoms,)` are equal for atoms without an identity of their own. Groups come in order of their first
+    row: the six C-H bonds of two equal methyl groups are one, and which hydrogen is called the first does not matter.
+    """
+    found: dict[tuple[int, ...], list[int]] = {}
+    for k, row in enumerate(classes[rows].tolist()):
+        found.setdefault(min(tuple(row), tuple(row[::-1])), []).append(k)
+    return [np.array(group, dtype=np.intp) for group in found.values()]
+
+
+def group_labels(labels: Sequence[str], groups: Sequence[npt.NDArray[np.intp]]) -> list[str]:
+    """Return the name of the first of each group, and how many more are equal to it."""
+    return [labels[g[0]] + (f" and {len(g) - 1} equal" if len(g) > 1 else "") for g in groups]
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """Return all items, or at most `most` of them, evenly chosen."""
+    return list(items[:: -(-len(items) // most)]) if items else []
+
+
+def over_groups(values: Float64Array, groups: Sequence[npt.NDArray[np.intp]]) -> Float64Array:
+    """Return the means over groups of the last axis, `(..., n_groups)`."""
+    if not groups:
+        return values[..., :0]
+    return np.stack([values[..., g].mean(axis=-1) for g in groups], axis=-1)

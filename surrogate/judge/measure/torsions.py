@@ -1,19 +1,30 @@
-"""Every torsion a molecule can turn about beside phi and psi: omega, chi, rotatable bonds, rotors; symmetry folded."""
+"""Every torsion a molecule can turn about beside phi and psi: omega, chi, rotatable bonds, rotors, symmetry folded; and
+the wells of an angle, its states."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import networkx as nx
 import numpy as np
+import numpy.typing as npt
 
 from systems.scene import Scene
 
 Kind = Literal["ω", "χ", "rotatable", "rotor"]
 
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Segments = Sequence[npt.NDArray[Any]]
+
 _FLAT = 0.25
+_BINS = 72
+# Peaks of an angle are two states where the density between them falls below this share of the lower one.
+_SADDLE = 0.5
+_LEAST_PEAK = 1e-3
 
 
 class Torsion(NamedTuple):
@@ -143,3 +154,87 @@ def _where(scene: Scene, i: int, j: int) -> str:
 
 def _bond(scene: Scene, i: int, j: int) -> str:
     return f"{scene.atom_names[i]}-{scene.atom_names[j]} ({_where(scene, i, j)})"
+
+
+@dataclass(frozen=True, eq=False)
+class Wells:
+    """States of one angle: `of_bin` `(72,)` holds the state of each bin of 5 degrees, -1 on a rim between two."""
+
+    torsion: str
+    of_bin: IntArray
+    names: tuple[str, ...]
+
+    def assign(self, segments: Segments) -> list[IntArray]:
+        """Return the state of every frame: on a rim, that which was left last."""
+        out = []
+        for values in segments:
+            angle = np.asarray(values, dtype=np.float64)
+            finite = np.isfinite(angle)
+            raw = np.where(finite, self.of_bin[_bins_of(np.where(finite, angle, 0.0))], -1)
+            known = np.flatnonzero(raw >= 0)
+            if not len(known):
+                out.append(np.zeros(len(raw), dtype=np.int64))
+                continue
+            before = np.searchsorted(known, np.arange(len(raw)), side="right") - 1
+            out.append(raw[known[np.maximum(before, 0)]])
+        return out
+
+    def labels(self, segments: Segments) -> list[IntArray]:
+        """Return the same, -1 for frames that are not finite."""
+        return [np.where(np.isfinite(x), s, -1) for x, s in zip(segments, self.assign(segments), strict=True)]
+
+
+def find_wells(torsion: str, *samples: Segments) -> Wells:
+    """Return the states of an angle: peaks of its density, mean over the samples, that a deep enough minimum parts."""
+    density = np.zeros(_BINS)
+    for segments in filter(len, samples):
+        values = np.concatenate([np.asarray(x, dtype=np.float64) for x in segments])
+        values = values[np.isfinite(values)]
+        if len(values):
+            density += np.bincount(_bins_of(values), minlength=_BINS) / len(values)
+    # What vibrates by 10 degrees is one peak, of however few frames.
+    kernel = np.exp(-0.5 * (np.arange(-6, 7) / 2.0) ** 2)
+    smooth = sum(w * np.roll(density, k) for k, w in zip(range(-6, 7), kernel / kernel.sum(), strict=True))
+    assert isinstance(smooth, np.ndarray)
+    edges = _minima(smooth)
+    if len(edges) < 2:
+        return Wells(torsion, np.zeros(_BINS, dtype=np.int64), ("",))
+    of_bin = np.searchsorted(edges, np.arange(_BINS), side="right") - 1
+    of_bin = np.where(of_bin < 0, len(edges) - 1, of_bin)
+    degrees = [5 * e - 180 for e in edges]
+    names = tuple(f"{a}° to {b}°" for a, b in zip(degrees, degrees[1:] + degrees[:1], strict=True))
+    rim = np.concatenate([(edges - 2) % _BINS, (edges - 1) % _BINS, edges, (edges + 1) % _BINS])
+    cores = of_bin.copy()
+    cores[rim] = -1
+    # A state that is all rim keeps its bins.
+    for k in range(len(names)):
+        if not (cores == k).any():
+            cores[of_bin == k] = k
+    return Wells(torsion, cores, names)
+
+
+def _minima(smooth: FloatArray) -> IntArray:
+    """Return the bins at which states of a circular density begin, ascending: the minima between its peaks."""
+    before, after = np.roll(smooth, 1), np.roll(smooth, -1)
+    peaks = np.flatnonzero((smooth > before) & (smooth >= after) & (smooth > _LEAST_PEAK / 10)).tolist()
+
+    def saddle(a: int, b: int) -> tuple[float, int]:
+        path = np.arange(a, b + _BINS * (b <= a) + 1) % _BINS
+        # The middle of a level minimum, such as of empty bins.
+        lowest = np.flatnonzero(smooth[path] <= smooth[path].min() + 1e-12)
+        return float(smooth[path].min()), int(path[lowest[len(lowest) // 2]])
+
+    while len(peaks) > 1:
+        depth = [saddle(a, b)[0] / min(smooth[a], smooth[b]) for a, b in zip(peaks, peaks[1:] + peaks[:1], strict=True)]
+        worst = int(np.argmax(depth))
+        if depth[worst] <= _SADDLE:
+            break
+        pair = (worst, (worst + 1) % len(peaks))
+        peaks.pop(min(pair, key=lambda i: smooth[peaks[i]]))
+    if len(peaks) < 2:
+        return np.empty(0, dtype=np.int64)
+    return np.sort([saddle(a, b)[1] for a, b in zip(peaks, peaks[1:] + peaks[:1], strict=True)])
+
+
+def _bins_of(angle: FloatArray) -> IntArray:
+    return np.floor((angle + math.pi) / (2 * math.pi) * _BINS).astype(np.int64) % _BINS

@@ -1,27 +1,30 @@
-"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene."""
+"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene.
+
+It is read from files that are opened, matched to the reference's atoms, made whole and laid out in time, and holds what
+they say of themselves: settings, costs, what guards did.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.read.account_of_guards import COLUMN, intervention_notes, unseen_notes
-from surrogate.judge.read.reading import common_lag, merged_record, open_matched, time_axis
-from surrogate.judge.read.rounding import grid_of, rounded, rounding_note
-from surrogate.judge.read.stored_frames import StoredFrames
-from surrogate.judge.read.truth_asked import reweighting_notes
-from systems.errors import InputError, listed
+from surrogate.judge.read.common_atoms import Match, match_scenes, solute_atoms
+from surrogate.judge.read.stored_frames import StoredFrames, bond_tree, grid_of, rounded, rounding_note
+from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
 from systems.scene import Scene, part_of
-from systems.trajectory.codec import replicas_of
+from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.codec import DIFFERENCE_COLUMN, replicas_of, reweighting
 from systems.units import format_time_ps
 
 Frames = npt.NDArray[np.float32] | StoredFrames
@@ -34,6 +37,18 @@ STOPPED = "Stopped before the end"
 _LEAST_FRAMES = 10
 # Of a sample of frames, about as many numbers.
 _SAMPLED_VALUES = 20_000_000
+# Scalar column, 0 for a frame that nothing was done about.
+GUARD_COLUMN = "intervention"
+FloatArray = npt.NDArray[np.float64]
+
+_LEAST = 10
+# Below this share of effective frames populations of the truth and of the model are two things.
+_FEW = 0.5
+_WIDEST_BOND_NM = 0.3
+# No MD saves frames this close; and a DCD header of one AKMA unit of time is a default, not a time.
+_LEAST_LAG_PS = 1e-4
+_AKMA_PS = 0.04888821
+_SETTINGS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "model", "weights_hash")
 
 
 def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
@@ -217,8 +232,8 @@ def load_ensemble(
             flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
         if reader.chunk_idx is not None:
             chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
-        if COLUMN in reader.scalars:
-            changed += np.split(reader.scalars[COLUMN] > 0, cuts)
+        if GUARD_COLUMN in reader.scalars:
+            changed += np.split(reader.scalars[GUARD_COLUMN] > 0, cuts)
         if len(replicas) > 1:
             notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
         records += [record for _, record in replicas]
@@ -301,3 +316,186 @@ def _common_strides(lags_ps: Sequence[float]) -> list[int]:
     for lag in lags[1:]:
         common = Fraction(math.lcm(common.numerator, lag.numerator), math.gcd(common.denominator, lag.denominator))
     return [int(common / lag) for lag in lags]
+
+
+def unseen_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return that a rollout's molecule was not trained on, else nothing."""
+    if not any(r.get("unseen_molecule") for r in records):
+        return []
+    return [f"{label}: its weights ({records[0].get('weights')}) were not trained on this molecule."]
+
+
+def intervention_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what the guards of a rollout did, replicas together, and what it may do to statistics; else nothing."""
+    accounts = [r["interventions"] for r in records if isinstance(r.get("interventions"), dict)]
+    frames: Counter[str] = Counter()
+    bias: dict[str, None] = {}
+    for account in accounts:
+        frames.update({str(k): int(v) for k, v in account.get("frames", {}).items()})
+        bias |= dict.fromkeys(str(why) for why in account.get("bias", []))
+    if not frames:
+        return []
+    chunks, caught = (sum(int(a.get(key, 0)) for a in accounts) for key in ("chunks", "chunks_caught"))
+    done = ", ".join(f"{n} {name}" for name, n in frames.items())
+    return [
+        f"{label}: guard {accounts[0].get('guard')} stepped in in {caught} of {chunks} chunks; frames that are not the "
+        f"model's first draw: {done}. What that may do: {'; '.join(bias)}."
+    ]
+
+
+def reweighting_notes(
+    label: str, records: Sequence[Mapping[str, Any]], scalars: Sequence[Mapping[str, FloatArray]]
+) -> list[str]:
+    """Return how far a learned potential's frames are those of its truth, where a rollout asked it; else nothing."""
+    temperature = records[0].get("temperature_k") if records else None
+    columns = [s[DIFFERENCE_COLUMN] for s in scalars if DIFFERENCE_COLUMN in s]
+    if not columns or not isinstance(temperature, int | float):
+        return []
+    asked = np.concatenate(columns)
+    asked = asked[~np.isnan(asked)]
+    known = asked[np.isfinite(asked)]
+    if len(known) < _LEAST:
+        return []
+    _, effective = reweighting(known, float(temperature))
+    truth = records[0].get("force_field", "its truth")
+    few = "" if effective >= _FEW * len(known) else "; so few say that populations of the two differ: train longer"
+    none = f" and has no energy for {len(asked) - len(known)} more" if len(known) < len(asked) else ""
+    return [
+        f"{label}: {truth} was asked about {len(known)} frames{none}: U({truth}) - U(model) is {known.mean():.3g} "
+        f"kJ/mol with a standard deviation of {known.std():.3g}. Reweighted by exp(-difference / kT) at "
+        f"{temperature:g} K, {effective:.0f} of {len(known)} frames are effective{few}."
+    ]
+
+
+class Opened(NamedTuple):
+    """An open file: its frames in the template's order, and which of the template's atoms they are."""
+
+    reader: TrajectoryReader
+    frames: StoredFrames
+    template: Scene
+    kept: IntArray
+
+
+def open_matched(path: Path, template: Scene | None, top: Path | None, notes: list[str]) -> Opened:
+    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`.
+
+    Raises InputError, OutOfDomainError (another molecule), TrajectoryError.
+    """
+    from systems.trajectory.codec import open_trajectory
+
+    reader = open_trajectory(path, top=top)
+    if reader.n_frames == 0:
+        reader.close()
+        raise InputError(f"{path}: no frames.")
+    notes.extend(f"{path}: {note}" for note in reader.notes)
+    scene = reader.scene
+    order: IntArray | None = None
+    if scene is None and template is None:
+        raise InputError(f"{path} holds no topology; give one with `top='FILE.pdb'`.")
+    if template is None:
+        assert scene is not None
+        order = solute_atoms(scene)
+        if len(order) < scene.n_atoms:
+            notes.append(f"{path}: water and single ions are left out ({scene.n_atoms - len(order)} atoms).")
+            template = part_of(scene, order)
+        else:
+            order, template = None, scene
+        kept = np.arange(template.n_atoms)
+    elif scene is None:
+        kept = np.arange(template.n_atoms)
+        if reader.n_atoms != template.n_atoms:
+            raise OutOfDomainError(
+                f"{path} has {reader.n_atoms} atoms, {template.name!r} has {template.n_atoms}; give its topology with "
+                "`top`."
+            )
+        notes.append(f"{path}: no topology; its atoms are taken to be in the order of {template.name!r}.")
+    else:
+        try:
+            match = match_scenes(scene, template)
+        except OutOfDomainError as error:
+            raise OutOfDomainError(f"{path} does not hold the molecule of the reference: {error}") from error
+        order, kept = match.order, match.kept
+        moved = len(order) < reader.n_atoms or bool((order != np.arange(len(order))).any())
+        if match.how:
+            notes.append(_matched_note(path, match, template, moved))
+        order = order if moved else None
+    tree = None
+    cells = reader.read_cells(0, 1)
+    if cells is not None and len(cells) and float(np.linalg.norm(cells[0], axis=1).min()) > 2 * _WIDEST_BOND_NM:
+        tree = bond_tree(scene or template)
+        notes.append(f"{path}: periodic; molecules are made whole.")
+    return Opened(reader, StoredFrames(reader, order=order, tree=tree), template, kept)
+
+
+def _matched_note(path: Path, match: Match, template: Scene, moved: bool) -> str:
+    how = "reordered" if moved else "in the same order"
+    if len(match.kept) < template.n_atoms:
+        how = f"{len(match.kept)} of {template.n_atoms} atoms"
+    return f"{path}: atoms matched by {match.how} ({how})."
+
+
+def time_axis(
+    path: str, time_ps: npt.NDArray[np.float64] | None, n_frames: int, stated: float | None
+) -> tuple[float, list[int], list[str]]:
+    """Return the lag (NaN when one frame leaves it open), the frames at which a new segment starts, and notes."""
+    steps = np.empty(0) if time_ps is None else np.diff(time_ps)
+    measured = float(f"{np.median(steps):.6g}") if len(steps) else math.nan
+    if stated is not None:
+        note = []
+        if math.isfinite(measured) and abs(measured - stated) > 1e-3 * stated:
+            note = [f"{path}: {format_time_ps(stated)} per frame as stated; the file itself says {measured:g} ps."]
+        return stated, [], note
+    if n_frames < 2:
+        return math.nan, [], []
+    if time_ps is None or not (np.isfinite(time_ps).all() and measured > 0):
+        raise InputError(f"{path}: the file holds no usable times; state the time between frames with `dt_ps='1ps'`.")
+    if measured < _LEAST_LAG_PS or abs(measured - _AKMA_PS) < 1e-6:
+        raise InputError(
+            f"{path}: its header says {1e3 * measured:.3g} fs between frames, which is what a writer that was told "
+            "nothing puts there; state the time between frames with `dt_ps='1ps'`."
+        )
+    # Times that passed through float32 are exact only to its spacing.
+    tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
+    odd = np.abs(steps - measured) > tolerance
+    jump = odd & ((steps <= 0) | (steps >= 1.5 * measured))
+    if (odd & ~jump).any() or jump.sum() > 0.02 * len(steps):
+        first = int(np.flatnonzero(odd)[0])
+        raise TrajectoryError(
+            f"{path}: time is uneven (frame {first} to {first + 1}: {steps[first]:g} ps, most steps {measured:g} ps); "
+            "state the time between frames with `dt_ps` if you know it to be even."
+        )
+    cuts = (np.flatnonzero(jump) + 1).tolist()
+    notes = [f"{path}: time jumps {len(cuts)} times; the stretches between are treated as segments."] if cuts else []
+    return measured, cuts, notes
+
+
+def common_lag(lags: Sequence[float], paths: Sequence[str | Path], stated: float | None) -> float:
+    """Return the one save interval of all replicas, ps. Raises InputError when they differ or none is known."""
+    if stated is not None:
+        return stated
+    if not lags:
+        raise InputError(
+            f"{paths[0]}: one frame only, so the time between frames is unknown; state it with `dt_ps='1ps'`."
+        )
+    if max(lags) - min(lags) > 1e-3 * min(lags):
+        listed = ", ".join(f"{p}: {x:g} ps" for p, x in zip(paths, lags, strict=False))
+        raise InputError(
+            f"Replicas of one candidate must share one save interval ({listed}); thin them or use `dt_ps`."
+        )
+    return lags[0]
+
+
+def merged_record(records: Sequence[dict[str, Any]], label: str, notes: list[str]) -> dict[str, Any]:
+    """Return the first record with costs summed over all, noting settings in which the files differ."""
+    merged = dict(records[0])
+    for key in _SETTINGS:
+        values = {str(r.get(key)) for r in records}
+        if len(values) > 1:
+            notes.append(f"{label}: its files differ in {key} ({', '.join(sorted(values))}).")
+    costs = [c for c in (r.get("cost") for r in records) if isinstance(c, dict)]
+    merged.pop("cost", None)
+    if len(costs) == len(records):
+        shared = set.intersection(*(set(c) for c in costs))
+        numbers = sorted(k for k in shared if all(isinstance(c[k], (int, float)) for c in costs))
+        merged["cost"] = {k: sum(c[k] for c in costs) for k in numbers}
+    return merged

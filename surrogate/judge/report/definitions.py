@@ -31,7 +31,7 @@ DEFINITIONS: tuple[Definition, ...] = (
         "Blocks",
         "Error bars and tests rest on blocks of ten correlation times of the slowest motion found among all torsions, "
         "rings, size and shape, and TIC 0, in reference and replicate together. What moves fast within a state (φ "
-        "given ψ's basin, steps, lifetimes) has blocks of its own. Fewer than 20 independent samples, or states "
+        "given ψ's basin, steps) has blocks of its own. Fewer than 20 independent samples, or states "
         "between which hardly any run passes: undecided.",
         "Flyvbjerg and Petersen, J. Chem. Phys. 91, 461 (1989)",
     ),
@@ -66,7 +66,7 @@ DEFINITIONS: tuple[Definition, ...] = (
     ),
     Definition(
         "Basins",
-        "α: -120° ≤ ψ < 80°; β: the rest of the circle; the cuts lie at the two minima of the ψ density of "
+        "β: ψ outside of -120° ≤ ψ < 80°, which is α; the cuts lie at the two minima of the ψ density of "
         "alanine dipeptide. φ > 0: the left-handed region. Frames that are not finite belong to no basin and stay in "
         "the denominator. Tolerance: a free-energy difference of 1 kJ/mol at 300 K.",
         "",
@@ -131,17 +131,6 @@ DEFINITIONS: tuple[Definition, ...] = (
         "at H above 120°. Of those that the molecule's symmetry makes equal (the hydrogens of an ammonium, the oxygens "
         "of a carboxylate) the mean is taken.",
         "Baker and Hubbard, Prog. Biophys. Mol. Biol. 44, 97 (1984)",
-    ),
-    Definition(
-        "Ring pucker",
-        "Amplitude Q, and the phase φ₂ (θ for six-membered rings), of rings of 4 to 7 atoms that are not flat.",
-        "Cremer and Pople, J. Am. Chem. Soc. 97, 1354 (1975)",
-    ),
-    Definition(
-        "³J(HN,HA)",
-        "8.40 cos²θ - 1.36 cos θ + 0.33 Hz with θ = φ - 60° (φ + 60° for D residues, the mean of both for glycine), "
-        "averaged over frames.",
-        "Karplus, J. Chem. Phys. 30, 11 (1959); Vögeli et al., J. Am. Chem. Soc. 129, 9377 (2007)",
     ),
     Definition(
         "Valid frames",

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure.distributions import free_energy_kj
-from surrogate.judge.report.figures import MAP_MAX_KJ, ramachandran
+from surrogate.judge.report.figures import MAP_MAX_KJ, energy_map
 from surrogate.judge.report.figures import Figure as Picture
-from systems.units import GAS_CONSTANT_KJ_MOL_K
+from surrogate.judge.rows.charts import Chart, Histogram, Landscape
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,15 +21,17 @@ FloatArray = npt.NDArray[np.float64]
 _MOST_ROWS, _MOST_HISTOGRAMS, _MOST_MAPS = 4, 6, 6
 
 
-def overview(drawn: Sequence[tuple[str, Sequence[Any], Sequence[Any]]], temperature_k: float) -> Figure:
+def overview(drawn: Sequence[tuple[str, Sequence[Chart]]], temperature_k: float) -> Figure:
     """Return a figure: free energy over φ and ψ, kJ/mol, a row a residue, reference, replicate and each candidate in
     columns; of a molecule without a backbone the densities of what was measured, each candidate a row.
 
-    `drawn`: of each candidate its label, its maps over φ and ψ, and its histograms.
+    `drawn`: of each candidate its label and its charts.
     """
     from matplotlib.figure import Figure
 
-    labels, maps, histograms = zip(*drawn, strict=True)
+    labels = [label for label, _ in drawn]
+    maps = [[c for c in charts if isinstance(c, Landscape) and c.x_label == "φ / °"] for _, charts in drawn]
+    histograms = [[c for c in charts if isinstance(c, Histogram)] for _, charts in drawn]
     figure: Any = Figure(layout="constrained")
     if not maps[0]:
         n = min(_MOST_HISTOGRAMS, max(len(histograms[0]), 1))
@@ -54,7 +56,7 @@ def overview(drawn: Sequence[tuple[str, Sequence[Any], Sequence[Any]]], temperat
             energy = np.clip(free_energy_kj(counts, temperature_k), 0.0, MAP_MAX_KJ)
             image = axes.imshow(energy.T, origin="lower", extent=(-180, 180, -180, 180), aspect="auto",
                                 vmin=0.0, vmax=MAP_MAX_KJ, cmap="viridis_r")  # fmt: skip
-            axes.set_title(f"{name}, {residue.label}", fontsize=8)
+            axes.set_title(f"{name}, {residue.title}", fontsize=8)
             axes.set(xlabel="φ / °" if k == n - 1 else "", ylabel="ψ / °" if axes is row[0] else "")
         figure.colorbar(image, ax=row.tolist(), label="kJ/mol")
     return figure
@@ -92,12 +94,16 @@ def answer_overview(molecule: str, answer: dict[str, Any]) -> Figure:
     return figure
 
 
-def weighted_maps(maps: dict[str, FloatArray], temperature_k: float) -> list[Picture]:
+def weighted_maps(maps: dict[str, FloatArray]) -> list[Picture]:
     """Return the report's pictures of MD's answer: the free energy (kJ/mol, `(36, 36)`) of the first residues."""
-    rt_kj = GAS_CONSTANT_KJ_MOL_K * temperature_k
+    edges = np.linspace(-180.0, 180.0, 37)
+
+    def shown(energy: FloatArray) -> FloatArray:
+        return np.where(np.isfinite(energy), np.minimum(energy, MAP_MAX_KJ), np.nan)
+
     return [
         Picture(
-            ramachandran(f"By MD's weights, {label}", np.exp(-energy / rt_kj), temperature_k),
+            energy_map(f"By MD's weights, {label}", shown(energy), (edges, edges), ("φ / °", "ψ / °")),
             f"{label}: free energy by MD's answer, all its frames weighted",
         )
         for label, energy in list(maps.items())[:_MOST_MAPS]

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.equal_atoms import over_groups
-from surrogate.judge.measure.probes import Family
+from surrogate.judge.measure.probes import Family, over_groups
 from surrogate.judge.measure.statistics import Estimate, difference_p, estimate, mean_estimate
-from surrogate.judge.rows.rows import Metric, Row, Sample, Trio, observable_row, truth_of
+from surrogate.judge.rows.rows import Quantity, Row, Sample, Trio, observable_row, truth_of
 
 FloatArray = npt.NDArray[np.float64]
 Segments = Sequence[npt.NDArray[Any]]
@@ -94,7 +93,7 @@ def over_equal(means: Means, groups: Sequence[npt.NDArray[np.intp]]) -> Means:
 
 
 def mean_row(
-    trio: Trio, metric: Metric, means: Sequence[Means], k: int, statement: Callable[[float, float], str]
+    trio: Trio, metric: Quantity, means: Sequence[Means], k: int, statement: Callable[[float, float], str]
 ) -> Row:
     """Return the row of the mean of column `k`, from `means` of (reference, candidate, replicate); see
     `observable_row`."""
@@ -103,7 +102,7 @@ def mean_row(
 
 def shift_row(
     trio: Trio,
-    metric: Metric,
+    metric: Quantity,
     means: Sequence[Means],
     labels: Sequence[str],
     statement: Callable[[str, float, float], str],
@@ -132,7 +131,7 @@ def shift_row(
         group=metric.group,
         metric=f"{metric.name}: {labels[worst]}",
         unit=metric.unit,
-        kind="distance",
+        form="distance",
         reference=None,
         candidate=replace(found, low=max(found.low, 0.0)),
         replicate=Estimate(float(floor[at]), error=float((rep.draws - ref.draws)[:, at].std())),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -17,29 +17,34 @@ from surrogate.judge.measure.statistics import Estimate
 
 FloatArray = npt.NDArray[np.float64]
 
-Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "experiment", "worth"]
+Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "worth"]
 Role = Literal["reference", "candidate", "replicate", "other"]
-
-
-def _plain(value: Any) -> Any:
-    """Arrays to lists, rounded to six digits; what is not finite to None."""
-    if isinstance(value, np.ndarray):
-        return [_plain(x) for x in value.tolist()]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    if isinstance(value, (list, tuple)):
-        return [_plain(x) for x in value]
-    if isinstance(value, Curve):
-        return value.to_dict()
-    return value
+ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
 
 
 class Curve:
     """Base of the records below."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {name: _plain(value) for name, value in vars(self).items()}
+        """Return JSON-able values, and under "type" which chart it is."""
+        return {name: jsonable(value) for name, value in vars(self).items()} | {"type": type(self).__name__}
+
+
+def jsonable(value: Any) -> Any:
+    """Return JSON-able values of dataclasses, arrays (six digits) and numbers; what is not finite becomes None."""
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {name: jsonable(x) for name, x in vars(value).items()}
+    if isinstance(value, dict):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(x) for x in value]
+    if isinstance(value, np.ndarray):
+        return jsonable([float(f"{x:.6g}") for x in value] if value.ndim == 1 else list(value))
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +96,9 @@ class LineChart(Curve):
 
 @dataclass(frozen=True, eq=False)
 class Landscape(Curve):
-    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies like the Ramachandran maps.
+    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies: φ and ψ of a residue, or two TICs.
 
-    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`.
+    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`; `captions` below the maps of reference, candidate and replicate.
     """
 
     section: Section
@@ -105,6 +110,7 @@ class Landscape(Curve):
     reference: FloatArray
     candidate: FloatArray
     replicate: FloatArray
+    captions: tuple[str, str, str] = ("Reference", "Candidate", "Replicate")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from surrogate.judge.measure import distributions
+from surrogate.judge.measure.distributions import Bins
 from surrogate.judge.measure.statistics import (
     Blocks,
     Estimate,
@@ -21,19 +22,28 @@ from surrogate.judge.measure.statistics import (
     pooled,
 )
 from surrogate.judge.measure.structure import Backbone, Features
+from surrogate.judge.read.ensemble import Ensemble
+from surrogate.judge.rows.charts import Chart, Histogram, jsonable
 from systems.chemistry.validity import Geometry
 from systems.scene import Scene
-from systems.units import format_time_ps
+from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
 
 FloatArray = npt.NDArray[np.float64]
+Series = Sequence[Sequence[npt.NDArray[Any]]]
 Group = Literal["validity", "structure", "populations", "distributions", "kinetics"]
-Kind = Literal["share", "distance", "observable"]
+Form = Literal["share", "distance", "observable"]
+Kind = Literal["validity", "distribution", "kinetics", "information"]
+# The slowest motion that a row depends on: vibrations and faults of frames; a step from frame to frame; what moves
+# within a state of the slow motion; the slow motion itself.
+TimeScale = Literal["fast", "step", "within states", "slow"]
 Word = Literal["agrees", "close", "differs", "fails", "undecided"]
 
 # A replicate this unlikely to be of one simulation with the reference does not speak for it.
 UNLIKE_BELOW = 1e-3
 # Of a lag, to tell anything at it.
 LEAST_LAGS = 10
+# A population within this factor is 1 kJ/mol away at 300 K.
+ONE_KJ_FACTOR = math.exp(1.0 / (GAS_CONSTANT_KJ_MOL_K * 300.0))
 # Histograms drawn at a time, as numbers: a hundred MB or so.
 _DRAWN_VALUES = 4e6
 
@@ -42,14 +52,13 @@ GROUPS: tuple[Group, ...] = ("validity", "structure", "populations", "distributi
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of a comparison. `tica_lag_ps` and `lags_ps` are rounded to whole frames, which the rows then name.
+    """Settings of a comparison. `tica_lag_ps` is rounded to whole frames, which the rows then name.
 
     `peptide_recipe`: whether the published recipe is followed too (its 10 states take most of the time of a short
     comparison, and no verdict rests on it).
     """
 
     tica_lag_ps: float = 10.0
-    lags_ps: tuple[float, ...] = (1.0, 10.0, 50.0)
     n_bootstrap: int = 400
     n_permutations: int = 1000
     seed: int = 0
@@ -58,7 +67,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Metric:
+class Quantity:
     """What one row is about: its key and group, its name and unit for people, and the deviation that is tolerated.
 
     `tolerance` is in `unit`; of a positive, skewed number, such as a time or a width (`relative`), it is a share of the
@@ -81,21 +90,33 @@ class Metric:
         return f"{100 * self.tolerance:g} %" if self.relative else f"{self.tolerance:g} {self.unit}".rstrip()
 
 
+Skipped = tuple[str, str]
+
+
+class Measured(NamedTuple):
+    """What one metric finds: rows of the table, charts, and what it left out, each with the reason."""
+
+    rows: Sequence[Row] = ()
+    charts: Sequence[Chart] = ()
+    skipped: Sequence[Skipped] = ()
+
+
 @dataclass(frozen=True)
 class Row:
     """One metric of one candidate, between the reference and its replicate.
 
-    `kind` says how it is judged: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
+    `form` says how it is judged: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
     floor; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is the part of
     frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against reference
     and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows.
+    `kind` and `time_scale` are those of the `Metric` that measured it.
     """
 
     key: str
     group: Group
     metric: str
     unit: str
-    kind: Kind
+    form: Form
     reference: Estimate | None
     candidate: Estimate
     replicate: Estimate | None
@@ -108,20 +129,12 @@ class Row:
     divergence: tuple[float, float] | None = None
     p_corrected: float = math.nan
     verdict: Word = "undecided"
+    kind: Kind = "distribution"
+    time_scale: TimeScale = "slow"
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; what is not finite becomes None."""
-        out: dict[str, Any] = {}
-        for key, value in vars(self).items():
-            if isinstance(value, Estimate):
-                out[key] = value.to_dict()
-            elif isinstance(value, float):
-                out[key] = value if math.isfinite(value) else None
-            elif isinstance(value, tuple):
-                out[key] = [x if math.isfinite(x) else None for x in value]
-            else:
-                out[key] = value
-        return out
+        return {name: jsonable(value) for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +157,8 @@ class Trio:
     """Reference, candidate and replicate at equal lag and equal frame count, and what they are measured with.
 
     `recipes`: what the published recipe fitted on the reference, by the number of its frames; the candidates of one
-    comparison share it.
+    comparison share it. `trajectories`: reference, candidate and replicate (None where there is none) whole, as they
+    were read.
     """
 
     scene: Scene
@@ -156,6 +170,7 @@ class Trio:
     options: Options
     temperature_k: float = 300.0
     recipes: dict[int, Any] = field(default_factory=dict)
+    trajectories: tuple[Ensemble, Ensemble, Ensemble | None] | None = None
 
     @property
     def compared_ps(self) -> float:
@@ -244,7 +259,7 @@ def distance_row(
         group=group,
         metric=metric,
         unit="",
-        kind="distance",
+        form="distance",
         reference=None,
         candidate=_distance_estimate(to_candidate, draws_candidate, n_blocks),
         replicate=_distance_estimate(to_replicate, draws_replicate, n_blocks),
@@ -256,6 +271,62 @@ def distance_row(
         statement=statement(ratio.value) if math.isfinite(ratio.value) else f"{metric}: not as in the reference",
         divergence=(to_candidate**2, to_replicate**2) if n_series == 1 else None,
     )
+
+
+def series_distance(trio: Trio, series: Series, bins: Bins, key: str, name: str, group: Group) -> Row:
+    """Return the Jensen-Shannon distance row of one series `(n,)` per segment and sample."""
+    counts = [distributions.block_counts(v, bins, s.blocks) for s, v in zip(trio.samples, series, strict=True)]
+    low = name if name[1:2].isupper() else name[0].lower() + name[1:]
+    return distance_row(
+        trio,
+        counts,
+        key=key,
+        group=group,
+        metric=f"{name}, distance",
+        statement=lambda ratio: f"the distribution of {low} is {ratio:.2g} times as far off as a replicate's",
+    )
+
+
+def mean_distance(
+    trio: Trio,
+    segments: Sequence[Sequence[npt.NDArray[Any]]],
+    bins: Sequence[Bins],
+    key: str,
+    name: str,
+    group: Group,
+    groups: Sequence[npt.NDArray[np.intp]] | None = None,
+) -> Row:
+    """Return the row of the mean Jensen-Shannon distance over the columns `(n, k)`, one `Bins` each.
+
+    With `groups` of equal columns, one histogram and one `Bins` a group.
+    """
+    chosen = [np.array([k]) for k in range(len(bins))] if groups is None else groups
+    counts = [
+        np.stack([distributions.grouped_counts(v, g, own, s.blocks) for g, own in zip(chosen, bins, strict=True)], 1)
+        for s, v in zip(trio.samples, segments, strict=True)
+    ]
+    what = f"{name}, distance" if len(bins) == 1 else f"{name}, mean distance of {len(bins)}"
+    low = name[0].lower() + name[1:]
+    return distance_row(
+        trio,
+        counts,
+        key=key,
+        group=group,
+        metric=what,
+        statement=lambda ratio: f"{low}: distributions {ratio:.2g} times as far off as a replicate's",
+    )
+
+
+def histogram(trio: Trio, series: Series, bins: Bins, label: str, unit: str) -> Histogram:
+    """Return the densities of (reference, candidate, replicate), normalised over all frames, in range or not."""
+    width = (bins.high - bins.low) / bins.n
+    densities, outside = [], []
+    for sample, segments in zip(trio.samples, series, strict=True):
+        counts = distributions.block_counts(segments, bins, sample.blocks).sum(0)
+        densities.append(counts[: bins.n] / counts.sum() / width)
+        outside.append(float(counts[bins.n :].sum() / counts.sum()))
+    ref, cand, rep = densities
+    return Histogram(label, unit, bins.edges, ref, cand, rep, (outside[0], outside[1], outside[2]))
 
 
 Distance = Callable[[FloatArray, FloatArray], FloatArray]
@@ -322,7 +393,7 @@ def _distance_estimate(value: float, draws: FloatArray, n_blocks: int) -> Estima
 
 def observable_row(
     trio: Trio,
-    metric: Metric,
+    metric: Quantity,
     values: Sequence[float],
     draws: Sequence[FloatArray],
     statement: Callable[[float, float], str],
@@ -348,7 +419,7 @@ def observable_row(
         group=metric.group,
         metric=metric.name,
         unit=metric.unit,
-        kind="observable",
+        form="observable",
         reference=ref,
         candidate=cand,
         replicate=rep,

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import copy
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
-from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.autoencoder import Autoencoder
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.transformer import Approximator
+from surrogate.models.lam_slide.network import Approximator, Autoencoder, LamSlideConfig
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
 
+if TYPE_CHECKING:
+    pass
 
-class LamSlide(Surrogate):
-    """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.interface`.
+
+class LamSlide(Propagator):
+    """Encoder, approximator and decoder (section 3), behind the contract of `surrogate.models.propagator`.
 
     Latents are used as (z - mean) / scale with a mean per latent component and one common scale, both measured on the
     training frames: LayerNorm bounds their power but leaves constant offsets that carry no information.
@@ -40,10 +41,6 @@ class LamSlide(Surrogate):
         self.lag_ps = config.approximator.lag_range_ps[0] if config.approximator.lag_range_ps else None
         self.register_buffer("latent_mean", torch.zeros(n_latents, latent_dim))
         self.register_buffer("latent_scale", torch.ones(()))
-
-    @property
-    def canonical(self) -> bool:
-        return self.config.canonical
 
     @property
     def n_conditioning(self) -> int:
@@ -100,7 +97,7 @@ class LamSlide(Surrogate):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Surrogate.next_chunk`. Velocities play no part."""
+        """See `Propagator.next_chunk`. Velocities play no part."""
         solver = solver or self.solvers[0]
         if solver in flow.ADAPTIVE and len(noise) > 1:
             pairs = zip(last_frames_nm.split(1), noise.split(1), strict=True)
@@ -108,7 +105,9 @@ class LamSlide(Surrogate):
             mean = sum(row.evaluations or 0.0 for row in rows) / len(rows)
             return Chunk(torch.cat([row.frames_nm for row in rows]), evaluations=mean)
         c = self.config.approximator
-        known = self.encode(last_frames_nm, molecule.elements)
+        # Frames that training turned at random, it had about their middle.
+        middle_nm = 0.0 if self.config.canonical else last_frames_nm[:, -1:].mean(-2, keepdim=True)
+        known = self.encode(last_frames_nm - middle_nm, molecule.elements)
         lag = self.embedded_lag(None, len(known))
         memory = self.approximator.remember(known, lag) if c.clean_conditioning else None
         evaluations = 0
@@ -120,4 +119,4 @@ class LamSlide(Surrogate):
 
         latents = flow.SOLVERS[solver](predict, noise, solver_steps, c.interpolant)
         frames = self.decode(latents[:, self.n_conditioning :], last_frames_nm.shape[-2])
-        return Chunk(frames, evaluations=float(evaluations))
+        return Chunk(frames + middle_nm, evaluations=float(evaluations))

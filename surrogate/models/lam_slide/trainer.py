@@ -2,29 +2,230 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.strides import StrideSampler, strides_up_to
-from surrogate.data.weights import Weights, save_weights
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.losses import FlowWindows, autoencoder_loss, draw_flow_times, flow_loss
+from surrogate.data.references import References, StrideSampler, Survey, strides_up_to
+from surrogate.models.architecture import (
+    AdvanceFn,
+    Architecture,
+    Choice,
+    Prepared,
+    Settings,
+    Suitability,
+    Trainer,
+    TrainingRequest,
+)
+from surrogate.models.lam_slide import flow
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.subjects import Subject, normalise_latents
-from surrogate.models.precision import bf16_pays
-from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of, training_domain
+from surrogate.models.lam_slide.network import (
+    AutoencoderConfig,
+    LamSlideConfig,
+    draw_identifiers,
+    reconstruction_losses,
+)
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
+from surrogate.training.devices import bf16_pays
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 from systems.units import whole_steps
+
+# The two stages' losses: reconstruction (stage one) and data-prediction flow matching (stage two).
+
+# The weight 1 / sigma^2 diverges at the data end; flow times stop just before it.
+TAU_MAX = 0.995
+
+
+def random_rotations(n: int, generator: torch.Generator) -> Tensor:
+    """Return `(n, 3, 3)` rotations, uniform over SO(3): normalised Gaussian quaternions."""
+    w, x, y, z = F.normalize(torch.randn(n, 4, generator=generator), dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(n, 3, 3)
+
+
+def autoencoder_loss(
+    model: LamSlide, frames_nm: Tensor, elements: Tensor, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Stage one on frames `(b, n_atoms, 3)` nm: eq. 13, 14 and 16 with table weights; identifiers of Algorithm 1."""
+    c = model.config.autoencoder
+    batch, n_atoms, _ = frames_nm.shape
+    x = frames_nm / model.config.position_scale_nm
+    identifiers = model.identifiers(n_atoms).expand(batch, -1)
+    if c.random_identifiers > 0:
+        drawn = draw_identifiers(identifiers.shape[1], c.identifier_pool, batch, generator).to(x.device)
+        pick = torch.rand(batch, 1, generator=generator).to(x.device) < c.random_identifiers
+        identifiers = torch.where(pick, drawn, identifiers)
+    numbers = elements.expand(batch, n_atoms)
+    latents = model.autoencoder.encode(x, numbers, identifiers)
+    noise = torch.randn(latents.shape, generator=generator).to(x.device)
+    decoded = model.autoencoder.decode(latents + c.latent_noise * noise, identifiers, with_types=c.type_weight > 0)
+    position, distance = reconstruction_losses(x, decoded.positions)
+    loss = c.position_weight * position + c.distance_weight * distance
+    terms = {"position": position, "distance": distance}
+    if decoded.type_logits is not None:
+        terms["type"] = F.cross_entropy(decoded.type_logits.flatten(0, 1), numbers.flatten())
+        loss = loss + c.type_weight * terms["type"]
+    return loss, {k: v.detach() for k, v in terms.items()}
+
+
+def draw_flow_times(model: LamSlide, batch: int, generator: torch.Generator) -> Tensor:
+    """Return flow times `(batch,)` in [0, TAU_MAX], logit-normal or uniform."""
+    c = model.config.approximator
+    if c.uniform_tau:
+        return torch.rand(batch, generator=generator).clamp(max=TAU_MAX)
+    draws = torch.randn(batch, generator=generator) * c.tau_scale + c.tau_location
+    return torch.sigmoid(draws).clamp(max=TAU_MAX)
+
+
+@dataclass(frozen=True, eq=False)
+class FlowWindows:
+    """A batch of windows of one molecule as stage two sees them: clean `latents (b, T, L, dim)` of `n_atoms` atoms.
+
+    `lag`: see `LamSlide.embedded_lag`.
+    """
+
+    latents: Tensor
+    n_atoms: int
+    lag: Tensor | None = None
+
+
+def flow_loss(
+    model: LamSlide, windows: FlowWindows, tau: Tensor, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return stage two's loss at flow times `tau (b,)`, and its terms: eq. 9 on the predicted frames (with
+    `loss_on_given` on all), plus decoded position and distance.
+
+    With preconditioning the error is divided by c_out^2, so that every flow time asks for the same relative precision;
+    without it the weight is one, as in the paper. The decoded terms compare with the decoded clean latents, so that the
+    decoder's own error is not charged to the approximator.
+    """
+    c = model.config.approximator
+    latents = windows.latents
+    known = latents[:, : c.n_conditioning]
+    noise = torch.randn(latents.shape, generator=generator).to(latents.device)
+    alpha, sigma, _, _ = (flow.expand(v, latents) for v in flow.coefficients(tau, c.interpolant))
+    noisy = alpha * latents + sigma * noise
+    first = 0 if c.loss_on_given else c.n_conditioning
+    prediction = model.approximator(noisy, tau, known, lag=windows.lag)[:, first:]
+    target = latents[:, first:]
+    weight = torch.ones_like(tau)
+    if c.precondition:
+        weight = flow.preconditioning(tau, c.interpolant)[1].square().reciprocal()
+    loss = ((prediction - target).square().flatten(1).mean(1) * weight).mean()
+    terms = {"flow": loss.detach()}
+    if c.auxiliary_frames and (c.position_weight or c.distance_weight):
+        pick = torch.randint(target.shape[1], (c.auxiliary_frames,), generator=generator)
+        scale = model.config.position_scale_nm
+        decoded = model.decode(prediction[:, pick], windows.n_atoms) / scale
+        with torch.no_grad():
+            clean = model.decode(target[:, pick], windows.n_atoms) / scale
+        w = weight.reshape(-1, 1, 1, 1).sqrt()
+        position = ((decoded - clean) * w).square().sum(-1).mean()
+        i, j = torch.triu_indices(windows.n_atoms, windows.n_atoms, 1)
+        span = lambda x: ((x[..., i, :] - x[..., j, :]).square().sum(-1) + 1e-12).sqrt()  # noqa: E731
+        distance = ((span(decoded) - span(clean)) * w[..., 0]).square().mean()
+        loss = loss + c.position_weight * position + c.distance_weight * distance
+        terms |= {"position": position.detach(), "distance": distance.detach()}
+    return loss, terms
+
+
+# Dataset of one molecule for LaM-SLidE's two stages: its frames, windows of them, their latents, input features.
+
+_HELD_FRAMES = 2048
+_BLOCK = 8192
+
+
+@dataclass(eq=False)
+class Subject:
+    """Frames of one molecule and its input features. `latents` (n_frames, n_latents, dim): those of all
+    frames, once stage one is over, where poses stay and memory suffices."""
+
+    frames: TrainingFrames
+    molecule: Molecule
+    latents: Tensor | None = None
+
+    @staticmethod
+    def of(frames: TrainingFrames, model: LamSlide) -> Subject:
+        return Subject(frames, model.featurise(frames.scene).to(model.latent_mean.device))
+
+    @property
+    def n_atoms(self) -> int:
+        return self.molecule.n_atoms
+
+    def poses(self, model: LamSlide, rows: int, generator: torch.Generator) -> Tensor | None:
+        """Return a rotation `(rows, 3, 3)` for each window, uniform; None where poses stay as they are."""
+        return None if model.config.canonical else random_rotations(rows, generator)
+
+    def seen(self, x: Tensor, turns: Tensor | None) -> Tensor:
+        """Return frames `(b, ..., n_atoms, 3)` turned, on the model's device."""
+        if turns is not None:
+            x = torch.einsum("bij,b...nj->b...ni", turns, x)
+        return x.to(self.molecule.elements.device)
+
+    @torch.no_grad()
+    def reconstruction_error_nm(self, model: LamSlide) -> float:
+        """Return the root mean square error of held-out frames that went through the autoencoder."""
+        held = self.frames.spread_starts(_HELD_FRAMES, validation=True)
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(held)), None)
+        error = model.decode(model.encode(x, self.molecule.elements), self.n_atoms) - x
+        return float(error.square().sum(-1).mean().sqrt())
+
+    @torch.no_grad()
+    def encode(self, model: LamSlide, idx: npt.NDArray[np.int64]) -> Tensor:
+        """Return the latents `(len(idx), n_latents, dim)` of frames `(n,)` as they are posed."""
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx)), None)
+        return model.encode(x, self.molecule.elements)
+
+    def keep_latents(self, model: LamSlide) -> None:
+        """Encode every frame once and keep the latents."""
+        parts = [
+            self.encode(model, np.arange(start, min(start + _BLOCK, self.frames.n_frames))).cpu()
+            for start in range(0, self.frames.n_frames, _BLOCK)
+        ]
+        self.latents = torch.cat(parts).to(self.molecule.elements.device)
+
+    def windows(self, model: LamSlide, idx: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the latents `(b, length, n_latents, dim)` of frames `idx` (b, length), each window in its own pose."""
+        if self.latents is not None:
+            return self.latents[idx.to(self.latents.device)]
+        turns = self.poses(model, len(idx), generator)
+        x = self.seen(torch.from_numpy(self.frames.positions_nm(idx.numpy())), turns)
+        with torch.no_grad():
+            return model.encode(x, self.molecule.elements)
+
+
+def pick(subjects: Sequence[object], generator: torch.Generator) -> int:
+    """Return which subject a batch is of, each as likely; a single one costs no random number."""
+    if len(subjects) == 1:
+        return 0
+    return int(torch.randint(len(subjects), (1,), generator=generator))
+
+
+@torch.no_grad()
+def normalise_latents(model: LamSlide, subject: Subject, seed: int, n_frames: int = 20_000) -> None:
+    """Measure the latents' means and common scale on training frames and set them."""
+    model.latent_mean.zero_()
+    model.latent_scale.fill_(1.0)
+    starts = subject.frames.window_starts(1, validation=False)
+    idx = np.random.default_rng(seed).choice(len(starts), size=min(n_frames, len(starts)), replace=False)
+    z = subject.encode(model, starts[np.sort(idx)])
+    model.latent_mean.copy_(z.mean(0))
+    model.latent_scale.copy_((z - z.mean(0)).square().mean().sqrt())
+
 
 # Latents beyond this are not kept: windows are encoded when they are drawn.
 LATENT_CACHE_BYTES = 2_000_000_000
@@ -47,7 +248,6 @@ class TrainingConfig:
     bf16: bool = True
     device: str = "cpu"
     validate_every_s: float = 60.0
-    snapshot_every_s: float | None = None
     # Compile stage two's network and the decoder; needs a C++ compiler on the machine.
     compile: bool = False
     # Present every other window backwards: exact for positions of a system in equilibrium (microscopic
@@ -96,34 +296,27 @@ def train_lam_slide(
     device = torch.device(config.device)
     model = LamSlide(model_config).to(device)
     subject = Subject.of(frames, model)
-    log_path = out.with_suffix(".csv")
-    states = [out.with_name(f"{out.stem}.{stage}.train.safetensors") for stage in ("autoencoder", "flow")]
-    if not resume and is_first_process():
-        for path in (*states, log_path):
-            path.unlink(missing_ok=True)
-    places = [StagePlace(state, log_path, device, resume) for state in states]
     shown = _Shown(model, subject, strides)
     one, two = config.stages(with_autoencoder=start is None)
-    spent_one = 0.0
-    if start is None:
-        spent_one = _stage_one(shown, one, places[0], progress)
-        normalise_latents(model, subject, config.seed)
-    else:
+    if start is not None:
         _check_start(start, frames, model_config)
         model.load_state_dict(start.model.state_dict())
     domain = training_domain(frames, strides=strides if len(strides) > 1 else ())
     origin = {"reference_ns": frames.total_ps * 1e-3, "sources": list(frames.sources)}
 
-    def write(spent_s: float) -> None:
-        settings = _told(config) | {"stage_one_s": round(spent_one, 1), "stage_two_s": round(spent_s, 1)}
+    def stages() -> Iterator[Stage]:
+        if start is None:
+            yield _stage_one(shown, one)
+            normalise_latents(model, subject, config.seed)
+        yield _stage_two(shown, config, two)
+
+    def write(spent_s: list[float]) -> None:
+        spent_one, spent_two = [0.0, *spent_s][-2:]
+        settings = {"seed": config.seed, "time_reversal": config.time_reversal, "stage_one_s": round(spent_one, 1),
+                    "stage_two_s": round(spent_two, 1)}  # fmt: skip
         save_weights(out, model, domain, provenance_of(origin, settings, start))
 
-    spent_two = _stage_two(shown, config, two, places[1], progress, write)
-    if is_first_process():
-        write(spent_two)
-        for path in states:
-            path.unlink(missing_ok=True)
-    wait_for_all()
+    train_stages(stages(), out, write, device=device, resume=resume, progress=progress)
     return out
 
 
@@ -166,7 +359,7 @@ class _Shown:
     strides: tuple[int, ...]
 
 
-def _stage_one(shown: _Shown, stage: StageConfig, place: StagePlace, progress: ProgressFn | None) -> float:
+def _stage_one(shown: _Shown, stage: StageConfig) -> Stage:
     model, subject = shown.model, shown.subject
     own = subject.frames.window_starts(1, validation=False)
 
@@ -179,7 +372,7 @@ def _stage_one(shown: _Shown, stage: StageConfig, place: StagePlace, progress: P
     def validate() -> dict[str, float]:
         return {"validation_rmsd_nm": subject.reconstruction_error_nm(model)}
 
-    return run_stage(model.autoencoder, stage, loss_fn, validate, place, progress=progress)
+    return Stage(model.autoencoder, stage, loss_fn, validate, saves=False)
 
 
 def window_frames(first: Tensor, length: int, generator: torch.Generator, *, time_reversal: bool,
@@ -194,10 +387,7 @@ def window_frames(first: Tensor, length: int, generator: torch.Generator, *, tim
     return torch.where(backwards, idx.flip(1), idx)
 
 
-def _stage_two(
-    shown: _Shown, config: TrainingConfig, stage: StageConfig, place: StagePlace, progress: ProgressFn | None,
-    write: Callable[[float], None],
-) -> float:  # fmt: skip
+def _stage_two(shown: _Shown, config: TrainingConfig, stage: StageConfig) -> Stage:
     model, subject, strides = shown.model, shown.subject, shown.strides
     length, device = model.config.approximator.chunk_frames, model.latent_mean.device
     if len(strides) > 1:
@@ -208,7 +398,7 @@ def _stage_two(
         model.approximator.compile()
         model.autoencoder.decode = torch.compile(model.autoencoder.decode)  # type: ignore[method-assign]
     c = model.config.autoencoder
-    if model.canonical and 4 * subject.frames.n_frames * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
+    if model.config.canonical and 4 * subject.frames.n_frames * c.n_latents * c.latent_dim <= LATENT_CACHE_BYTES:
         subject.keep_latents(model)
 
     def loss_of(
@@ -240,16 +430,7 @@ def _stage_two(
             _, terms = loss_of(held, held_stride, tau, generator)
         return {f"validation_{key}": float(value) for key, value in terms.items()}
 
-    next_snapshot = [config.snapshot_every_s or float("inf")]
-
-    def on_save(spent_s: float) -> None:
-        write(spent_s)
-        if spent_s >= next_snapshot[0]:
-            out = place.state.with_name(place.state.name.replace(".flow.train.safetensors", ".safetensors"))
-            shutil.copy(out, out.with_name(f"{out.stem}.at{round(spent_s / 60)}min.safetensors"))
-            next_snapshot[0] = spent_s + (config.snapshot_every_s or float("inf"))
-
-    return run_stage(model.approximator, stage, loss_fn, validate, place, progress=progress, on_save=on_save)
+    return Stage(model.approximator, stage, loss_fn, validate)
 
 
 def _held_windows(subject: Subject, length: int, strides: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
@@ -274,9 +455,88 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
         raise InputError(f"{name} steps {of.lag_ps:g} ps from frame to frame; these trajectories {frames.lag_ps:g} ps.")
 
 
-def _told(config: TrainingConfig) -> dict[str, Any]:
-    """Return what the weights' provenance says of the settings."""
-    return {
-        "seed": config.seed,
-        "time_reversal": config.time_reversal,
-    }
+# LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training.
+
+_SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
+
+
+class LamSlideTrainer(Trainer):
+    """Trains LaM-SLidE. One molecule at one spacing of frames gets the defaults if they hold its atoms."""
+
+    goes_on = True
+    learns_lags = True
+
+    def check(self, request: TrainingRequest) -> None:
+        """See `Trainer.check`."""
+        super().check(request)
+        if request.steps is not None and request.steps < 2:
+            raise InputError("`steps` must be at least 2: one for each stage.")
+
+    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+        """See `Trainer.choose`."""
+        survey, found = references.survey, list[Choice]()
+        if request.start_from is None:
+            default = AutoencoderConfig.identifier_pool
+            pool = request.model.get("autoencoder", {}).get("identifier_pool", default)
+            if (n := survey.scenes[0].n_atoms) > pool:
+                found.append(Choice("model.autoencoder.identifier_pool", n, f"{n} atoms, more than {pool} identifiers"))
+            if (request.longest_lag_ps or request.training.get("longest_lag_ps")) and survey.equilibrium:
+                found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+        return tuple(choice for choice in found if not _is_set(choice.key, request))
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`."""
+        if request.start_from is not None:
+            model = LamSlideConfig.from_dict(read_header(request.start_from).config)
+        else:
+            model = LamSlideConfig.from_dict(request.model)
+        steps, first = request.steps, None
+        if steps is not None:
+            first = 0 if request.start_from is not None else max(1, round(steps * STAGE_ONE_SHARE))
+        asked: dict[str, Any] = {
+            "budget_s": request.budget_s,
+            "stage_one_steps": first,
+            "stage_two_steps": None if steps is None or first is None else steps - first,
+            "seed": request.seed,
+            "device": request.device,
+        }
+        if request.longest_lag_ps is not None:
+            asked["longest_lag_ps"] = request.longest_lag_ps
+        return Settings(model, request.settings(TrainingConfig, asked), _SETTLED)
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`."""
+        settings = self.settings(request)
+        model: LamSlideConfig = settings.model
+        start = None if request.start_from is None else load_weights(request.start_from)
+        frames = references.frames(canonical=model.canonical)
+        for validation in (False, True):  # too short a reference is refused before the first stage has been trained
+            frames.window_starts(model.approximator.chunk_frames, validation=validation)
+        share_one = 0.0 if start is not None else STAGE_ONE_SHARE
+
+        def run(advance: AdvanceFn) -> Path:
+            def report(stage: str, share: float, metrics: dict[str, float]) -> None:
+                advance(stage, share * share_one if stage == "autoencoder" else share_one + share * (1 - share_one))
+
+            return train_lam_slide(
+                frames, request.out, model, settings.training, start=start, resume=request.resume, progress=report
+            )
+
+        return Prepared(frames.scene.name, run)
+
+
+def _is_set(key: str, request: TrainingRequest) -> bool:
+    """Return whether the configuration file holds this key already."""
+    found: Any = {"model": request.model, "training": request.training}
+    for name in key.split("."):
+        if not isinstance(found, dict) or name not in found:
+            return False
+        found = found[name]
+    return True
+
+
+def _suits(survey: Survey) -> Suitability | None:
+    return Suitability(0, "one molecule") if survey.one_molecule else None
+
+
+LAM_SLIDE = Architecture("lam-slide", LamSlideConfig.from_dict, LamSlide, LamSlideTrainer, _suits)

@@ -3,24 +3,108 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar, cast
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
-from surrogate.models.egnn import Egnn
-from surrogate.models.graphs import Graph, molecular_graph
-from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.models.painet.attention import EnergyAttention, TypeGroups
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.leapfrog import Leapfrog
-from surrogate.models.painet.modes import Modes, centred_template
-from surrogate.models.painet.pairs import Pairs, molecular_pairs
-from surrogate.models.painet.rotation import angular_velocity, spun, turns
-from surrogate.models.painet.surroundings import Surroundings
+from surrogate.models.architecture import build
+from surrogate.models.painet.attention import EnergyAttention, Pairs, Surroundings, TypeGroups, molecular_pairs
+from surrogate.models.painet.decoders import (
+    Egnn,
+    Graph,
+    Leapfrog,
+    Modes,
+    angular_velocity,
+    centred_template,
+    molecular_graph,
+    spun,
+    turns,
+)
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.errors import InputError
+from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
+
+if TYPE_CHECKING:
+    pass
+
+# PAINET's settings.
+
+
+@dataclass(frozen=True)
+class PainetConfig:
+    """Size, horizon and physics. `n_new` frames are predicted at once, `frame_stride` reference frames apart: 1 frame
+    at a large stride is state-to-state, several are state-to-trajectory.
+
+    `attention` 'linear' (factored over types, cost linear in atoms), 'dense' (the same numbers, quadratic) or 'none'
+    (the decoder alone, which is EGNN). `edges` 'bonds' (with second neighbours) or 'all' pairs. `lag_ps` between
+    predicted frames, `temperature_k` and `friction_per_ps` of the bath that refreshes velocities between chunks; a
+    training takes the three from its reference.
+
+    Ours: `n_modes` modes of motion over the whole molecule beside attention and decoder (`Modes`), 0 for none;
+    `free_rotation` takes the rotation of the whole out of what is learned.
+
+    `decoder` 'egnn' (the paper's) or 'leapfrog' (ours: layers are steps of an integrator whose forces keep momentum,
+    angular momentum and depend on positions alone), with `n_radial` functions of the distance per shell of pairs and
+    `n_scalars` and `n_vectors` sums over an atom's neighbours.
+    """
+
+    n_new: int = 8
+    frame_stride: int = 1
+    width: int = 64
+    n_heads: int = 4
+    head_dim: int = 16
+    n_decoder_layers: int = 4
+    attention: str = "linear"
+    edges: str = "bonds"
+    n_modes: int = 0
+    free_rotation: bool = False
+    decoder: str = "egnn"
+    n_radial: int = 12
+    n_scalars: int = 8
+    n_vectors: int = 6
+    # Share of the attention's mean in the next embedding, eta of the descent step.
+    step: float = 0.5
+    # Largest Psi / Phi: below one, weights stay positive whatever the embeddings.
+    psi_limit: float = 0.95
+    length_scale_nm: float = 0.1
+    lag_ps: float = 0.005
+    temperature_k: float = 300.0
+    friction_per_ps: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.attention not in ("linear", "dense", "none"):
+            raise InputError(f"attention = {self.attention!r} is unknown; choose linear, dense or none.")
+        if self.edges not in ("bonds", "all"):
+            raise InputError(f"edges = {self.edges!r} is unknown; choose bonds or all.")
+        if self.decoder not in ("egnn", "leapfrog"):
+            raise InputError(f"decoder = {self.decoder!r} is unknown; choose egnn or leapfrog.")
+        if self.n_modes < 0 or (self.decoder == "leapfrog" and (self.n_modes or self.free_rotation)):
+            raise InputError(f"n_modes = {self.n_modes} and free_rotation = {self.free_rotation} go with decoder egnn.")
+        if self.n_radial < 2 or min(self.n_scalars, self.n_vectors, self.n_decoder_layers) < 1:
+            raise InputError(
+                f"n_radial = {self.n_radial} must be at least 2, n_scalars = {self.n_scalars}, n_vectors = "
+                f"{self.n_vectors} and n_decoder_layers = {self.n_decoder_layers} at least 1."
+            )
+        if self.n_new < 1 or self.frame_stride < 1:
+            raise InputError(f"n_new = {self.n_new} and frame_stride = {self.frame_stride} must be at least 1.")
+        if not 0.0 < self.step < 1.0 or not 0.0 <= self.psi_limit < 1.0:
+            raise InputError(f"step = {self.step:g} and psi_limit = {self.psi_limit:g} must lie between 0 and 1.")
+
+    @property
+    def chunk_ps(self) -> float:
+        return self.n_new * self.lag_ps
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(record: dict[str, Any]) -> PainetConfig:
+        """Raises InputError for an unknown key, naming the nearest."""
+        return build(PainetConfig, record)
+
 
 # Atomic numbers up to xenon; 0 is a particle of a model system.
 N_TYPES = 55
@@ -42,7 +126,7 @@ class Structure:
     pairs: Pairs | None = None
 
 
-class Painet(Surrogate):
+class Painet(Propagator):
     """X0, V0 -> X(1..T) and V(T), equivariant to rotations, reflections, translations and atom order.
 
     Embeddings start from invariants of the state: element, speed, distance to the centre of mass and the angle between
@@ -53,8 +137,6 @@ class Painet(Surrogate):
     """
 
     arch: ClassVar[str] = "painet"
-    carries_velocities: ClassVar[bool] = True
-    bf16_by_default: ClassVar[bool] = False
     config: PainetConfig
     velocity_scale_nm_ps: Tensor
     reach: Tensor
@@ -70,22 +152,18 @@ class Painet(Surrogate):
         if c.n_modes:
             self.surroundings = Surroundings(c.width)
             self.modes = Modes(c.width, c.n_modes, c.n_new)
-            self.float32_layers = ("surroundings.", "modes.")
         self.decoder: Egnn | Leapfrog = Egnn(c.width, c.n_decoder_layers)
         if c.decoder == "leapfrog":
             self.decoder = Leapfrog(c.width, c.n_decoder_layers, c.n_radial, c.n_scalars, c.n_vectors)
-            self.float32_layers = (*self.float32_layers, "decoder.")
         self._known: Structure | None = None
         self.register_buffer("velocity_scale_nm_ps", torch.ones(()))
         self.register_buffer("reach", torch.ones(2))
 
-    @property
-    def canonical(self) -> bool:
-        return False
-
-    @property
-    def knows_bonds(self) -> bool:
-        return self.config.n_modes > 0
+    def featurise(self, scene: Scene) -> Molecule:
+        """See `Propagator.featurise`; `own`: the template (n_atoms, 3) nm, of a model with modes."""
+        if not self.config.n_modes:
+            return Molecule.of(scene)
+        return Molecule.of(scene, torch.tensor(scene.positions_nm - scene.positions_nm.mean(axis=0)).float())
 
     @property
     def n_conditioning(self) -> int:
@@ -113,9 +191,9 @@ class Painet(Surrogate):
         groups = [torch.nonzero(molecule.elements == number).flatten() for number in present]
         all_pairs, template = self.config.edges == "all", None
         if self.config.n_modes:
-            if molecule.atoms is None:
-                raise InputError("this model knows a template; make molecules by `data.descriptions.describe`.")
-            template = centred_template(molecule.atoms.template_nm, molecule.masses_da, self.config.length_scale_nm)
+            if molecule.own is None:
+                raise InputError("this model knows a template; make molecules by its `featurise`.")
+            template = centred_template(molecule.own, molecule.masses_da, self.config.length_scale_nm)
         bonds = torch.cat([molecule.bonds.T, molecule.bonds.T.flip(0)], dim=1)
         if self._integrates:
             pairs = molecular_pairs(molecule, all_pairs=all_pairs)
@@ -212,7 +290,7 @@ class Painet(Surrogate):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Surrogate.next_chunk`: one evaluation from velocities that the bath has refreshed."""
+        """See `Propagator.next_chunk`: one evaluation from velocities that the bath has refreshed."""
         start = self.refreshed(last_velocities_nm_ps, molecule, noise)
         x, v = self(last_frames_nm[:, -1], start, self._structure_of(molecule))
         return Chunk(x, v[:, -1])

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.descriptions import describe
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.references import References
-from surrogate.data.weights import Weights, save_weights
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet, Structure
-from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of, training_domain
-from surrogate.training.trainer import AdvanceFn, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.architecture import AdvanceFn, Architecture, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.painet.model import EgnnForecaster, Painet, PainetConfig, Structure
+from surrogate.models.weights import Weights, provenance_of, save_weights, training_domain
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
 
@@ -90,17 +87,13 @@ def train_painet(
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
     model = model_class(model_config).to(device)
-    structure = model.structure(describe(model, frames.scene).to(device))
+    structure = model.structure(model.featurise(frames.scene).to(device))
     windows = StateWindows(frames, model_config, device)
     model.set_scales(windows.velocity_scale_nm_ps, windows.position_scale_nm, windows.change_scale_nm_ps)
     if start is not None:
         if start.model.config != model_config:
             raise InputError(f"{start.path} is of another configuration, {start.model.config}, than {model_config}.")
         model.load_state_dict(start.model.state_dict())
-    log_path, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.forecast.train.safetensors")
-    if not resume and is_first_process():
-        for path in (log_path, state):
-            path.unlink(missing_ok=True)
     stage = StageConfig("forecast", config.batch, config.learning_rate, config.budget_s, config.steps,
                         seed=config.seed, bf16=config.bf16, validate_every_s=config.validate_every_s)  # fmt: skip
     domain = training_domain(typical or frames, stride=model_config.frame_stride)
@@ -112,19 +105,13 @@ def train_painet(
     def validate() -> dict[str, float]:
         return forecast_errors(model, structure, windows)
 
-    def write(spent_s: float) -> None:
+    def write(spent_s: list[float]) -> None:
         settings = {"seed": config.seed, "noise": config.noise, "pushforward": config.pushforward,
-                    "every_frame": config.every_frame}  # fmt: skip
-        save_weights(
-            out, model, domain, provenance_of(frames.origin, {**settings, "training_s": round(spent_s, 1)}, start)
-        )
+                    "every_frame": config.every_frame, "training_s": round(sum(spent_s), 1)}  # fmt: skip
+        save_weights(out, model, domain, provenance_of(frames.origin, settings, start))
 
-    place = StagePlace(state, log_path, device, resume)
-    spent = run_stage(model, stage, loss_fn, validate, place, progress=progress, on_save=write)
-    if is_first_process():
-        write(spent)
-        state.unlink(missing_ok=True)
-    wait_for_all()
+    stages = [Stage(model, stage, loss_fn, validate)]
+    train_stages(stages, out, write, device=device, resume=resume, progress=progress)
     return out
 
 
@@ -242,3 +229,7 @@ class PainetTrainer(Trainer):
             )  # fmt: skip
 
         return Prepared(frames.scene.name, run)
+
+
+PAINET = Architecture("painet", PainetConfig.from_dict, Painet, partial(PainetTrainer, Painet))
+EGNN = Architecture("egnn", PainetConfig.from_dict, EgnnForecaster, partial(PainetTrainer, EgnnForecaster))

@@ -7,7 +7,7 @@ with that frame leaves to learn, (z_t - ρ(t) z_0) / sqrt(1 - ρ(t)²), which ha
 chunk has its own time, so that one model serves all spacings. The states of torsions with high barriers are drawn first
 (`models.peptides.torsion_states`); numbers of such a torsion count from the mean of those in its state. Frames that
 leave these states a little, or in which atoms overlap as they never do in MD, are set right by small turns
-(`models.peptides.settling`); chunks with frames where that is not enough are drawn again, in the same states and then
+(`models.peptides.chains`); chunks with frames where that is not enough are drawn again, in the same states and then
 in others.
 """
 
@@ -15,98 +15,49 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from surrogate.models.interface import Chunk, Molecule, Surrogate
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.further_noise import REDRAWS, STATES, generators
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import ChainScale
-from surrogate.models.peptides.settling import settle
+from surrogate.models.peptides.chains import ChainFeatures, settle
+from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
 from surrogate.models.peptides.torsion_states import MOST_STATES, MOST_TORSIONS, StateJumps, times_apart, told_states
-from surrogate.models.settings import build
+from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
+from systems.scene import Scene
 
-if TYPE_CHECKING:
-    from surrogate.models.peptides.chains import ChainFeatures
+# More random numbers than a chunk's noise holds, from numbers in it that nothing else uses.
+# The conditioning frames' place in the noise (b, T, L, dim) is taken by their clean latents, so numbers of its first
+# frame are free: pairs of them seed generators, a row's from its own, so that no row depends on those beside it.
 
-# Before the first residue, and after the last.
-ENDS = ("<", ">")
+# Where the pair of numbers stands that seeds each use.
+REDRAWS, STATES = 1, 5
+
+
+def generators(noise: Tensor, place: int, attempt: int = 0) -> list[torch.Generator]:
+    """Return one generator a row of `noise`, seeded by its two numbers from `place` on and by `attempt`."""
+    found = []
+    for row in noise:
+        low, high = row[0].flatten()[place : place + 2].float().cpu().view(torch.int32).tolist()
+        seed = ((low & 0xFFFFFFFF) << 31) ^ ((high & 0xFFFFFFFF) << 8) ^ attempt
+        found.append(torch.Generator().manual_seed(seed))
+    return found
+
+
 # Residues further apart along the chain are alike far.
 _FAR = 6
 _SOLVERS = ("gaussian", "angular", *flow.solvers_for("linear"))
-_LAGS_PER_DECADE = 8
 _MOST_CORRELATED = 0.995
 _LONGEST_WAVE = 4.0
 # Chunks that disobey the states that were drawn for them, or whose atoms overlap, are drawn again so often.
 MAX_REDRAWS = 8
 # Where atoms overlap so many times, there may be no room for them in these states, and these are drawn again, too.
 _OVERLAPS = 2
-
-
-@dataclass(frozen=True)
-class PeptideConfig:
-    """`types`: of residues that training saw. `shortest_ps`, `longest_ps`: times after the given frame that it was
-    shown. `innovation`: the flow runs on innovations, else on the coordinates themselves. `conditioning_noise`: added
-    to the given frame in training, in standard deviations. `turning_weight`: what a torsion's numbers count in the loss
-    beside a stiff one. `usual_steps`, `usual_solver`: of rollouts; those that the flow was taught, if it was distilled.
-    Flow times are logit-normal, as elsewhere."""
-
-    width: int = 128
-    n_layers: int = 6
-    n_heads: int = 4
-    chunk_frames: int = 16
-    shortest_ps: float = 1.0
-    longest_ps: float = 1000.0
-    innovation: bool = True
-    conditioning_noise: float = 0.03
-    turning_weight: float = 4.0
-    usual_steps: int = 6
-    usual_solver: str = "gaussian"
-    tau_location: float = 0.5
-    tau_scale: float = 1.4
-    types: tuple[str, ...] = ()
-    scale: ChainScale | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(record: dict[str, Any]) -> PeptideConfig:
-        """Raises InputError for an unknown key, naming the nearest."""
-        return build(PeptideConfig, record)
-
-    @property
-    def forgotten_ps(self) -> float:
-        """A time that stands for one at which nothing is left of the given frame."""
-        return 10.0 * self.longest_ps
-
-    @property
-    def lags_ps(self) -> Tensor:
-        """The times at which correlations are kept."""
-        decades = math.log10(self.longest_ps / self.shortest_ps)
-        n = max(2, round(_LAGS_PER_DECADE * decades) + 1)
-        return torch.logspace(math.log10(self.shortest_ps), math.log10(self.longest_ps), n, dtype=torch.float64).float()
-
-    def places(self, residues: tuple[str, ...]) -> Tensor:
-        """Return the numbers `(n_residues, 3)` of each residue's type, the one's before and the one's after.
-
-        Raises InputError for a type that training did not see.
-        """
-        known = {name: k for k, name in enumerate((*ENDS, *self.types))}
-        for name in residues:
-            if name not in known:
-                raise InputError(
-                    f"residue {name} is none that these weights were trained on ({', '.join(self.types)})."
-                )
-        row = [known[name] for name in (ENDS[0], *residues, ENDS[1])]
-        return torch.tensor([row[1:-1], row[:-2], row[2:]]).T
 
 
 class TypedLinear(nn.Module):
@@ -222,8 +173,8 @@ class PeptideFlow(nn.Module):
             return self.of_time(torch.cat([angles.sin(), angles.cos()], dim=-1))
 
 
-class PeptideSlide(Surrogate):
-    """The flow between frames of a peptide, behind the contract of `surrogate.models.interface`.
+class PeptideSlide(Propagator):
+    """The flow between frames of a peptide, behind the contract of `surrogate.models.propagator`.
 
     `token_mean` (types, states, slots), `token_scale` (types, slots): what makes a coordinate's numbers centred, for
     each state of its torsion where that has states (else all are the first), and of unit variance;
@@ -245,6 +196,7 @@ class PeptideSlide(Surrogate):
         if config.usual_solver not in _SOLVERS:
             raise InputError(f"usual_solver = {config.usual_solver!r} is none of {', '.join(_SOLVERS)}.")
         self.solvers = tuple(dict.fromkeys((config.usual_solver, *_SOLVERS)))
+        self.usual_steps = config.usual_steps
         n_types, n_slots = len(config.types) + len(ENDS), config.scale.n_slots
         self.flow = PeptideFlow(config, n_slots)
         self.jumps = StateJumps(n_slots, n_types)
@@ -253,19 +205,10 @@ class PeptideSlide(Surrogate):
         self.register_buffer("token_scale", torch.ones(n_types, n_slots))
         self.register_buffer("correlation", torch.zeros(n_types, len(config.lags_ps), n_slots))
 
-    @property
-    def usual_steps(self) -> int:
-        """See `Surrogate.usual_steps`."""
-        return self.config.usual_steps
-
-    @property
-    def canonical(self) -> bool:
-        return True
-
-    @property
-    def knows_chains(self) -> bool:
-        """See `Surrogate.knows_chains`."""
-        return True
+    def featurise(self, scene: Scene) -> Molecule:
+        """See `Propagator.featurise`; `own`: the chain's `ChainFeatures`. Raises InputError for a scene that is no
+        chain of residues that training saw."""
+        return Molecule.of(scene, chain_features(scene, self.config))
 
     @property
     def n_conditioning(self) -> int:
@@ -345,10 +288,10 @@ class PeptideSlide(Surrogate):
 
     def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 10,
                    solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Surrogate.next_chunk`. Velocities play no part. Raises InputError for a molecule not told as a chain."""
-        chain = molecule.chain
+        """See `Propagator.next_chunk`. Raises InputError for a molecule not told as a chain."""
+        chain: ChainFeatures | None = molecule.own
         if chain is None:
-            raise InputError("this model knows peptides by residues; make molecules by `data.descriptions.describe`.")
+            raise InputError("this model knows peptides by residues; make molecules by its `featurise`.")
         types, filled = chain.places[:, 0], chain.code.filled
         known, now = self.normalised(last_frames_nm[:, -1], chain)
         assert self.lag_ps is not None

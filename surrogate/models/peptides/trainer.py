@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,23 +14,156 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale, unknown_coordinates
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.molecules import FrameSets
-from surrogate.data.weights import Weights, save_weights
+from surrogate.data.references import FrameSets, References, Survey
+from surrogate.models.architecture import (
+    AdvanceFn,
+    Architecture,
+    Choice,
+    Prepared,
+    Settings,
+    Suitability,
+    Trainer,
+    TrainingRequest,
+)
 from surrogate.models.lam_slide import flow
-from surrogate.models.lam_slide.losses import TAU_MAX
-from surrogate.models.lam_slide.subjects import pick
-from surrogate.models.peptides.balance import balance_entries
-from surrogate.models.peptides.chains import FREE_ENDS, ChainFeatures
-from surrogate.models.peptides.model import ENDS, PeptideConfig, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.state_windows import StateWindows
-from surrogate.models.peptides.torsion_states import MOST_STATES, times_apart, told_states
-from surrogate.training.devices import is_first_process, wait_for_all
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, run_stage
-from surrogate.training.provenance import provenance_of, training_domain
+from surrogate.models.lam_slide.trainer import TAU_MAX, pick
+from surrogate.models.peptides.chains import FREE_ENDS, ChainFeatures, dihedral
+from surrogate.models.peptides.layout import (
+    ENDS,
+    PeptideConfig,
+    chain_features,
+    chain_layout,
+    chain_scale,
+    standard_peptide,
+    unknown_coordinates,
+)
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
+from surrogate.models.peptides.torsion_states import (
+    MOST_STATES,
+    NEGATIVE_CORE_DEG,
+    POSITIVE_CORE_DEG,
+    times_apart,
+    told_states,
+)
+from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
+from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
+
+# The odds of entering phi > 0, set to those of leaving it and to how likely it is.
+# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries,
+# but only as well weighted as a few frames are, and a rate that is three times too high shows in no loss: nearly every
+# window holds no entry. What is known well are the odds of leaving and the free energy of phi > 0 (umbrella sampling),
+# and in equilibrium as many frames enter as leave. So after training the odds of entering are moved, by a level of each
+# residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
+
+# Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
+_SIDE_FRAMES, _SIDE_SEED = 1000, 0
+_TIMES_PS = (3.0, 10.0, 30.0, 100.0)
+# Of a side that fewer frames show, nothing is said.
+_LEAST_FRAMES = 50
+_PASSES = 4
+# Holds levels that few peptides tell near zero, and what one phi may ask for within bounds.
+_RIDGE, _MOST = 0.3, 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Phi:
+    """One phi of a peptide: its `residue`, frames well on its negative and on its positive side, as numbers `known` (n,
+    n_residues, n_slots) and `states` (n, n_residues, MOST_TORSIONS) each, and how likely the positive is beside the
+    other."""
+
+    chain: ChainFeatures
+    residue: int
+    known: tuple[Tensor, Tensor]
+    states: tuple[Tensor, Tensor]
+    positive: float
+
+    @property
+    def places(self) -> list[int]:
+        """The numbers of its residue's type, of the one's before and of the one's after."""
+        return [int(k) for k in self.chain.places[self.residue]]
+
+
+@torch.no_grad()
+def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
+    """Move the odds of entering phi > 0 of `model` to where detailed balance holds in the mean over `subjects`, whose
+    weights say how likely phi > 0 is; those without weights play no part."""
+    n_types = len(model.token_mean)
+    phis = [phi for subject in subjects for phi in told_phis(model, subject)]
+    if not phis:
+        return
+    told = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
+    for k, phi in enumerate(phis):
+        for which, place in enumerate(phi.places):
+            told[k, which * n_types + place] = 1.0
+    held = told.T @ told + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
+    for _ in range(_PASSES):
+        lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
+        levels = torch.linalg.solve(held, told.T @ lacking.clamp(-_MOST, _MOST))
+        model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
+
+
+def told_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
+    """Return each phi of a peptide of which frames show both sides and weights tell how likely they are; before a
+    proline that is not known well enough."""
+    if subject.weights is None:
+        return []
+    chain, found = subject.chain, []
+    types = (*chain.code.layout.types, "")
+    for residue in chain.signed.tolist():
+        if types[residue + 1] == "PRO":
+            continue
+        sides = [_side(subject, residue, state) for state in (0, 1)]
+        if min(len(idx) for idx, _ in sides) < _LEAST_FRAMES:
+            continue
+        (known, states), (known_positive, states_positive) = (subject.seen(model, idx) for idx, _ in sides)
+        both, all_states = (known, known_positive), (states, states_positive)
+        found.append(Phi(chain, residue, both, all_states, sides[1][1] / sides[0][1]))
+    return found
+
+
+def lacking_entries(model: PeptideSlide, phi: Phi) -> float:
+    """Return the logarithm of how many times too low the odds of entering phi > 0 are, in the mean over times."""
+    enter, leave = (_log_odds(model, phi, state) for state in (0, 1))
+    return float((leave - enter).mean()) + math.log(phi.positive)
+
+
+def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, float]:
+    """Return frames well on one side of a phi, and how likely this side is. Of the rare side all frames count alike:
+    the weights within it rest on few."""
+    assert subject.weights is not None
+    idx = torch.arange(len(subject.weights))
+    weights = torch.from_numpy(subject.weights) * (subject.states(idx)[:, residue, 0] == state)
+    total = float(weights.sum())
+    if total == 0.0:
+        return idx[:0], total
+    odds = weights if state == 0 else (weights > 0).double()
+    drawn = torch.multinomial(odds, _SIDE_FRAMES, replacement=True, generator=torch.Generator().manual_seed(_SIDE_SEED))
+    stated = subject.chain.stated.to(torch.device("cpu"))
+    quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
+    x = torch.from_numpy(subject.frames.positions_nm(drawn.numpy()))
+    phi = dihedral(*(x[:, int(atom)] for atom in quad)).rad2deg()
+    low, high = (NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG)[state]
+    return drawn[(phi > low) & (phi < high)], total
+
+
+def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
+    """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
+    later."""
+    known, now, chain = phi.known[state], phi.states[state], phi.chain
+    counts, before, found = chain.stated.counts, now[:, None], []
+    told = told_states(before, counts)
+    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(told, told)
+    for time_ps in _TIMES_PS:
+        times = torch.full((len(known), 1), time_ps, device=known.device)
+        apart = times_apart(times, model.config.forgotten_ps)
+        of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
+        logits = model.jumps.odds(0, common + of_times[:, :, None], levels, before[..., 0], told)
+        found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
+    return torch.stack(found)
+
 
 _MEASURED_FRAMES = 4000
 _MEASURED_PAIRS = 4000
@@ -50,7 +184,7 @@ class PeptideTraining:
     """Optimisation (AdamW, EMA 0.999), in seconds of training or steps.
 
     `time_reversal`: MD in equilibrium looks alike backwards. Windows are read backwards, too, and frames drawn from
-    equilibrium stand for endless times, both weighted by a Markov model of each molecule (`data.equilibrium`).
+    equilibrium stand for endless times, both weighted by a Markov model of each molecule (`models.peptides.subjects`).
     `positive_phi_kt`: of residue types, the free energy of phi > 0 over phi < 0 in kT where it is known (metadynamics);
     short runs leave that state and hardly ever enter it.
     """
@@ -158,30 +292,18 @@ def train_peptides(
     several = len({f.scene.topology_hash for f in sets}) > 1
     domain = replace(domains[0], further=tuple(domains[1:]), transferable=several)
 
-    def write(*spent_s: float) -> None:
+    def write(spent_s: list[float]) -> None:
         settings: dict[str, Any] = {"seed": training.seed, "spent_s": round(sum(spent_s), 1)}
         if training.positive_phi_kt:
             settings["positive_phi_kt"] = training.positive_phi_kt
         save_weights(out, model, domain, provenance_of(FrameSets(tuple(sets)).origin, settings, start))
 
-    log = out.with_suffix(".csv")
-    states = [out.with_name(f"{out.stem}.{stage.name}.train.safetensors") for stage in stages]
-    if not resume and is_first_process():
-        for path in (*states, log):
-            path.unlink(missing_ok=True)
-    spent_s = 0.0
-    parts = ((model.flow, flow_loss), (model.jumps, jumps_loss))
-    for stage, (trained, loss_fn), state in zip(stages, parts, states, strict=True):
-        place = StagePlace(state, log, device, resume)
-        spent_s += run_stage(
-            trained, stage, loss_fn, partial(validate, stage), place, progress=progress, on_save=partial(write, spent_s)
-        )
-    balance_entries(model, subjects)
-    if is_first_process():
-        write(spent_s)
-        for path in states:
-            path.unlink(missing_ok=True)
-    wait_for_all()
+    def in_turn() -> Iterator[Stage]:
+        for stage, trained, loss_fn in zip(stages, (model.flow, model.jumps), (flow_loss, jumps_loss), strict=True):
+            yield Stage(trained, stage, loss_fn, partial(validate, stage))
+        balance_entries(model, subjects)
+
+    train_stages(in_turn(), out, write, device=device, resume=resume, progress=progress)
     return out
 
 
@@ -361,3 +483,87 @@ def disturbed(known: Tensor, chain: ChainFeatures, config: PeptideConfig, genera
     """Return the given frame's numbers `(b, r, slots)` with the noise that training adds."""
     noise = torch.randn(known.shape, generator=generator).to(known.device)
     return known + config.conditioning_noise * chain.code.filled * noise
+
+
+# The model of peptides behind the verb `train`: choices for the references, settings, and the start.
+
+# Share of the longest trajectory that a window may span: its end is held out.
+_SPAN = 0.9
+
+
+class PeptideTrainer(Trainer):
+    """One flow for peptides of any sequence and any spacing of frames."""
+
+    goes_on = True
+    learns_lags = True
+
+    def choose(self, references: References, request: TrainingRequest) -> tuple[Choice, ...]:
+        """See `Trainer.choose`."""
+        survey, known = references.survey, PeptideConfig()
+        found = []
+        going_on = request.start_from is not None
+        if not going_on and "shortest_ps" not in request.model and survey.lag_ps != known.shortest_ps:
+            found.append(Choice("model.shortest_ps", survey.lag_ps, "the references' spacing of frames"))
+        if not going_on and "longest_ps" not in request.model:
+            reach = int(_SPAN * min(survey.longest)) * survey.lag_ps
+            if request.longest_lag_ps is not None:
+                found.append(Choice("model.longest_ps", request.longest_lag_ps, "`longest_lag_ps`"))
+            elif reach < known.longest_ps:
+                found.append(Choice("model.longest_ps", reach, "as far as every reference reaches"))
+        if "time_reversal" not in request.training and survey.equilibrium:
+            found.append(Choice("training.time_reversal", True, "MD at constant temperature reads alike backwards"))
+        return tuple(found)
+
+    def settings(self, request: TrainingRequest) -> Settings:
+        """See `Trainer.settings`."""
+        asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
+        training = request.settings(PeptideTraining, asked)
+        model = request.model if request.start_from is None else read_header(request.start_from).config
+        if request.start_from is not None:  # learning further, a flow forgets the few steps that it was taught
+            model = {key: value for key, value in model.items() if key not in ("usual_steps", "usual_solver")}
+        return Settings(PeptideConfig.from_dict(model), training, frozenset(asked))
+
+    def prepare(self, references: References, request: TrainingRequest) -> Prepared:
+        """See `Trainer.prepare`."""
+        settings, sets = self.settings(request), references.sets()
+        start = None if request.start_from is None else load_weights(request.start_from)
+
+        def report(advance: AdvanceFn, stage: str, share: float, metrics: dict[str, float]) -> None:
+            done = 1 - JUMPS_SHARE if stage == "jumps" else 0.0
+            advance(stage, done + share * (JUMPS_SHARE if stage == "jumps" else 1 - JUMPS_SHARE))
+
+        def run(advance: AdvanceFn) -> Path:
+            trained, unseen = (
+                [_under_standard_names(frames) for frames in some] for some in (sets.trained, sets.unseen)
+            )
+            return train_peptides(
+                trained, request.out, settings.model, settings.training, unseen=unseen, start=start,
+                resume=request.resume, progress=partial(report, advance),
+            )  # fmt: skip
+
+        return Prepared(sets.names, run)
+
+
+def _under_standard_names(frames: TrainingFrames) -> TrainingFrames:
+    """Return frames of a peptide from any program's file, atoms in the order and residues under the names of ours."""
+    standard, order = standard_peptide(frames.scene)
+    if standard.residue_names == frames.scene.residue_names and (order == np.arange(len(order))).all():
+        return frames
+    return replace(
+        frames, scene=replace(standard, name=frames.scene.name), coordinates=frames.coordinates[:, order],
+        velocities=None if frames.velocities is None else frames.velocities[:, order],
+    )  # fmt: skip
+
+
+def _suits(survey: Survey) -> Suitability | None:
+    if len(survey.scenes) < 2:
+        return None
+    try:
+        for scene in (*survey.scenes, *survey.unseen):
+            chain_layout(scene)
+    except InputError:
+        return None
+    return Suitability(10, f"{len(survey.scenes)} peptides, known by their residues in internal coordinates")
+
+
+PEPTIDES = Architecture("lam-slide-peptides", PeptideConfig.from_dict, PeptideSlide, PeptideTrainer, _suits)

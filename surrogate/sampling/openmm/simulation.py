@@ -7,15 +7,19 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
+from surrogate.data.shipped import weights_path
+from surrogate.models.potential import Potential
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import RolloutConfig
-from surrogate.sampling.domain import fit_weights
-from surrogate.sampling.openmm.openmm_state import SurrogateState
+from surrogate.sampling.domain import fit_weights, match_scene
 from systems.errors import InputError, SimulationError
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
@@ -23,7 +27,123 @@ from systems.options import from_field, takes
 from systems.scene import Scene
 
 if TYPE_CHECKING:
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
+
+# The `openmm.State` of a surrogate: positions, time and energy; velocities and forces are refused by name.
+
+
+@dataclass(frozen=True, eq=False)
+class SurrogateState:
+    """A snapshot: positions `(n_atoms, 3)` nm, time, step; `include` names what was asked for, as `openmm.State`.
+
+    Every getter raises SimulationError for what was not asked for or what a surrogate does not have.
+    """
+
+    positions_nm: npt.NDArray[np.float32]
+    time_ps: float
+    step: int
+    include: frozenset[str]
+    energy_fn: Callable[[npt.NDArray[np.float64]], float] | None = None
+
+    def getPositions(self, asNumpy: bool = False) -> Any:
+        """Return positions with their unit: `Vec3`s, or an array `(n_atoms, 3)` with `asNumpy`."""
+        from openmm import Vec3, unit
+
+        if "positions" not in self.include:
+            raise SimulationError("this state was taken without positions; call getState(positions=True).")
+        positions = self.positions_nm.astype(np.float64)
+        if asNumpy:
+            return positions * unit.nanometer
+        return [Vec3(*row) for row in positions.tolist()] * unit.nanometer
+
+    def getTime(self) -> Any:
+        """Return the simulated time with its unit."""
+        from openmm import unit
+
+        return self.time_ps * unit.picoseconds
+
+    def getStepCount(self) -> int:
+        return self.step
+
+    def getPotentialEnergy(self) -> Any:
+        """Return what the simulation's `energy_fn` says of the positions, with its unit."""
+        from openmm import unit
+
+        if "energy" not in self.include:
+            raise SimulationError("this state was taken without energy; call getState(energy=True).")
+        if self.energy_fn is None:
+            raise SimulationError("a surrogate has no potential energy; give the simulation an energy_fn.")
+        return float(self.energy_fn(self.positions_nm.astype(np.float64))) * unit.kilojoules_per_mole
+
+    def getKineticEnergy(self) -> NoReturn:
+        raise SimulationError("a surrogate has no kinetic energy (nor total energy, nor temperature); leave it out.")
+
+    def getVelocities(self, asNumpy: bool = False) -> NoReturn:
+        raise SimulationError("a surrogate has no velocities; leave them out.")
+
+    def getForces(self, asNumpy: bool = False) -> NoReturn:
+        raise SimulationError("a surrogate has no forces; leave them out.")
+
+    def getParameters(self) -> dict[str, float]:
+        """Return no global parameters: there are none."""
+        return {}
+
+    def getPeriodicBoxVectors(self, asNumpy: bool = False) -> NoBox:
+        """Return a box that is none; see `NoBox`."""
+        return NoBox()
+
+    def getPeriodicBoxVolume(self) -> NoReturn:
+        _no_box()
+
+
+def _no_box() -> NoReturn:
+    raise SimulationError("a surrogate has no periodic box; leave the cell, volume and density out.")
+
+
+class NoBox:
+    """The box of a molecule without one. StateDataReporter multiplies its lengths whether it reports a volume or not,
+    so products are allowed; an attempt to get a number out of it raises SimulationError.
+
+    As a whole it has the value that DCD and XTC files write where there is no cell, zeros: MDTraj's reporters of these
+    formats ask for it, and its readers make None of it again.
+    """
+
+    # Before NumPy's own operators.
+    __array_ufunc__ = None
+
+    def __init__(self, *, is_product: bool = False) -> None:
+        self._is_product = is_product
+
+    def __getitem__(self, index: int) -> NoBox:
+        if index not in (0, 1, 2):
+            raise IndexError(index)
+        return self
+
+    def __mul__(self, other: Any) -> NoBox:
+        return NoBox(is_product=True)
+
+    __rmul__ = __mul__
+
+    def value_in_unit(self, unit: Any) -> npt.NDArray[np.float64]:
+        if self._is_product:
+            _no_box()
+        return np.zeros((3, 3))
+
+    def __float__(self) -> float:
+        _no_box()
+
+    def __pow__(self, power: float) -> NoReturn:
+        _no_box()
+
+    def __truediv__(self, other: Any) -> NoReturn:
+        _no_box()
+
+    def __rtruediv__(self, other: Any) -> NoReturn:
+        _no_box()
+
+    def __str__(self) -> str:
+        _no_box()
+
 
 # positions (n_atoms, 3) nm -> potential energy in kJ/mol
 EnergyFn = Callable[[npt.NDArray[np.float64]], float]
@@ -168,8 +288,8 @@ class Simulation:
         raise SimulationError("a surrogate has no energy to minimise; prepare the scene, or minimise it with OpenMM.")
 
     def _settings(self) -> dict[str, Any]:
-        lag_ps = self.weights.model.lag_ps
-        return ({} if lag_ps is None else {"lag_ps": lag_ps}) | {
+        return {
+            "lag_ps": self.lag_ps,
             "weights_hash": self.weights.hash,
             "topology_hash": self.scene.topology_hash,
             "seed": self._seed,
@@ -298,7 +418,7 @@ def _given(scene: str | Path | Scene, weights: str | Path | Weights) -> tuple[Sc
         scene = prepare(str(scene))
     if isinstance(weights, str | Path):
         from surrogate.data.shipped import weights_path
-        from surrogate.data.weights import load_weights
+        from surrogate.models.weights import load_weights
 
         weights = load_weights(weights_path(weights))
     return scene, weights
@@ -310,3 +430,85 @@ def _described(report: Any) -> dict[str, Any]:
         return report
     names = ("positions", "velocities", "forces", "energy")
     return {"steps": report[0], "include": [name for name, asked in zip(names, report[1:5], strict=True) if asked]}
+
+
+# A learned potential as other programs take it: a function of positions, an OpenMM force, an ASE calculator.
+
+FloatArray = npt.NDArray[np.floating[Any]]
+# An Å in nm, an eV in kJ/mol (CODATA 2018).
+NM_PER_ANGSTROM = 0.1
+KJ_MOL_PER_EV = 96.48533212331
+
+
+class LearnedForces:
+    """Energies and forces of a scene by a learned potential, atoms in the scene's order.
+
+    `weights`: a file, or loaded ones. Raises InputError for weights that are no potential, OutOfDomainError for a
+    molecule that they do not cover.
+    """
+
+    def __init__(self, scene: Scene, weights: str | Path | Weights) -> None:
+        loaded = load_weights(weights_path(weights)) if isinstance(weights, str | Path) else weights
+        if not isinstance(loaded.model, Potential):
+            raise InputError(
+                f"{loaded.path.name} makes frames, not forces ({loaded.model.arch}); train a potential with "
+                "`level='gfn2-xtb'`."
+            )
+        self.scene, self.weights, self._model = scene, loaded, loaded.model.eval()
+        self._order = match_scene(scene, loaded)
+        self._back = np.argsort(self._order)
+        self._molecule = Molecule.of(loaded.domain.scene)
+
+    def __call__(self, positions_nm: FloatArray) -> tuple[float, FloatArray]:
+        """Positions `(n_atoms, 3)` nm -> energy in kJ/mol, forces `(n_atoms, 3)` in kJ/mol/nm."""
+        energies, forces, _ = self.evaluate(np.asarray(positions_nm)[None])
+        return float(energies[0]), forces[0]
+
+    def evaluate(self, frames_nm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Frames `(n, n_atoms, 3)` nm -> energies `(n,)`, forces, and the members' spread of energies `(n,)`, root mean
+        square, all in kJ/mol and kJ/mol/nm. Raises SimulationError where they are not finite."""
+        x = torch.from_numpy(np.ascontiguousarray(np.asarray(frames_nm, dtype=np.float64)[:, self._order]))
+        members, gradient = self._model.gradient(x, self._molecule)(x)
+        energies, forces = members.mean(-1).numpy(), -gradient.numpy()[:, self._back]
+        if not (np.isfinite(energies).all() and np.isfinite(forces).all()):
+            raise SimulationError(f"{self.weights.path.name}: the learned energy of {self.scene.name!r} is not finite.")
+        return energies, forces, members.std(-1, correction=0).numpy()
+
+    def openmm_force(self) -> Any:
+        """Return an `openmm.PythonForce`, to be added to a System of the scene's particles."""
+        import openmm
+
+        if not hasattr(openmm, "PythonForce"):
+            raise InputError(
+                f"a learned force needs OpenMM's PythonForce, which {openmm.__version__} lacks; update it."
+            )
+
+        def compute(state: Any) -> tuple[float, FloatArray]:
+            return self(np.asarray(state.getPositions(asNumpy=True)._value, dtype=np.float64))
+
+        force = openmm.PythonForce(compute)
+        force.setName("PAINET")
+        return force
+
+    def ase_calculator(self) -> Any:
+        """Return an ASE calculator of energies in eV and forces in eV/Å. Raises InputError without ASE."""
+        try:
+            from ase.calculators.calculator import Calculator, all_changes
+        except ImportError as error:
+            raise InputError("an ASE calculator needs ASE; install it: `pip install ase`.") from error
+        learned = self
+
+        class Learned(Calculator):
+            implemented_properties = ["energy", "forces"]  # noqa: RUF012
+
+            def calculate(self, atoms: Any = None, properties: Any = None, system_changes: Any = all_changes) -> None:
+                super().calculate(atoms, properties, system_changes)
+                if tuple(atoms.get_chemical_symbols()) != tuple(learned.scene.elements):
+                    raise InputError(f"these atoms are not those of {learned.scene.name!r}, in its order.")
+                energy, forces = learned(atoms.get_positions() * NM_PER_ANGSTROM)
+                self.results = {
+                    "energy": energy / KJ_MOL_PER_EV,
+                    "forces": forces * (NM_PER_ANGSTROM / KJ_MOL_PER_EV),
+                }
+
+        return Learned()

@@ -11,9 +11,8 @@ from surrogate.verbs.run.run_record import Outcome
 from systems.units import format_time_ps, format_wall
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison, Judgement
+    from surrogate.judge.comparison import Account, Comparison, Judgement
     from surrogate.judge.md_answer import Answer
-    from surrogate.judge.rows.account import Account
     from surrogate.judge.worth import Worth
 
 

@@ -16,7 +16,7 @@ from systems.units import format_time_ps
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
-    from surrogate.data.weights import Weights
+    from surrogate.models.weights import Weights
     from systems.scene import Scene
 
 # Rollouts side by side: one batch, which costs little more than one of them. Of a potential's, sixteen run at once on
@@ -169,6 +169,7 @@ def by_openmm(rates: Rates, scene: Scene, config: MDConfig, why: str) -> Rates:
 def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: float, cores: int) -> Rolls:
     """Return how weights roll a scene that they cover, by a few chunks of it; `stretch`, `cores`: see `Rates`."""
     from surrogate.data.shipped import shipped_weights
+    from surrogate.models.potential import Potential
     from surrogate.sampling.domain import in_bath
     from surrogate.sampling.runner import RolloutConfig, rollout
 
@@ -177,7 +178,7 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
         lag_ps = min(max(LONG_LAG_PS, lag_ps), weights.domain.longest_lag_ps)
     replicas, relaxation_ps = REPLICAS, 0.0
     seen_ps = min(_FURTHER * lag_ps, weights.domain.longest_lag_ps) if weights.domain.jumps else lag_ps
-    if weights.model.integrates:  # so many steps a frame that one frame tells
+    if isinstance(weights.model, Potential):  # so many steps a frame that one frame tells
         weights, replicas = in_bath(weights, {"n_new": 1}), max(_POTENTIAL_REPLICAS, _REPLICAS_A_CORE * cores)
     seen: list[tuple[float, float]] = []
     with tempfile.TemporaryDirectory(prefix="surromd-rate-") as folder:
@@ -216,9 +217,8 @@ def _slowest_ps(files: list[Path]) -> float:
 def _covering(scene: Scene, config: MDConfig, named: str | Path | None) -> tuple[Weights | None, str]:
     """Return the weights that cover the scene under these conditions, and why these or why none."""
     from surrogate.data.shipped import weights_path
-    from surrogate.data.weights import load_weights
-    from surrogate.sampling.choice import check_conditions, choose_weights
-    from surrogate.sampling.domain import match_domain
+    from surrogate.models.weights import load_weights
+    from surrogate.sampling.domain import check_conditions, choose_weights, match_domain
 
     asked = {"force_field": config.force.force_field, "solvent": config.force.solvent}
     if named is None:

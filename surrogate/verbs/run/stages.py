@@ -215,7 +215,7 @@ def _trained(site: Site, record: RunRecord) -> RunRecord | None:
 
 def _rolling(site: Site, record: RunRecord) -> RunRecord | None:
     """Return the record with the weights that were trained, and how fast they roll. Raises SimulationError."""
-    from surrogate.data.weights import load_weights
+    from surrogate.models.weights import load_weights
 
     out = site.folder / WEIGHTS_NAME
     if not out.exists():
@@ -346,7 +346,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
             "\n".join(found.in_short),
             "States by MD, what the trajectory is worth, and how the budget was spent",
             [("worth", found.details), *lines, *(("note", note) for note in notes)],
-            [] if answer is None else weighted_maps(answer.maps, comparison.temperature_k),
+            [] if answer is None else weighted_maps(answer.maps),
         ),
     )
     return replace(record, outcome=found)

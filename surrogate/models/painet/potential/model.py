@@ -1,55 +1,250 @@
-"""PAINET as a potential: energies, their exact gradient, and the molecule integrated on them."""
+"""PAINET as a potential: energies and their exact gradient, by torch and by SIMD."""
 
 from __future__ import annotations
 
-import copy
-import math
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+import ctypes
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+import numpy as np
+import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from surrogate.models.interface import Chunk, Molecule, Surrogate
-from surrogate.models.painet.potential.config import LONGEST_FLEXIBLE_PS, PotentialConfig
-from surrogate.models.painet.potential.edges import FEW_ATOMS
-from surrogate.models.painet.potential.energy import N_TYPES, EnergyNetwork, Fabric, Prepared
-from surrogate.models.painet.potential.gradient import GradientFn, gradient_of
-from surrogate.models.painet.potential.rigid import RigidBonds
-from surrogate.models.painet.potential.simd import Bath, SimdPotential, simd_potential_of
+from md_reference import simd as engine
+from surrogate.models.painet.attention import N_SHELLS, EnergyAttention
+from surrogate.models.painet.potential.energy import (
+    FEW_ATOMS,
+    N_TYPES,
+    WALL,
+    EnergyNetwork,
+    Fabric,
+    Look,
+    PotentialConfig,
+    Prepared,
+    radial_grid,
+)
+from surrogate.models.potential import TOLERANCE, Bath, GradientFn, Potential, at_rest, gradient_of
+from surrogate.models.propagator import Molecule
 from systems.errors import InputError
-from systems.scene import Scene
-from systems.units import GAS_CONSTANT_KJ_MOL_K, whole_steps
+from systems.files.native import CompilerError, compiled_program
 
-_HYDROGEN = 1
-_RELAXED_ROUNDS = 100
+if TYPE_CHECKING:
+    pass
+
+# The potential by SIMD: copies of a molecule at once, each in its own element of the processor's vector registers.
+# `simd.cpp` computes energies and their mean's gradient as `energy.py` and torch do, in single precision, without
+# writing what a pair of atoms sees to memory, and moves the copies by it with the bath and rigid bonds of
+# md_reference.simd. This machine's C++ compiler makes it at first use, in seconds.
+
+_SOURCE = Path(__file__).with_name("simd.cpp")
+_SIZES = ("width", "n_steps", "n_radial", "n_scalars", "n_vectors", "n_tensors", "n_heads", "head_dim", "n_members")
+# Copies at once: of a whole register, and where no more are asked for; of the register in bytes.
+_WIDTH, _FEW, _ALIGNED = 16, 4, 64
+_LEAST_NM = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """`energy_kj_mol` (rows,) and `forces_kj_mol_nm` (rows, n_atoms, 3), the mean of the members; `members_kj_mol`
-    (rows, n_members)."""
-
-    energy_kj_mol: Tensor
-    forces_kj_mol_nm: Tensor
-    members_kj_mol: Tensor
+class _Linear(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("weight", "turned", "bias")]
 
 
-class PainetPotential(Surrogate):
+class _Step(ctypes.Structure):
+    _fields_ = [
+        *((name, _Linear) for name in ("send", "first", "second", "third", "qkv", "out")),
+        *((name, ctypes.c_void_p) for name in ("phi", "psi")),
+    ]
+
+
+class _Bath(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int32) for name in ("n_atoms", "n_bonds")),
+        *((name, ctypes.c_void_p) for name in ("atoms", "bonds", "lengths")),
+        *((name, ctypes.c_double) for name in ("timestep", "keep", "noise", "tolerance")),
+    ]
+
+
+class SimdPotential:
+    """Frames `(rows, n_atoms, 3)` nm of one molecule -> the members' energies `(rows, n_members)` in kJ/mol and the
+    gradient `(rows, n_atoms, 3)` of their mean, by the network's weights as they are now, times `unit` and from `zero`,
+    both in kJ/mol."""
+
+    def __init__(self, network: EnergyNetwork, fabric: Fabric, made: Prepared, unit: float, zero: float) -> None:
+        config, n = network.config, fabric.molecule.n_atoms
+        self.config, self.n_atoms, self.unit, self.zero = config, n, unit, zero
+        self._work: dict[tuple[int, int], npt.NDArray[Any]] = {}
+        # The program reads these arrays in place.
+        self._kept: list[npt.NDArray[Any]] = []
+        types = fabric.molecule.elements
+        steps = []
+        looks, attentions = cast(Iterable[Look], network.looks), cast(Iterable[EnergyAttention], network.steps)
+        for look, attention in zip(looks, attentions, strict=True):
+            phi, psi = (m[:, types][:, :, types] for m in attention.type_matrices())
+            dense = (look.update[0], look.update[2], look.update[4], attention.qkv, attention.out)
+            linear = [self._linear(layer) for layer in (look.send, *dense)]
+            steps.append(_Step(*linear, self._array(phi), self._array(psi)))
+        edges, shell = made.edges, made.edges.shell
+        begin, spacing = radial_grid(config.n_radial, config.cutoff_nm, made.of_atom)
+        per_cutoff2 = torch.where(shell == N_SHELLS - 1, config.cutoff_nm**-2, 0.0)
+        pairs = (begin[shell], 1.0 / spacing[shell], per_cutoff2, 1.0 / made.nearest_nm[:, 0].clamp(min=_LEAST_NM),
+                 1.0 / made.farthest_nm[:, 0])  # fmt: skip
+        seen = torch.cat([*made.looks, 0.5 * made.table], dim=-1)
+        last = cast(nn.Linear, network.site[2])
+        members = torch.cat([last.weight, last.bias[:, None], network.latent.T / n**2], dim=-1)
+        assert edges.dense
+
+        class Network(ctypes.Structure):
+            _fields_ = [
+                ("n", ctypes.c_int64),
+                ("steps", _Step * config.n_steps),
+                ("site", _Linear),
+                *((name, ctypes.c_void_p) for name in ("members", "of_atom", "edges", "pairs")),
+                ("eta", ctypes.c_float),
+                ("wall", ctypes.c_float),
+            ]
+
+        self._network = Network(
+            n,
+            (_Step * config.n_steps)(*steps),
+            self._linear(network.site[0]),
+            self._array(torch.cat([members, members.mean(0, keepdim=True)])),
+            self._array(made.of_atom),
+            self._array(seen.transpose(1, 2)),
+            self._array(torch.stack(pairs, dim=-1)),
+            config.step,
+            WALL,
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SimdPotential:
+        return self  # pointers into arrays that never change
+
+    @torch.no_grad()
+    def __call__(self, positions_nm: Tensor) -> tuple[Tensor, Tensor]:
+        rows, width = len(positions_nm), _width(len(positions_nm))
+        x = _laid(positions_nm.double(), width)
+        energy = torch.empty(len(x), self.config.n_members, width)
+        gradient = torch.empty(len(x), self.n_atoms, 3, width)
+
+        def compute(block: int, program: ctypes.CDLL, work: int) -> None:
+            places = (x[block].data_ptr(), energy[block].data_ptr(), gradient[block].data_ptr(), work)
+            program.evaluate(ctypes.byref(self._network), *map(ctypes.c_void_p, places))
+
+        self._each_block(len(x), width, compute)
+        members = energy.transpose(1, 2).flatten(0, 1)[:rows].double()
+        return self.zero + self.unit * members, self.unit * _back(gradient, rows).double()
+
+    @torch.no_grad()
+    def langevin(self, x: Tensor, v: Tensor, draw: Tensor, bath: Bath) -> tuple[Tensor, Tensor]:
+        """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
+        n_steps, 3) holds normal numbers for."""
+        rows, width, n_steps = len(x), _width(len(x)), draw.shape[2]
+        at, moving = _laid(x.double(), width), _laid(v.double(), width)
+        drawn = _laid((bath.lost[..., None] * draw).transpose(1, 2).float(), width)
+        # What the bath gives is drawn: no thermal speeds.
+        atoms = torch.cat([1.0 / bath.masses, torch.zeros_like(bath.masses)], dim=-1)
+        if (rigid := bath.rigid) is None:
+            bonds, lengths = torch.zeros(0, 2, dtype=torch.int32), atoms
+        else:
+            bonds = torch.stack([rigid.first, rigid.second], dim=-1).to(torch.int32)
+            lengths = rigid.length2.sqrt()
+        places = (array.data_ptr() for array in (atoms, bonds, lengths))
+        settings = _Bath(self.n_atoms, len(bonds), *places, bath.timestep_ps, bath.kept, 1.0, TOLERANCE)
+
+        def compute(block: int, program: ctypes.CDLL, work: int) -> None:
+            of_block = [ctypes.c_void_p(array[block].data_ptr()) for array in (at, moving, drawn)]
+            program.langevin(ctypes.byref(self._network), ctypes.byref(settings), ctypes.c_double(self.unit), *of_block,
+                             ctypes.c_int64(n_steps), ctypes.c_void_p(work))  # fmt: skip
+
+        self._each_block(len(at), width, compute)
+        return _back(at, rows), _back(moving, rows)
+
+    def _each_block(self, n_blocks: int, width: int, compute: Callable[[int, ctypes.CDLL, int], None]) -> None:
+        """Call `compute(block, program, room to work in)` for each block of copies, on as many cores as torch takes."""
+        program, n_threads = _program(self.config, width), min(torch.get_num_threads(), n_blocks)
+
+        def some(thread: int) -> None:
+            if (work := self._work.get((width, thread))) is None:
+                work = _aligned(int(program.work_floats(ctypes.c_int64(self.n_atoms))))
+                self._work[width, thread] = work
+            for block in range(thread, n_blocks, n_threads):
+                compute(block, program, work.ctypes.data)
+
+        if n_threads == 1:
+            some(0)
+        else:
+            list(_pool(n_threads).map(some, range(n_threads)))
+
+    def _array(self, values: Tensor) -> int:
+        self._kept.append(np.ascontiguousarray(values.detach().numpy(), dtype=np.float32))
+        return self._kept[-1].ctypes.data
+
+    def _linear(self, layer: Any) -> _Linear:
+        if layer is None:
+            return _Linear()
+        return _Linear(self._array(layer.weight), self._array(layer.weight.T), self._array(layer.bias))
+
+
+def simd_potential_of(network: EnergyNetwork, fabric: Fabric, made: Prepared, rows: int, *, unit: float = 1.0,
+                      zero: float = 0.0) -> SimdPotential | None:  # fmt: skip
+    """Return the potential by SIMD, compiled for so many frames; None where it does not run so: not in single precision
+    on this processor, for so many atoms that pairs change from frame to frame, or without a C++ compiler."""
+    if made.of_atom.dtype != torch.float32 or made.of_atom.device.type != "cpu" or not made.edges.dense:
+        return None
+    try:
+        _program(network.config, _width(rows))
+    except (CompilerError, OSError):
+        return None
+    return SimdPotential(network, fabric, made, unit, zero)
+
+
+def _width(rows: int) -> int:
+    return _WIDTH if rows > _FEW else _FEW
+
+
+def _laid(values: Tensor, width: int) -> Tensor:
+    """`values` (rows, ..) -> (blocks, .., width), a copy, which the program moves in place; places that have no row
+    hold the last."""
+    n_blocks = -(-len(values) // width)
+    if n_blocks * width > len(values):
+        values = values[torch.arange(n_blocks * width).clamp(max=len(values) - 1)]
+    # One whole block that comes `_back` from here lies as it is wanted: `contiguous` would not copy it.
+    return values.unflatten(0, (n_blocks, width)).movedim(1, -1).clone(memory_format=torch.contiguous_format)
+
+
+def _back(laid: Tensor, rows: int) -> Tensor:
+    return laid.movedim(-1, 1).flatten(0, 1)[:rows]
+
+
+@lru_cache(maxsize=8)
+def _program(config: PotentialConfig, width: int) -> ctypes.CDLL:
+    sizes = {name.upper(): getattr(config, name) for name in _SIZES}
+    program = compiled_program(_SOURCE, {"W": width, **sizes}, Path(engine.__path__[0]))
+    program.work_floats.restype = ctypes.c_int64
+    return program
+
+
+@lru_cache(maxsize=1)
+def _pool(n_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(n_threads, "simd")
+
+
+def _aligned(n_floats: int) -> npt.NDArray[Any]:
+    """Return an array that begins where a register may be loaded from."""
+    raw = np.empty(4 * n_floats + _ALIGNED, dtype=np.uint8)
+    begin = -raw.ctypes.data % _ALIGNED
+    return raw[begin : begin + 4 * n_floats].view(np.float32)
+
+
+class PainetPotential(Potential):
     """A scalar energy, invariant to rotations, reflections, translations and the order of like atoms, and smooth; its
     exact gradient as forces, so that momentum, angular momentum and energy are kept.
 
-    As a surrogate its chunk is MD on this potential: Langevin middle (Zhang 2019) or velocity Verlet, in double
-    precision, bonds to hydrogen rigid at steps above 2 fs. Energies are `energy_offset_kj_mol` plus the network's times
-    `energy_scale_kj_mol`, both of training.
+    Energies are `energy_offset_kj_mol` plus the network's times `energy_scale_kj_mol`, both of training.
     """
 
     arch: ClassVar[str] = "painet-potential"
-    carries_velocities: ClassVar[bool] = True
-    integrates: ClassVar[bool] = True
-    bf16_by_default: ClassVar[bool] = False
-    canonical: ClassVar[bool] = False
-    n_conditioning: ClassVar[int] = 1
     config: PotentialConfig
     energy_offset_kj_mol: Tensor
     energy_scale_kj_mol: Tensor
@@ -61,50 +256,7 @@ class PainetPotential(Surrogate):
         self.register_buffer("energy_offset_kj_mol", torch.zeros(()))
         self.register_buffer("energy_scale_kj_mol", torch.full((), 100.0))
         self._known: tuple[Molecule, GradientFn] | None = None
-
-    @property
-    def n_new(self) -> int:
-        return self.config.n_new
-
-    def in_bath(self, changes: dict[str, Any]) -> PainetPotential:
-        """See `Surrogate.in_bath`. Raises InputError and UnitError for settings that do not go together."""
-        model = copy.copy(self)
-        model.config, model._known = replace(self.config, **changes), None
-        _ = model.steps_per_frame
-        return model
-
-    def features(self, scene: Scene) -> RigidBonds | None:
-        """See `Surrogate.features`: bonds to hydrogen, as long as at the nearest minimum of the energy; None where they
-        are flexible."""
-        molecule = Molecule.of(scene)
-        bonds = [pair for pair in molecule.bonds.tolist() if any(molecule.elements[i] == _HYDROGEN for i in pair)]
-        if not (self.config.constrain_hydrogens and bonds):
-            return None
-        rest_nm = self._minimum_nm(torch.tensor(scene.positions_nm, dtype=torch.float64), molecule)
-        return RigidBonds.of(rest_nm, torch.tensor(bonds), self.masses_da(molecule))
-
-    def _minimum_nm(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        fabric = self.fabric(molecule)
-        with torch.inference_mode(False), torch.enable_grad():
-            x = positions_nm.clone().requires_grad_(True)
-            descent = torch.optim.LBFGS([x], max_iter=_RELAXED_ROUNDS, line_search_fn="strong_wolfe")
-
-            def energy() -> Tensor:
-                descent.zero_grad()
-                total = self.members(x[None], fabric).mean()
-                (x.grad,) = torch.autograd.grad(total, x)
-                return total.detach()
-
-            descent.step(energy)
-            return x.detach()
-
-    @property
-    def steps_per_frame(self) -> int:
-        return whole_steps(self.config.lag_ps, self.config.timestep_ps, "frame spacing in time steps")
-
-    def noise_shape(self, n_atoms: int) -> tuple[int, ...]:
-        """One vector an atom for the first velocities, then for each step."""
-        return (n_atoms, 1 + self.n_new * self.steps_per_frame, 3)
+        self._woven: Fabric | None = None
 
     def train(self, mode: bool = True) -> PainetPotential:
         """As any module; what was made of earlier weights is forgotten."""
@@ -113,11 +265,19 @@ class PainetPotential(Surrogate):
         return self
 
     def fabric(self, molecule: Molecule) -> Fabric:
-        """Return what `evaluate` needs of a molecule. Raises InputError for elements beyond radon."""
-        heaviest = int(molecule.elements.max())
-        if heaviest >= N_TYPES:
-            raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
-        return Fabric.of(molecule)
+        """Return what the network needs of a molecule, made once for call after call. Raises InputError for elements
+        beyond radon."""
+        if self._woven is None or self._woven.molecule is not molecule:
+            heaviest = int(molecule.elements.max())
+            if heaviest >= N_TYPES:
+                raise InputError(f"PAINET has types up to atomic number {N_TYPES - 1}; this molecule holds {heaviest}.")
+            with torch.inference_mode(False):
+                self._woven = Fabric.of(molecule)
+        return self._woven
+
+    def energies(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
+        """See `Potential.energies`."""
+        return self.members(positions_nm, self.fabric(molecule))
 
     def members(self, positions_nm: Tensor, fabric: Fabric, made: Prepared | None = None) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> the members' energies `(rows, n_members)` in kJ/mol, in float64."""
@@ -125,55 +285,12 @@ class PainetPotential(Surrogate):
         energy = self.network(positions_nm, fabric, made)
         return self.energy_offset_kj_mol.double() + self.energy_scale_kj_mol.double() * energy.double()
 
-    def evaluate(self, positions_nm: Tensor, fabric: Fabric, made: Prepared | None = None) -> Evaluation:
-        """Frames `(rows, n_atoms, 3)` nm, in double precision for forces to the last digit -> energies and forces."""
-        members, gradient = gradient_of(lambda x: self.members(x, fabric, made))(positions_nm)
-        return Evaluation(members.mean(-1), -gradient, members)
-
     def member_forces(self, positions_nm: Tensor, fabric: Fabric) -> Tensor:
         """Frames `(rows, n_atoms, 3)` nm -> each member's forces `(n_members, rows, n_atoms, 3)` kJ/mol/nm."""
         with torch.inference_mode(False), torch.enable_grad():
             x = positions_nm.detach().clone().requires_grad_(True)
             totals = self.members(x, fabric).sum(0)
             return -torch.stack([torch.autograd.grad(total, x, retain_graph=True)[0] for total in totals])
-
-    def masses_da(self, molecule: Molecule) -> Tensor:
-        """Masses `(n_atoms,)` that move: hydrogens as heavy as the settings have them, at the cost of their bond's
-        other end."""
-        masses, heavy = molecule.masses_da.double().clone(), self.config.hydrogen_mass_da
-        if heavy is not None:
-            for i, j in [*molecule.bonds.tolist(), *molecule.bonds.flip(1).tolist()]:
-                if molecule.elements[i] == _HYDROGEN != molecule.elements[j]:
-                    masses[j] -= heavy - molecule.masses_da[i]
-                    masses[i] = heavy
-        return masses
-
-    def next_chunk(self, last_frames_nm: Tensor, molecule: Molecule, noise: Tensor, *, solver_steps: int = 1,
-                   solver: str | None = None, last_velocities_nm_ps: Tensor | None = None) -> Chunk:  # fmt: skip
-        """See `Surrogate.next_chunk`: MD on the potential."""
-        with torch.inference_mode(False):
-            x, draws = last_frames_nm[:, -1].clone().double(), noise.clone().double()
-            masses = self.masses_da(molecule)[:, None]
-            thermal = (GAS_CONSTANT_KJ_MOL_K * self.config.temperature_k / masses).sqrt()
-            share = masses / masses.sum()
-            drawn = thermal * draws[:, :, 0]
-            drawn = drawn - (share * drawn).sum(-2, keepdim=True)
-            if (rigid := self._rigid(molecule, self.config.timestep_ps)) is not None:
-                x = rigid.place(x, x)
-                drawn = rigid.project(drawn, x)
-            v = drawn if last_velocities_nm_ps is None else last_velocities_nm_ps.clone().double()
-            frames = []
-            move = self.verlet if self.config.ensemble == "nve" else self.langevin
-            for draw in draws[:, :, 1:].split(self.steps_per_frame, dim=2):
-                x, v = move(x, v, molecule, masses, thermal, draw)
-                frames.append(x)
-            dtype = last_frames_nm.dtype
-            found = torch.stack(frames, dim=1).to(dtype)
-            return Chunk(found, v.to(dtype), float(draws.shape[2] - 1))
-
-    def forces(self, positions_nm: Tensor, molecule: Molecule) -> Tensor:
-        """Frames `(rows, n_atoms, 3)` nm -> forces, with what depends on the molecule alone kept from call to call."""
-        return -self.gradient(positions_nm, molecule)(positions_nm)[1]
 
     def gradient(self, positions_nm: Tensor, molecule: Molecule) -> GradientFn:
         """Return what computes the members' energies and their mean's gradient at frames like these: by SIMD where
@@ -197,60 +314,12 @@ class PainetPotential(Surrogate):
 
     def langevin(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor, *,
                  timestep_ps: float | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Return positions nm and velocities nm/ps `(rows, n_atoms, 3)` after the steps that `draw` (rows, n_atoms,
-        n_steps, 3) holds normal numbers for, by the Langevin middle scheme: kick, half a drift, bath, half a drift.
-
-        `thermal`: what velocities are at the bath's temperature, root mean square; the centre of mass is at rest.
-        """
-        dt = timestep_ps or self.config.timestep_ps
-        kept = math.exp(-self.config.friction_per_ps * dt)
-        lost = math.sqrt(1.0 - kept * kept) * thermal
-        rigid = self._rigid(molecule, dt)
-        share = masses / masses.sum()
-        v = v - (share * v).sum(-2, keepdim=True)
+        """See `Potential.langevin`; all steps by SIMD where that runs."""
         if isinstance(simd := self.gradient(x, molecule), SimdPotential):
-            return simd.langevin(x, v, draw, Bath(dt, kept, lost, masses, rigid))
-        for k in range(draw.shape[2]):
-            v = v + dt * self.forces(x, molecule) / masses
-            if rigid is not None:
-                v = rigid.project(v, x)
-            free = x + 0.5 * dt * v
-            v = kept * v + lost * draw[:, :, k]
-            v = v - (share * v).sum(-2, keepdim=True)
-            x, v = _drift(x, free, v, 0.5 * dt, rigid, dt)
-        return x, v
-
-    def verlet(self, x: Tensor, v: Tensor, molecule: Molecule, masses: Tensor, thermal: Tensor, draw: Tensor
-               ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """The same by velocity Verlet, a leapfrog that shows velocities at full steps; without a bath."""
-        dt = self.config.timestep_ps
-        rigid = self._rigid(molecule, dt)
-        force = self.forces(x, molecule)
-        for _ in range(draw.shape[2]):
-            v = v + 0.5 * dt * force / masses
-            x, v = _drift(x, x, v, dt, rigid, dt)
-            force = self.forces(x, molecule)
-            v = v + 0.5 * dt * force / masses
-            if rigid is not None:
-                v = rigid.project(v, x)
-        return x, v
-
-    @staticmethod
-    def _rigid(molecule: Molecule, timestep_ps: float) -> RigidBonds | None:
-        return molecule.own if timestep_ps > LONGEST_FLEXIBLE_PS else None
+            return simd.langevin(x, at_rest(v, masses), draw, self.bath(molecule, masses, thermal, timestep_ps))
+        return super().langevin(x, v, molecule, masses, thermal, draw, timestep_ps=timestep_ps)
 
     def set_scales(self, energies_kj_mol: Tensor, forces_kj_mol_nm: Tensor) -> None:
         """Take the units of what is learned from samples: mean energy, and the root mean square force over 0.1 nm."""
         self.energy_offset_kj_mol.fill_(float(energies_kj_mol.mean()))
         self.energy_scale_kj_mol.fill_(max(0.1 * float(forces_kj_mol_nm.square().mean().sqrt()), 1e-3))
-
-
-def _drift(before: Tensor, x: Tensor, v: Tensor, ahead_ps: float, rigid: RigidBonds | None, step_ps: float
-           ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return positions `ahead_ps` after `x`, and velocities; where bonds are rigid, placed along those of `before`,
-    `step_ps` ago, and the velocities that this takes."""
-    free = x + ahead_ps * v
-    if rigid is None:
-        return free, v
-    placed = rigid.place(free, before)
-    return placed, v + (placed - free) / step_ps

@@ -6,9 +6,10 @@ the potential learn from different samples; where their forces spread most, the 
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,21 +18,126 @@ import torch
 from torch import Tensor
 
 from surrogate.data.references import References
-from surrogate.data.weights import save_weights
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.potential.config import PotentialConfig
-from surrogate.models.painet.potential.covered import domain_of
+from surrogate.models.architecture import Architecture, Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.painet.potential.energy import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
-from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.precision import StepThreads, torch_threads
-from surrogate.training.loop import ProgressFn, StageConfig, StagePlace, append_row, run_stage
-from surrogate.training.loss_curves import read_curves
-from surrogate.training.provenance import provenance_of
-from surrogate.training.trainer import Prepared, Settings, Trainer, TrainingRequest
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import TrainingDomain, provenance_of, save_weights
+from surrogate.training.devices import StepThreads, torch_threads
+from surrogate.training.loop import (
+    ProgressFn,
+    Stage,
+    StageConfig,
+    append_row,
+    read_curves,
+    tensor_checksum,
+    train_stages,
+)
 from systems.chemistry.graph import turn_torsions
+from systems.chemistry.validity import WIDENING, geometry_from_frames, limits_from_frames
 from systems.errors import InputError, SimulationError
+from systems.files.schema import parsed
+from systems.files.whole_file import create_whole
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
+
+# States with energies and forces: what a potential learns from, kept in a file of its own.
+
+Array = Any
+# So far above the lowest state, for each atom, that no rollout comes there: the potential energy of 1,200 K.
+_HIGHEST_KJ_MOL = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """`positions_nm` and `forces_kj_mol_nm` (n, n_atoms, 3), `energies_kj_mol` (n,), in float64; `held` (n,): whether a
+    sample is kept for measuring errors and never trained on."""
+
+    positions_nm: Array
+    energies_kj_mol: Array
+    forces_kj_mol_nm: Array
+    held: Array
+
+    def __len__(self) -> int:
+        return len(self.energies_kj_mol)
+
+    def joined(self, other: Samples) -> Samples:
+        """Return both, without what lies too high above the lowest."""
+        parts = [np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Samples)]
+        together = Samples(*parts)
+        return together.plausible(together)
+
+    def plausible(self, others: Samples) -> Samples:
+        """Return those of the others that a rollout may visit, by how far they lie above the lowest of these."""
+        highest = self.energies_kj_mol.min(initial=np.inf) + _HIGHEST_KJ_MOL * self.positions_nm.shape[1]
+        return others.where(others.energies_kj_mol < highest)
+
+    def where(self, chosen: Array) -> Samples:
+        """Return those that are chosen, by a mask or by numbers."""
+        return Samples(*(getattr(self, f.name)[chosen] for f in fields(Samples)))
+
+    def tensors(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return positions, energies and forces."""
+        return tuple(torch.from_numpy(np.ascontiguousarray(a)) for a in (
+            self.positions_nm, self.energies_kj_mol, self.forces_kj_mol_nm))  # type: ignore[return-value]  # fmt: skip
+
+    def save(self, path: Path, molecule: str) -> None:
+        """Write them whole or not at all; `molecule`: whose they are."""
+        from safetensors.torch import save_file
+
+        tensors = {f.name: torch.from_numpy(np.ascontiguousarray(getattr(self, f.name))) for f in fields(Samples)}
+        text = json.dumps({"molecule": molecule})
+        metadata = {"surromd_samples": text, "sha256": tensor_checksum(text, tensors)}
+        create_whole(path, lambda temporary: save_file(tensors, temporary, metadata=metadata))
+
+    @staticmethod
+    def load(path: Path, molecule: str) -> Samples:
+        """Read them back. Raises InputError for a damaged file or another molecule's."""
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as handle:
+                metadata = handle.metadata() or {}
+                tensors = {f.name: handle.get_tensor(f.name) for f in fields(Samples)}
+            text = metadata["surromd_samples"]
+            whole = metadata["sha256"] == tensor_checksum(text, tensors)
+            whose = parsed(text)["molecule"]
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"samples {path} cannot be read ({error}); train again without `resume`.") from error
+        if not whole:
+            raise InputError(f"samples {path} are damaged (checksum); train again without `resume`.")
+        if whose != molecule:
+            raise InputError(f"samples {path} are of another molecule; train again without `resume`.")
+        return Samples(**{name: tensor.numpy() for name, tensor in tensors.items()})
+
+    @staticmethod
+    def none(n_atoms: int) -> Samples:
+        empty = np.zeros((0, n_atoms, 3))
+        return Samples(empty, np.zeros(0), empty, np.zeros(0, dtype=bool))
+
+
+# What weights of a potential cover: how frames look at its truth, and how far they move from one to the next.
+
+
+def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
+    """Return what the weights cover: the truth's quieter samples say what frames look like; runs of cheap MD, `moving`
+    (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own rate."""
+    conditions = {
+        "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
+        "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,
+        "hydrogen_mass_da": config.hydrogen_mass_da, "constrain_hydrogens": config.constrain_hydrogens,
+    }  # fmt: skip
+    quiet = samples.positions_nm[np.argsort(samples.energies_kj_mol)[: max(2, len(samples) // 2)]]
+    looks = limits_from_frames(scene, quiet, quiet)
+    before, after = (np.concatenate([run[part] for run in moving]) for part in (slice(-1), slice(1, None)))
+    moves = limits_from_frames(scene, before, after)
+    middles = [run[:, np.unique(moves.jump_idx)].mean(axis=1) for run in moving]
+    drift_nm = max((np.linalg.norm(np.diff(m, axis=0), axis=-1).max(initial=0.0) for m in middles), default=0.0)
+    jumps = {key: getattr(moves, key) for key in ("jump_idx", "jump_max_nm", "jump_min_nm")}
+    limits = replace(looks, **jumps, drift_max_nm=WIDENING * float(drift_nm))
+    geometry = geometry_from_frames(scene, quiet)
+    return TrainingDomain(scene, config.lag_ps, conditions, geometry.to_dict(), limits.to_dict(), ())
+
 
 # The share of the budget in which states are asked for; what is missing then is asked for at once, unless a pause or a
 # resumption has brought the training so far that it would hardly learn them.
@@ -199,7 +305,7 @@ class Learner:
 
     def _measured(self, samples: Samples) -> dict[str, float]:
         x, energies, forces = samples.tensors()
-        parts = [self.model.evaluate(part, self.fabric) for part in x.split(256)]
+        parts = [self.model.evaluate(part, self.molecule) for part in x.split(256)]
         wrong = torch.cat([part.forces_kj_mol_nm for part in parts]) - forces
         off = torch.cat([part.energy_kj_mol for part in parts]) - energies
         return {
@@ -321,10 +427,8 @@ def learn_potential(
     began = time.monotonic() - before_s
     torch.manual_seed(config.seed)
     model = PainetPotential(model_config)
-    log, state = out.with_suffix(".csv"), out.with_name(f"{out.stem}.potential.train.safetensors")
     if not resume:
-        for path in (log, state, samples_path(out)):
-            path.unlink(missing_ok=True)
+        samples_path(out).unlink(missing_ok=True)
     # Frames change least in the own bath, with bonds as rigid as rollouts have them, and most when hot.
     moving = [
         truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed, constrain_hydrogens=rigid)
@@ -344,18 +448,18 @@ def learn_potential(
         if progress is not None:
             progress(_line(learner), share, metrics)
 
-    place = StagePlace(state, log, torch.device("cpu"), resume)
+    def write(spent_s: list[float]) -> None:
+        domain = domain_of(truth.scene, learner.samples, moving, model_config)
+        # No MD of the truth was made: what it answered is the reference.
+        origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
+        found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in learner.errors().items()}
+        settings = {"seed": config.seed, "training_s": round(sum(spent_s), 1), **found}
+        save_weights(out, model.eval(), domain, provenance_of(origin, settings))
+
     learner.begin(budget_s)
+    stages = [Stage(model, stage, learner.loss, learner.errors, saves=False)]
     with torch_threads(1):
-        spent = run_stage(model, stage, learner.loss, learner.errors, place, progress=advance)
-    errors = learner.errors()
-    domain = domain_of(truth.scene, learner.samples, moving, model_config)
-    # No MD of the truth was made: what it answered is the reference.
-    origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
-    found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in errors.items()}
-    settings = {"seed": config.seed, "training_s": round(spent, 1), **found}
-    save_weights(out, model.eval(), domain, provenance_of(origin, settings))
-    state.unlink(missing_ok=True)
+        train_stages(stages, out, write, device=torch.device("cpu"), resume=resume, progress=advance)
     return out
 
 
@@ -396,3 +500,6 @@ def _no_trajectories(request: TrainingRequest) -> InputError:
         f"{request.arch} learns from forces that are computed for it; give a molecule, `arch='painet'` and "
         "`level='gfn2-xtb'`."
     )
+
+
+PAINET_POTENTIAL = Architecture("painet-potential", PotentialConfig.from_dict, PainetPotential, PotentialTrainer)

@@ -21,7 +21,7 @@ from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, 
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.cli import main
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.models.weights import Weights, load_weights, save_weights
 from systems.errors import InputError
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer

@@ -18,7 +18,7 @@ from surrogate.bench.cost_error.effective_samples import (
     training_cost,
 )
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
+from surrogate.models.weights import load_weights
 
 
 def test_forgetting_too_fast_earns_nothing_and_too_slowly_costs() -> None:

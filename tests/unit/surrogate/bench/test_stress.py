@@ -17,7 +17,7 @@ from surrogate.bench.stress.other_arithmetic import measure_batches, measure_ope
 from surrogate.bench.stress.stress_options import StressOptions
 from surrogate.bench.stress.stress_page import markdown
 from surrogate.bench.stress.trials import StressConfig, choose_config, run_stress
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import Geometry, geometry_from_frames
 from systems.errors import InputError

@@ -10,12 +10,11 @@ import pytest
 import torch
 
 from surrogate.data.frames import TrainingFrames
-from surrogate.data.strides import StrideSampler, strides_up_to
-from surrogate.data.weights import Weights, load_weights, save_weights
-from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.data.references import StrideSampler, strides_up_to
+from surrogate.models.lam_slide.network import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
-from surrogate.sampling.domain import fit_weights
-from surrogate.sampling.lags import choose_lag
+from surrogate.models.weights import Weights, load_weights, save_weights
+from surrogate.sampling.domain import choose_lag, fit_weights
 from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.data.frames import TrainingFrames, collect_frames, load_frames, write_windows
-from surrogate.data.splits import RUN, Split, refuse_leaks
-from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.data.frames import RUN, Split, TrainingFrames, collect_frames, load_frames, refuse_leaks, write_windows
+from surrogate.models.lam_slide.network import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
 from systems.errors import InputError
 from systems.scene import Scene

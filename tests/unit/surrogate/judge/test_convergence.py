@@ -10,8 +10,8 @@ import pytest
 from judge_starts import SETTINGS, TORSIONS, Setting, judged, make_set
 
 from surrogate.judge import convergence
-from surrogate.judge.convergence import convergence_of, find_wells
-from surrogate.judge.explained import explain
+from surrogate.judge.convergence import convergence_of, explain
+from surrogate.judge.measure.torsions import find_wells
 from surrogate.judge.read.ensemble import load_ensemble
 
 LONG = Setting("long", 32, 40.0)
@@ -109,6 +109,10 @@ def test_wells_are_peaks_that_a_minimum_parts() -> None:
     assert len(found.names) == 2
     assert np.mean(found.assign([two])[0] == found.assign([np.array([2.5])])[0][0]) == pytest.approx(0.1, abs=0.01)
     assert len(find_wells("ψ", [rng.normal(3.1, 0.4, 500)]).names) == 1
+    gone = np.array([2.5, np.nan, 2.5])
+    assert found.labels([gone])[0][1] == -1 and found.assign([gone])[0][1] >= 0
+    three = np.concatenate([rng.normal(np.radians(c), 0.2, 500) for c in (-60.0, 60.0, 178.0)])
+    assert len(find_wells("χ1", [np.arctan2(np.sin(three), np.cos(three))]).names) == 3
 
 
 def test_real_runs_of_alanine_dipeptide_pass_and_their_beginnings_do_not(shared_data: Path) -> None:

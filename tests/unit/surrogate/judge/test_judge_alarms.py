@@ -19,7 +19,7 @@ from judge_alarms import (
 
 from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.motion import relaxation_rows
+from surrogate.judge.rows import relaxation_rows
 from systems.errors import InputError
 
 

@@ -128,7 +128,6 @@ def test_real_trajectories_of_one_molecule_agree(shared_data: Path, alanine_dipe
     assert judgement.status in ("indistinguishable", "close", "undecided")
     assert judgement.faults[1].n_invalid == 0
     assert judgement.row("population:ψ in the β basin").candidate.value == pytest.approx(52, abs=6)
-    assert judgement.row("correlation:1").reference.value == pytest.approx(0.987, abs=0.002)  # type: ignore[union-attr]
     assert 150 < judgement.row("correlation_time").candidate.value < 400
 
 
@@ -136,12 +135,16 @@ def test_real_torsions_equal_mdtrajs(shared_data: Path) -> None:
     """An independent implementation on real frames."""
     import mdtraj
 
-    from surrogate.judge.measure import structure
+    from surrogate.judge.measure import kinetics, structure
+    from surrogate.judge.measure.statistics import Blocks
 
     folder = shared_data / "alanine-dipeptide"
     files = [folder / "trajectory-1.dcd"]
     ensemble = load_ensemble(files, top=folder / "ala2.pdb", lag_ps=1.0)
     features = structure.Yardstick.of(ensemble, probing=False).measure(ensemble)
+    cosine = [np.cos(x[:, 0].astype(np.float64)) for x in features.psi]
+    sums = kinetics.lag_sums(cosine, Blocks.whole(features.segment_lengths), 2)
+    assert kinetics.autocorrelation(sums)[1] == pytest.approx(0.987, abs=0.003)
     theirs = mdtraj.load(str(files[0]), top=str(folder / "ala2.pdb"))
     for own, compute in ((features.phi, mdtraj.compute_phi), (features.psi, mdtraj.compute_psi)):
         step = own[0][:, 0] - compute(theirs)[1][:, 0]

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from surrogate.judge import worth_measures
-from surrogate.judge.comparison import Judgement, compare
+from surrogate.judge.comparison import Account, Judgement, compare, cost_ratio
 from surrogate.judge.measure import distributions
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.account import Account, cost_ratio
 from surrogate.judge.rows.rows import Options
 from surrogate.judge.worth import Measure, Worth, distance_to_truth, errors_by_length, headline, worth_by
 from systems.units import format_time_ps

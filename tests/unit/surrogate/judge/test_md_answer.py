@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from surrogate.judge.markov import equilibrium
-from surrogate.judge.md_answer import frames_over_states, md_answer, wells
+from surrogate.judge.md_answer import frames_over_states, md_answer
+from surrogate.judge.measure.torsions import find_torsions
 from surrogate.judge.read.ensemble import Ensemble
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
 from systems.errors import InputError
@@ -126,11 +127,29 @@ def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
     assert grid.shape == (36, 36) and grid.min() == 0.0
 
 
-def test_wells_are_found_and_one_well_is_none() -> None:
-    rng = np.random.default_rng(0)
-    three = np.radians(np.concatenate([rng.normal(c, 12.0, 500) for c in (-60.0, 60.0, 178.0)]))
-    assert len(wells(np.arctan2(np.sin(three), np.cos(three)))) == 3
-    assert len(wells(np.radians(rng.normal(20.0, 25.0, 2000)))) < 2
+def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
+    """Butane's torsion: anti and both gauche, of known shares, named by their mean angles; one well is no state."""
+    from systems.library.named_scenes import prepare
+
+    scene = prepare("smiles:CCCC")
+    graph, rng = bonded_graph(scene), np.random.default_rng(0)
+    (quad,) = (t.quad for t in find_torsions(scene) if t.kind == "rotatable")
+    states = jumps(np.array([[0.94, 0.03, 0.03], [0.1, 0.9, 0.0], [0.1, 0.0, 0.9]]), [0, 1, 2, 0] * 4, 300, 8)
+
+    def run(centres: tuple[float, ...]) -> Ensemble:
+        forms = np.array([[turned(scene.positions_nm, list(quad), math.radians(c + rng.normal(0, 12.0))
+                                  - _angle(scene.positions_nm, np.array(quad)), graph) for _ in range(FORMS)]
+                          for c in centres], dtype=np.float32)  # fmt: skip
+        return Ensemble("MD", [forms[row, rng.integers(FORMS, size=len(row))] for row in states], 1.0, scene)
+
+    answer = md_answer(run((180.0, 65.0, -65.0)), 300.0)
+    found = {s.state: s for s in answer.states}
+    named = {int(name.removesuffix("°")): s for name, s in found.items()}
+    assert len(found) == 3 and all(min(abs(abs(k) - c) for c in (180, 65)) < 8 for k in named)
+    for k, state in named.items():
+        right = 0.625 if abs(k) > 120 else 0.1875
+        assert abs(state.share - right) < 3.0 * state.error + 0.03, (k, state)
+    assert not md_answer(run((180.0, 180.0, 180.0)), 300.0).states, "negative control"
 
 
 def test_a_molecule_without_torsions_is_one_line() -> None:

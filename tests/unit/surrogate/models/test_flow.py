@@ -91,7 +91,7 @@ def test_unknown_interpolant_is_refused() -> None:
 
 def test_rotations_are_uniform_over_so3() -> None:
     """The wrong density (uniform Euler angles) fails the second moment of a matrix element and the angle's law."""
-    from surrogate.models.lam_slide.losses import random_rotations
+    from surrogate.models.lam_slide.trainer import random_rotations
 
     r = random_rotations(40_000, torch.Generator().manual_seed(0)).double()
     torch.testing.assert_close(r @ r.mT, torch.eye(3, dtype=torch.float64).expand_as(r), atol=1e-5, rtol=0)

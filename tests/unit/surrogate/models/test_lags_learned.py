@@ -9,9 +9,9 @@ import pytest
 from lag_errors import _correlation
 
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.data.weights import load_weights
-from surrogate.models.lam_slide.config import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
+from surrogate.models.lam_slide.network import ApproximatorConfig, AutoencoderConfig, LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
 from systems.prepare.molecule import scene_from_smiles

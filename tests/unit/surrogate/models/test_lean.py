@@ -11,11 +11,11 @@ import torch
 from torch import nn
 
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
 from surrogate.models.layers import CrossAttentionBlock, ParallelBlock, rotary_angles
 from surrogate.models.lean import LeanBlock, LeanCrossBlock, PackedLinear, with_lean_parts
-from surrogate.models.memory import keep_freed_memory
+from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler, with_bf16_weights
+from surrogate.training.devices import keep_freed_memory
 
 WIDTH, HEADS, LENGTH = 32, 2, 5
 

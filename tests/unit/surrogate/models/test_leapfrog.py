@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from surrogate.models.conformance import branched_chain, random_state
-from surrogate.models.interface import Molecule
-from surrogate.models.painet import pairs as pairs_module
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.leapfrog import RadialFunctions
-from surrogate.models.painet.model import Painet
-from surrogate.models.painet.pairs import molecular_pairs
+from surrogate.models.painet import attention as pairs_module
+from surrogate.models.painet.attention import molecular_pairs
+from surrogate.models.painet.decoders import RadialFunctions
+from surrogate.models.painet.model import Painet, PainetConfig
+from surrogate.models.propagator import Molecule
 from systems.errors import InputError
 
 CONFIG = PainetConfig(n_new=2, width=16, n_heads=2, head_dim=8, n_decoder_layers=3, decoder="leapfrog", edges="all",
@@ -68,21 +67,6 @@ def test_momentum_and_angular_momentum_are_kept_whatever_it_has_learned() -> Non
             p.normal_(std=0.3)
     frames, velocities = free(x, v, free.structure(molecule))
     assert (turning(frames[:, -1], velocities[:, -1]) - turning(x, v)).abs().max() > 1e-3
-
-
-def test_bf16_leaves_the_integration_alone() -> None:
-    from surrogate.sampling.chunks import with_bf16_weights
-
-    molecule = branched_chain(9)
-    exact = lively().float()
-    x, v = (s.float() for s in state(9))
-    rounded = with_bf16_weights(exact)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found, _ = rounded(x, v, rounded.structure(molecule))
-    expected, _ = exact(x, v, exact.structure(molecule))
-    straight = x[:, None] + CONFIG.lag_ps * torch.arange(1, 3)[:, None, None] * v[:, None]
-    assert found.dtype == torch.float32
-    assert (found - expected).abs().max() < 0.02 * (expected - straight).abs().max()
 
 
 def test_radial_functions_have_the_derivative_they_say() -> None:

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.models.atom_features import features_of_graph
 from surrogate.models.conformance import branched_chain, orthogonal, random_state
-from surrogate.models.interface import Molecule
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
-from surrogate.models.painet.modes import Modes, centred_template, superposing_turns
-from surrogate.models.painet.rotation import angular_velocity, spun, turns
+from surrogate.models.painet.decoders import Modes, angular_velocity, centred_template, spun, superposing_turns, turns
+from surrogate.models.painet.model import Painet, PainetConfig
+from surrogate.models.propagator import Molecule
 from systems.errors import InputError
 
 SMALL = PainetConfig(n_new=3, width=16, n_heads=2, head_dim=8, n_decoder_layers=1, n_modes=8)
@@ -29,9 +26,7 @@ def body(n_atoms: int = 7) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def with_template(molecule: Molecule, template_nm: np.ndarray) -> Molecule:
-    n, none = molecule.n_atoms, np.zeros(molecule.n_atoms)
-    bonds = molecule.bonds.numpy()
-    return replace(molecule, atoms=features_of_graph(n, bonds, np.ones(len(bonds)), bonds[:0], none, none, template_nm))
+    return replace(molecule, own=torch.tensor(template_nm, dtype=torch.float32))
 
 
 def test_a_rigid_body_turns_as_its_angular_velocity_says() -> None:

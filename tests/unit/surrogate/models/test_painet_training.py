@@ -12,11 +12,10 @@ import pytest
 import torch
 
 from surrogate.data.frames import TrainingFrames, at_rest, collect_frames, load_frames, quantise
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Chunk, Molecule
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
+from surrogate.models.painet.model import Painet, PainetConfig
 from surrogate.models.painet.trainer import PainetTraining, StateWindows, for_frames, forecast_errors, train_painet
+from surrogate.models.propagator import Chunk, Molecule
+from surrogate.models.weights import load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError
 from systems.scene import Scene

@@ -8,12 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from surrogate.data.descriptions import describe
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule
 from surrogate.models.painet.potential.model import PainetPotential
-from surrogate.models.painet.potential.rigid import RigidBonds
+from surrogate.models.potential import RigidBonds
+from surrogate.models.propagator import Molecule
+from surrogate.models.weights import load_weights
 from systems.scene import Scene
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
@@ -57,7 +56,7 @@ def paracetamol() -> tuple[PainetPotential, Scene]:
 
 def rolled(model: PainetPotential, scene: Scene, rows: int, seed: int = 0) -> tuple[Tensor, Tensor, Molecule]:
     """Frames `(rows, n_new, n_atoms, 3)` and last velocities of a chunk from the scene's structure."""
-    molecule = describe(model, scene)
+    molecule = model.featurise(scene)
     noise = torch.randn(rows, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(seed))
     last = torch.tensor(scene.positions_nm).float().expand(rows, 1, -1, -1)
     chunk = model.next_chunk(last, molecule, noise)
@@ -93,9 +92,9 @@ def test_energy_is_kept_at_4_fs_without_a_bath(paracetamol: tuple[PainetPotentia
     free = replace_lag(
         model.in_bath({"timestep_ps": 0.004, "hydrogen_mass_da": 3.0, "ensemble": "nve"}), 0.004, 1
     )  # fmt: skip
-    molecule = describe(free, scene)
+    molecule = free.featurise(scene)
     noise = torch.randn(1, *free.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(1))
-    masses, fabric = free.masses_da(molecule)[:, None], free.fabric(molecule)
+    masses = free.masses_da(molecule)[:, None]
 
     def totals(molecule: Molecule, n: int) -> Tensor:
         x, v, found = torch.tensor(scene.positions_nm)[None, None], None, []
@@ -104,7 +103,7 @@ def test_energy_is_kept_at_4_fs_without_a_bath(paracetamol: tuple[PainetPotentia
             x, v = chunk.frames_nm, chunk.velocities_nm_ps
             assert v is not None
             kinetic = 0.5 * (masses * v.double().square()).sum()
-            found.append(kinetic + free.evaluate(x[:, -1].double(), fabric).energy_kj_mol[0])
+            found.append(kinetic + free.evaluate(x[:, -1].double(), molecule).energy_kj_mol[0])
         return torch.stack(found)
 
     settled = totals(molecule, 80)[20:]

@@ -12,7 +12,7 @@ from scripted_model import (
     CONDITIONS,
     LAG_PS,
 )
-from surrogate.data.weights import TrainingDomain
+from surrogate.models.weights import TrainingDomain
 from systems.chemistry.geometry import superpose
 from systems.chemistry.validity import geometry_from_frames, limits_from_frames
 from systems.scene import Scene

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from surrogate.data.weights import Weights, load_weights
-from surrogate.sampling import choice
-from surrogate.sampling.choice import choose_weights
+from surrogate.models.weights import Weights, load_weights
+from surrogate.sampling import domain as choice
+from surrogate.sampling.domain import choose_weights
 from systems.errors import OutOfDomainError
 from systems.library.named_scenes import load, prepare
 

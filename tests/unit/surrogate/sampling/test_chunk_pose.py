@@ -9,10 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from surrogate.data.weights import Weights
-from surrogate.models.interface import Surrogate
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
+from surrogate.models.painet.model import Painet, PainetConfig
+from surrogate.models.propagator import Propagator
+from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import ChunkSampler
 
 
@@ -21,7 +20,7 @@ def weights(request: pytest.FixtureRequest, small_weights: Weights) -> Weights:
     if request.param == "lam-slide":
         return small_weights
     torch.manual_seed(0)
-    model: Surrogate = Painet(PainetConfig(n_new=3, width=16, n_heads=2, head_dim=8, n_decoder_layers=2)).eval()
+    model: Propagator = Painet(PainetConfig(n_new=3, width=16, n_heads=2, head_dim=8, n_decoder_layers=2)).eval()
     return replace(small_weights, model=model)
 
 

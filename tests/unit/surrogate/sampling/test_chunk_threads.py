@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import ChunkSampler
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError

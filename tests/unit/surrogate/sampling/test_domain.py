@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from surrogate.sampling.domain import bond_types, find_deviations, match_domain, match_scene, torsion_environments
 from systems.chemistry.geometry import signed_volumes
 from systems.errors import OutOfDomainError

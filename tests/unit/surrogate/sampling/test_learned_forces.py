@@ -13,15 +13,14 @@ import torch
 
 from md_reference.forces.quantum import Potential
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import TrainingDomain, Weights, load_weights
 from surrogate.judge.read.ensemble import load_ensemble
-from surrogate.models.painet.config import PainetConfig
-from surrogate.models.painet.model import Painet
-from surrogate.models.painet.potential.config import PotentialConfig
+from surrogate.models.painet.model import Painet, PainetConfig
+from surrogate.models.painet.potential.energy import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
+from surrogate.models.weights import TrainingDomain, Weights, load_weights
 from surrogate.sampling import runner
 from surrogate.sampling.domain import in_bath
-from surrogate.sampling.openmm.learned_forces import KJ_MOL_PER_EV, LearnedForces
+from surrogate.sampling.openmm.simulation import KJ_MOL_PER_EV, LearnedForces
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.matching import match_atoms
 from systems.chemistry.validity import ENERGY, UNSURE, geometry_from_frames

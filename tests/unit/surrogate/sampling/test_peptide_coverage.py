@@ -10,18 +10,15 @@ import pytest
 import torch
 
 from surrogate import api
-from surrogate.data.features.peptide_chains import chain_features
-from surrogate.data.features.standard_peptide import standard_peptide
-from surrogate.data.frames import TrainingFrames, canonicalise, quantise
+from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
 from surrogate.data.shipped import weights_path
-from surrogate.data.splits import Split
-from surrogate.data.weights import Weights, load_weights, read_header, save_weights
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, standard_peptide
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject
 from surrogate.models.peptides.trainer import normalise, with_scale
+from surrogate.models.weights import Weights, load_weights, read_header, save_weights, training_domain
 from surrogate.sampling.domain import find_deviations, match_domain
 from surrogate.sampling.runner import RolloutConfig, rollout
-from surrogate.training.provenance import training_domain
 from systems.errors import InputError, OutOfDomainError, PreparationError
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene, reordered

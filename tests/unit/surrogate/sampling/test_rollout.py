@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.data.weights import Weights
 from surrogate.models.lam_slide.model import LamSlide
+from surrogate.models.weights import Weights
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.chemistry.validity import INVALID, NOT_FINITE
 from systems.errors import InputError, OutOfDomainError, SimulationError, UnitError

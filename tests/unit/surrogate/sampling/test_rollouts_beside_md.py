@@ -15,11 +15,10 @@ from scripted_model import (
     twist,
     weights_of,
 )
-from surrogate.data.weights import TrainingDomain
+from surrogate.models.weights import TrainingDomain
 from surrogate.sampling.chunks import ChunkSampler
-from surrogate.sampling.guards import CAUGHT, Guard
+from surrogate.sampling.interventions import CAUGHT, MD_BETWEEN, Guard
 from surrogate.sampling.openmm.coupling import Coupling
-from surrogate.sampling.rollout_account import MD_BETWEEN
 from surrogate.sampling.runner import RolloutConfig
 from systems.chemistry.validity import ENERGY
 from systems.errors import InputError, UnknownNameError

@@ -7,7 +7,7 @@ import pytest
 
 from md_reference.forces.quantum import Potential
 from surrogate.data.shipped import weights_path
-from surrogate.sampling.openmm.learned_forces import LearnedForces
+from surrogate.sampling.openmm.simulation import LearnedForces
 from systems.prepare.molecule import scene_from_smiles
 
 

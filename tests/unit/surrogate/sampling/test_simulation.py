@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogate.data.weights import Weights
+from surrogate.models.weights import Weights
 from surrogate.sampling.openmm.simulation import Simulation
 from surrogate.sampling.runner import RolloutConfig, rollout
 from systems.errors import InputError, OutOfDomainError, SimulationError

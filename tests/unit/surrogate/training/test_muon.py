@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from surrogate.training.loop import StageConfig, optimisers_of
-from surrogate.training.muon import Muon, orthogonalised
+from surrogate.training.loop import Muon, StageConfig, optimisers_of, orthogonalised
 
 
 @pytest.mark.parametrize("shape", [(24, 24), (60, 16), (16, 60)])

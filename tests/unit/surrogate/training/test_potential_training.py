@@ -12,13 +12,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from surrogate.data.weights import load_weights
-from surrogate.models.interface import Molecule, draw_noise
 from surrogate.models.painet.potential import trainer
-from surrogate.models.painet.potential.config import PotentialConfig
-from surrogate.models.painet.potential.covered import domain_of
-from surrogate.models.painet.potential.samples import Samples
-from surrogate.models.painet.potential.trainer import Learner, PotentialTraining, learn_potential, samples_path
+from surrogate.models.painet.potential.energy import PotentialConfig
+from surrogate.models.painet.potential.trainer import (
+    Learner,
+    PotentialTraining,
+    Samples,
+    domain_of,
+    learn_potential,
+    samples_path,
+)
+from surrogate.models.propagator import Molecule, draw_noise
+from surrogate.models.weights import load_weights
+from surrogate.training import loop
 from systems.chemistry.validity import DRIFT, Limits, check_limits
 from systems.errors import InputError, SimulationError
 from systems.prepare.molecule import scene_from_smiles
@@ -112,7 +118,7 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
         return 0.0
 
     monkeypatch.setattr(trainer.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(trainer, "run_stage", stage)
+    monkeypatch.setattr(loop, "run_stage", stage)
     config = replace(QUICK, steps=None, budget_s=200.0)
     learn_potential(Slow(), tmp_path / "a.safetensors", SMALL, config, before_s=15.0, after_s=20.0)
     # 15 before, 400 frames of MD at two temperatures, 24 first labels, 20 for what comes after.

@@ -12,14 +12,11 @@ import pytest
 import torch
 
 from surrogate.data.frames import TrainingFrames, collect_frames, is_windows, load_frames, quantise
-from surrogate.data.weights import Weights, load_weights, read_header, save_weights
-from surrogate.models.lam_slide.autoencoder import draw_identifiers
-from surrogate.models.lam_slide.config import LamSlideConfig
-from surrogate.models.lam_slide.losses import FlowWindows, flow_loss
 from surrogate.models.lam_slide.model import LamSlide
-from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide, window_frames
+from surrogate.models.lam_slide.network import LamSlideConfig, draw_identifiers
+from surrogate.models.lam_slide.trainer import FlowWindows, TrainingConfig, flow_loss, train_lam_slide, window_frames
+from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights
 from surrogate.training.loop import StageConfig, StagePlace, learning_rate_factor, run_stage
-from surrogate.training.provenance import provenance_of
 from systems.errors import InputError, SimulationError, WeightsError
 from systems.options import read_toml
 from systems.scene import Scene
@@ -261,7 +258,7 @@ def test_rotation_augmentation_trains_without_canonical_frames(tmp_path: Path, h
     loose = replace(harmonic_frames, canonical=False)
     config = replace(small_model_config, canonical=False)
     out = train_lam_slide(loose, tmp_path / "a.safetensors", config, QUICK)
-    assert load_weights(out).model.canonical is False
+    assert load_weights(out).model.config.canonical is False
     with pytest.raises(InputError, match="disagree"):
         train_lam_slide(harmonic_frames, tmp_path / "b.safetensors", config, QUICK)
 

@@ -12,9 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from surrogate.training.devices import choose_device, is_first_process
-from surrogate.training.health import FACTOR, IN_A_ROW, Watch, first_not_finite
-from surrogate.training.loop import StageConfig, StagePlace, append_row, run_stage
-from surrogate.training.loss_curves import plot_curves, read_curves, series
+from surrogate.training.loop import (
+    FACTOR,
+    IN_A_ROW,
+    StageConfig,
+    StagePlace,
+    Watch,
+    append_row,
+    first_not_finite,
+    plot_curves,
+    read_curves,
+    run_stage,
+    series,
+)
 from systems.errors import InputError, SimulationError
 
 LINE = """

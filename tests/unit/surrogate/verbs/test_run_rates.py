@@ -18,8 +18,8 @@ from md_reference.run.config import MDConfig
 from md_reference.simd import force_field
 from md_reference.simd.system_terms import SimdUnavailableError
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import load_weights
 from surrogate.judge.read.ensemble import Ensemble
+from surrogate.models.weights import load_weights
 from surrogate.verbs.run import rates as measuring
 from surrogate.verbs.run.rates import Rates, measure, rollout_rate
 from systems.chemistry.graph import backbone_torsions, bonded_graph, turned

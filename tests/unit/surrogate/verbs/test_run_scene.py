@@ -83,7 +83,7 @@ def test_weights_that_roll_nothing_end_the_training_and_not_the_run(
         one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="nothing", md_ps_per_s=0.01, dear=True)
     )
     monkeypatch.setattr(stages, "train", train)
-    monkeypatch.setattr("surrogate.data.weights.load_weights", lambda path: path)
+    monkeypatch.setattr("surrogate.models.weights.load_weights", lambda path: path)
     monkeypatch.setattr(stages, "rollout_rate", fail)
     monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
     found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)

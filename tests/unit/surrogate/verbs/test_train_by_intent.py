@@ -13,15 +13,14 @@ from safetensors.numpy import load_file
 import surrogate as sm
 from command_line import SMALL_LAM_SLIDE, run
 from surrogate.data.references import References
-from surrogate.data.weights import load_weights
-from surrogate.models.lam_slide import choices
-from surrogate.models.lam_slide.config import LamSlideConfig
+from surrogate.models.architecture import TrainingRequest, toml_text
+from surrogate.models.lam_slide import trainer as choices
+from surrogate.models.lam_slide.network import LamSlideConfig
 from surrogate.models.lam_slide.trainer import TrainingConfig, train_lam_slide
-from surrogate.models.peptides.model import PeptideConfig
+from surrogate.models.peptides.layout import PeptideConfig
 from surrogate.models.peptides.trainer import PeptideTraining
-from surrogate.models.settings import toml_text
+from surrogate.models.weights import load_weights
 from surrogate.sampling.domain import match_domain
-from surrogate.training.trainer import TrainingRequest
 from systems.errors import InputError, OutOfDomainError
 from systems.library.named_scenes import prepare
 from systems.prepare.peptide import build_peptide

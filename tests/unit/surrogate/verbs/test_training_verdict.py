@@ -13,7 +13,7 @@ import pytest
 from surrogate import api
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.shipped import weights_path
-from surrogate.data.weights import Weights, load_weights, save_weights
+from surrogate.models.weights import Weights, load_weights, save_weights
 from surrogate.verbs.train_verdict import TrainingVerdict, judge_training, word_of
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer

@@ -11,14 +11,13 @@ from surrogate.judge.measure.probes import MAX_COLUMNS, _foremost
 from surrogate.judge.measure.statistics import make_blocks
 from surrogate.judge.measure.structure import Yardstick
 from surrogate.judge.read.ensemble import Ensemble
-from surrogate.judge.rows.motion.lifetimes import lifetime_rows
+from surrogate.judge.rows.bond_rows import angle_rows
 from surrogate.judge.rows.rows import Options, Row, Trio, make_sample
-from surrogate.judge.rows.shape.contact_rows import contact_rows, hydrogen_bond_rows
-from surrogate.judge.rows.shape.shape_rows import shape_rows
+from surrogate.judge.rows.shape_rows import contact_rows, hydrogen_bond_rows, shape_rows
 from systems.library.named_scenes import prepare
 from systems.scene import Scene
 
-ROOMS = (shape_rows, contact_rows, hydrogen_bond_rows, lifetime_rows)
+METRICS = (shape_rows, angle_rows, contact_rows, hydrogen_bond_rows)
 OPTIONS = Options(n_bootstrap=50, n_permutations=20)
 N = 1500
 
@@ -53,7 +52,7 @@ def judged(glycine: Scene) -> Judge:
         three = fixed[0], measured(frames), fixed[1]
         samples = [make_sample(f, make_blocks(f.segment_lengths, 100), OPTIONS, k) for k, f in enumerate(three)]
         trio = Trio(glycine, yardstick.torsions, yardstick.geometry, *samples, OPTIONS)
-        found = [room(trio) for room in ROOMS]
+        found = [measure(trio) for measure in METRICS]
         return {row.key: row for rows, _, _ in found for row in rows}, [c for _, charts, _ in found for c in charts]
 
     return judge
@@ -81,7 +80,6 @@ def test_two_equal_hydrogens_swapped_change_nothing(judged: Judge, glycine: Scen
     other = swapped(frames, givers(glycine)[0], bonded)
     (plain, charts), (turned, others) = judged(frames), judged(other)
     assert any(key.startswith("hydrogen_bond:") for key in plain)
-    assert any(key.startswith("hydrogen_bond_lifetime:") for key in plain)
     assert set(plain) == set(turned)
     for key, row in plain.items():
         assert turned[key].candidate.value == pytest.approx(row.candidate.value, rel=1e-5), key

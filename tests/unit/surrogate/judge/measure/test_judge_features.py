@@ -9,13 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge.measure import puckers
-from surrogate.judge.measure.probes import find_probes, mean_structure
-from surrogate.judge.measure.structure import backbone
+from surrogate.judge.measure.probes import find_probes, find_rings, mean_structure, pucker
 from surrogate.judge.measure.torsions import find_torsions
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows.shape.couplings import KARPLUS, coupling_hz, find_sites
-from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import bonded_graph
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene
@@ -96,15 +92,6 @@ def test_hydrogen_bonds_equal_mdtraj(real: Ensemble, as_mdtraj: object) -> None:
         theirs = {tuple(t) for t in mdtraj.baker_hubbard(as_mdtraj, freq=threshold, periodic=False).tolist()}
         assert {t for t, share in ours.items() if share > threshold} == theirs
     assert any(share > 0.001 for share in ours.values()), "the C7 ring of alanine dipeptide closes now and then"
-
-
-def test_couplings_equal_mdtraj(real: Ensemble, as_mdtraj: object) -> None:
-    quads = backbone(real.scene)
-    sites = find_sites(real.scene, quads)
-    assert [s.label for s in sites] == ["ALA 2"] and sites[0].offsets_deg == (-60.0,)
-    phi = torsion(real.segments[0][:], quads.phi)[:, 0]
-    _, expected = mdtraj.compute_J3_HN_HA(as_mdtraj, model="Bax2007")
-    assert coupling_hz(phi) == pytest.approx(expected[:, 0], abs=1e-4)
 
 
 def test_chi_torsions_equal_mdtraj(peptide: Scene) -> None:
@@ -221,19 +208,19 @@ def ring_frame(heights: np.ndarray, radius: float = 0.14) -> np.ndarray:
 def test_pucker_of_five_and_six_rings(phase: float) -> None:
     """Heights made by Cremer and Pople's own inverse, eq. 13: amplitude and phase come back."""
     five = np.sqrt(2 / 5) * 0.04 * np.cos(phase + 4 * np.pi * np.arange(5) / 5)
-    amplitude, angle = puckers.pucker(ring_frame(five), range(5))[:, 0]
+    amplitude, angle = pucker(ring_frame(five), range(5))[:, 0]
     assert amplitude == pytest.approx(0.04, rel=1e-6)
     assert np.cos(angle - phase) == pytest.approx(1.0, abs=1e-9)
     alternating = (-1.0) ** np.arange(6)
     for theta, mix in ((0.0, (0.0, 1.0)), (np.pi, (0.0, -1.0)), (np.pi / 2, (1.0, 0.0)), (np.pi / 4, (0.5**0.5,) * 2)):
         six = np.sqrt(1 / 3) * 0.06 * mix[0] * np.cos(phase + 4 * np.pi * np.arange(6) / 6)
         six = six + 0.06 * mix[1] * alternating / np.sqrt(6)
-        amplitude, angle = puckers.pucker(ring_frame(six), range(6))[:, 0]
+        amplitude, angle = pucker(ring_frame(six), range(6))[:, 0]
         assert (amplitude, angle) == pytest.approx((0.06, theta), abs=1e-6)
 
 
 def test_rings_that_can_pucker(peptide: Scene) -> None:
-    rings = puckers.find_rings(peptide)
+    rings = find_rings(peptide)
     assert [sorted(peptide.atom_names[i] for i in r) for r in rings] == [["CA", "CB", "CD", "CG", "N"]], "not phenyl"
     probes = find_probes(peptide, peptide.positions_nm[None].astype(np.float32))
     assert probes.labels("puckers")[0].startswith("amplitude, ring") and "PRO 4" in probes.labels("puckers")[0]
@@ -241,26 +228,6 @@ def test_rings_that_can_pucker(peptide: Scene) -> None:
     both = [probes.measure(x[None].astype(np.float32))["puckers"][0] for x in (peptide.positions_nm, mirrored)]
     assert both[0][0] == pytest.approx(both[1][0], abs=1e-6) and 0.02 < both[0][0] < 0.06
     assert np.cos(both[0][1] - both[1][1]) == pytest.approx(-1.0, abs=1e-4), "the mirror image puckers the other way"
-
-
-def test_couplings_know_glycine_proline_and_handedness(peptide: Scene) -> None:
-    assert [s.label for s in find_sites(peptide, backbone(peptide))] == ["VAL 2", "PHE 3", "LYS 5", "THR 6"]
-    mirrored = peptide.with_positions(peptide.positions_nm * [-1.0, 1.0, 1.0])
-    assert {s.offsets_deg for s in find_sites(mirrored, backbone(mirrored))} == {(60.0,)}
-    glycine = build_peptide("ACE-GLY-NME")
-    (site,) = find_sites(glycine, backbone(glycine))
-    assert site.offsets_deg == (-60.0, 60.0)
-    # The torsion H-N-CA-HA itself is what the relation means: phi - 60° for L.
-    sites = find_sites(peptide, backbone(peptide))
-    graph = bonded_graph(peptide)
-    for site in sites:
-        _, nitrogen, alpha, _ = backbone(peptide).phi[site.phi].tolist()
-        hydrogens = [next(j for j in graph[i] if peptide.elements[j] == "H") for i in (nitrogen, alpha)]
-        quads = [[hydrogens[0], nitrogen, alpha, hydrogens[1]], backbone(peptide).phi[site.phi].tolist()]
-        theta, phi = torsion(peptide.positions_nm[None], quads)[0]
-        assert np.cos(theta - (phi - np.pi / 3)) > np.cos(np.radians(12.0)), site.label
-    assert coupling_hz(np.array([np.radians(-120.0)]))[0] == pytest.approx(KARPLUS.a - KARPLUS.b + KARPLUS.c)
-    assert coupling_hz(np.array([np.radians(60.0)]))[0] == pytest.approx(KARPLUS.a + KARPLUS.b + KARPLUS.c)
 
 
 def test_a_frame_that_is_not_finite_measures_nothing(simulate: Callable[..., Ensemble]) -> None:

@@ -129,7 +129,7 @@ def test_rows_pass_a_replicate_and_reject_a_wrong_time_axis(trio: tuple[Ensemble
     assert wrong.row("msm_jsd").verdict == "agrees"
     assert wrong.row("transition_jsd").verdict == "differs"
     assert wrong.row("msm_timescale:1").verdict == "differs"
-    titles = [getattr(chart, "title", "") for chart in fair.curves.charts]
+    titles = [getattr(chart, "title", "") for chart in fair.charts]
     for title in ("TICA landscape", "Free energies of the metastable states", "Implied timescales"):
         assert title in titles
 
@@ -164,7 +164,7 @@ def test_a_process_into_a_state_that_is_never_held_is_not_timed(trio: tuple[Ense
     assert wrong.row("msm_jsd").verdict == "differs"
 
     def drawn(judgement, role: str) -> int:  # type: ignore[no-untyped-def]
-        chart = next(c for c in judgement.curves.charts if getattr(c, "title", "") == "Implied timescales")
+        chart = next(c for c in judgement.charts if getattr(c, "title", "") == "Implied timescales")
         assert ("never stays in state" in chart.caption) == (judgement is not fair)
         return sum(line.role == role for line in chart.lines)
 

@@ -13,9 +13,9 @@ from compare_speed import noisy_path
 
 from surrogate.judge.comparison import compare
 from surrogate.judge.measure import kinetics, msm
-from surrogate.judge.measure.equal_atoms import evenly
+from surrogate.judge.measure.probes import evenly
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows.motion.relaxation_rows import speed_words
+from surrogate.judge.rows.relaxation_rows import speed_words
 from surrogate.judge.rows.rows import Options
 
 

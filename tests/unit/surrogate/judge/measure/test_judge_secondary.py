@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from surrogate.judge.comparison import compare
-from surrogate.judge.measure.secondary import COIL, HELIX, STRAND, find_chains, secondary_structure
+from surrogate.judge.measure.probes import COIL, HELIX, STRAND, find_chains, secondary_structure
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
@@ -74,7 +74,7 @@ def test_a_candidate_that_unfolds_is_named_residue_by_residue(peptide: Scene) ->
     assert fair.row("secondary:helix").verdict == "agrees"
     assert wrong.row("secondary:helix").verdict == "differs"
     assert "of residues are in helix instead of" in wrong.row("secondary:helix").statement
-    charts = {c.title: c for c in wrong.curves.charts if c.section == "structure"}
+    charts = {c.title: c for c in wrong.charts if c.section == "structure"}
     assert "Residues in strand" not in charts and dict(wrong.skipped)["Residues in strand"]
     parts = [charts[f"Residues in {name}"].to_dict() for name in ("helix", "coil")]
     total = np.sum([part["candidate"] for part in parts], axis=0)

@@ -12,7 +12,7 @@ import pytest
 
 from surrogate.judge.comparison import Comparison, Judgement, compare
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.read.rounding import angle_variance, length_error_nm, rounded
+from surrogate.judge.read.stored_frames import angle_variance, length_error_nm, rounded
 from surrogate.judge.rows.rows import Options
 from systems.trajectory.companion_writer import pdb_text
 

@@ -18,11 +18,9 @@ from surrogate.judge.comparison import Comparison, compare
 from surrogate.judge.measure.statistics import Estimate
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.report import report, wording
-from surrogate.judge.report.cards import side_by_side
-from surrogate.judge.report.figures import Figure
-from surrogate.judge.report.markdown import to_markdown
-from surrogate.judge.report.pictures import Album, albums
-from surrogate.judge.report.report import Foreword, write_report
+from surrogate.judge.report.figures import Album, Figure, albums
+from surrogate.judge.report.report import Foreword, to_markdown, write_report
+from surrogate.judge.report.wording import side_by_side
 from surrogate.judge.rows.charts import BarChart, Landscape, Line, LineChart
 from systems.errors import InputError, StorageError
 
@@ -92,7 +90,7 @@ def one_of_each_type() -> tuple[LineChart, Landscape, BarChart]:
                   log_y=True),
         Landscape("kinetics", "TIC 0 and 1", "TIC 0", "TIC 1", np.linspace(-2, 2, 9), np.linspace(-1, 1, 7),
                   counts, counts.T.reshape(8, 6), counts),
-        BarChart("experiment", "Couplings", "J(HN,HA)", "Hz", ("ALA 2", "ALA 3"), x[:2], x[1:3], x[:2],
+        BarChart("structure", "Residues in helix", "DSSP", "frames / %", ("ALA 2", "ALA 3"), x[:2], x[1:3], x[:2],
                  x[:2] - 0.1, x[:2] + 0.1, x[1:3] - 0.2, x[1:3] + 0.2),
     )  # fmt: skip
 
@@ -101,7 +99,7 @@ def one_of_each_type() -> tuple[LineChart, Landscape, BarChart]:
 def few_pictures(comparison: Comparison) -> Comparison:
     """The candidate with troubles, with one chart of each type: drawing all takes seconds."""
     bad = comparison.judgements[1]
-    shorter = replace(bad, curves=replace(bad.curves, charts=one_of_each_type()))
+    shorter = replace(bad, charts=one_of_each_type())
     return replace(comparison, judgements=(shorter,), movies=comparison.movies[1:2])
 
 
@@ -145,7 +143,7 @@ def test_costs_skips_definitions_and_command_are_there(written: tuple[str, dict[
                  "Jensen-Shannon distance", "How to make this report again",
                  "surromd compare r0.h5,r1.h5 &#39;a b.h5&#39;",
                  "--top ala2.pdb --dt 1ps -o report.html",
-                 "100 chunks", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
+                 "<td>100</td>", "prefers-color-scheme: dark", "max-width: 44rem"):  # fmt: skip
         assert text in html, text
 
 
@@ -158,8 +156,12 @@ def test_json_is_strict_and_holds_every_row_and_curve(
     for out, judgement in zip(judged, comparison.judgements, strict=True):
         assert [r["key"] for r in out["rows"]] == [r.key for r in judgement.rows]
         assert out["verdict"] == judgement.verdict
-        assert np.array(out["curves"]["ramachandran"][0]["reference"]).shape == (50, 50)
-        assert {"correlations", "histograms", "timelines", "bonds"} <= set(out["curves"])
+        charts = {c.get("title") or c["label"]: c for c in out["charts"]}
+        assert np.array(charts["φ and ψ of ALA 2"]["reference"]).shape == (50, 50)
+        assert {"φ ALA 2", "TIC 0", "Autocorrelation of cos ψ ALA 2", "Mean bond lengths, less the reference's"} <= set(
+            charts
+        )
+        assert ("Faults along time" in charts) == (judgement.faults[1].n_invalid > 0)
     assert judged[1]["speed_ratio"] == pytest.approx(20.0)
     assert data["replicate"] is not None
 
@@ -199,18 +201,16 @@ def test_markdown_goes_beside_the_page(folder: Path) -> None:
 def test_every_type_of_chart_is_drawn_and_written(comparison: Comparison) -> None:
     charts = one_of_each_type()
     first = comparison.judgements[0]
-    first = replace(first, curves=replace(first.curves, charts=()))
-    with_charts = replace(first, curves=replace(first.curves, charts=charts))
-    plain = {a.title: a for a in albums(first, 300.0)}
-    drawn = {a.title: a for a in albums(with_charts, 300.0)}
+    plain = {a.title: a for a in albums(first.charts, 300.0)}
+    drawn = {a.title: a for a in albums((*charts, *first.charts), 300.0)}
     assert len(drawn["Forecast error"].figures) == len(plain.get("Forecast error", Album("", [], "")).figures) + 1
     assert len(drawn["How fast things move"].figures) == len(plain["How fast things move"].figures)
     assert [f.caption.split()[0] for f in drawn["TIC 0 and 1"].figures] == ["Reference", "Candidate", "Replicate",
                                                                             "Candidate"]  # fmt: skip
-    figure = drawn["Forecast error"].figures[-1]
+    figure = drawn["Forecast error"].figures[0]
     assert figure.caption == "Forecast <error>: against time" and 'aria-label="Forecast &lt;error&gt;"' in figure.svg
     assert "frozen" in figure.svg and "#0101" not in figure.svg
-    records = with_charts.curves.to_dict()["charts"]
+    records = [c.to_dict() for c in charts]
     assert [r["type"] for r in records] == ["LineChart", "Landscape", "BarChart"]
     assert records[0]["lines"][0]["y"] == pytest.approx((charts[0].lines[0].x ** 2).tolist(), rel=1e-5)
 
@@ -282,8 +282,8 @@ def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
     """Names of hydrogen bonds once took the whole width: axes without room, names cut off at the left."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    from surrogate.judge.report import chart_figures
-    from surrogate.judge.report.chart_figures import short_name
+    from surrogate.judge.report import figures
+    from surrogate.judge.report.figures import short_name
 
     name = "NZ-HZ1 (LYS 19) ... OE1 (GLU 17) and 5 equal"
     assert short_name("CA (LYS 10)") == "CA (LYS 10)"
@@ -304,9 +304,9 @@ def test_long_names_beside_bars_leave_room_for_the_bars() -> None:
 
     chart = BarChart("structure", "x", "", "frames / %", (name, name), *(np.array([1.0, 2.0]) for _ in range(3)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chart_figures, "draw", draw)
-        chart_figures.draw_chart(chart, 300.0)
-        patch.setattr(chart_figures, "short_name", lambda name: name)
-        chart_figures.draw_chart(chart, 300.0)
+        patch.setattr(figures, "draw", draw)
+        figures.draw_chart(chart, 300.0)
+        patch.setattr(figures, "short_name", lambda name: name)
+        figures.draw_chart(chart, 300.0)
     assert seen[0] >= 0 and seen[1] > 0.4
     assert seen[2] < 0 or seen[3] < 0.4, "negative control: whole names do not fit"

@@ -27,7 +27,7 @@ def test_a_comparison_draws_reference_replicate_and_candidates(trio: tuple[Ensem
 def test_weights_shape_the_maps_of_the_answer() -> None:
     deep, flat = np.full((36, 36), 30.0), np.zeros((36, 36))
     deep[5, 7] = 0.0
-    one, other = weighted_maps({"ALA 2": deep, "GLY 3": flat}, 300.0)
+    one, other = weighted_maps({"ALA 2": deep, "GLY 3": flat})
     assert "ALA 2" in one.caption and one.svg.startswith("<svg") and one.svg != other.svg
 
 

@@ -12,7 +12,7 @@ from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.charts import Histogram
 from surrogate.judge.rows.rows import Options
-from surrogate.judge.rows.shape.energy_rows import measure_energies
+from surrogate.judge.rows.validity_rows import measure_energies
 from systems.scene import Scene
 
 QUICK = Options(n_bootstrap=100, n_permutations=100, peptide_recipe=False)
@@ -74,7 +74,7 @@ def test_an_equal_ensemble_agrees_and_a_strained_one_does_not(
     exploded = judged(trio, frames, alanine_dipeptide)
     limit = 2 * fair.row("energy_mean").reference.value  # type: ignore[union-attr]
     assert exploded.row("energy_mean").candidate.value < limit, "one frame does not drown the others"
-    (chart,) = (c for c in exploded.curves.charts if isinstance(c, Histogram) and c.label == "Potential energy")
+    (chart,) = (c for c in exploded.charts if isinstance(c, Histogram) and c.label == "Potential energy")
     assert chart.outside[1] == pytest.approx(1 / 501, rel=0.01) and chart.outside[0] == 0.0
 
 

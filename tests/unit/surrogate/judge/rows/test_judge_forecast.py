@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from surrogate.judge.comparison import compare
 from surrogate.judge.read.ensemble import Ensemble
 from surrogate.judge.rows.charts import LineChart
-from surrogate.judge.rows.motion.forecast import find_pairs, forecast_charts, forecasts
+from surrogate.judge.rows.forecast import find_pairs, forecast_charts, forecasts
 from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
 
@@ -58,8 +59,8 @@ def test_what_starts_elsewhere_is_no_forecast(alanine_dipeptide: Scene) -> None:
     broken = [np.full_like(s, np.nan) for s in truth.segments]
     for other in (mirrored, replace(truth, segments=moved), replace(truth, segments=broken), truth):
         assert find_pairs(truth, other) is None
-        charts, skipped = forecast_charts(find_pairs(truth, other), None, truth.lag_ps)
-        assert charts == [] and skipped[0][0].startswith("Forecast error")
+        found = forecast_charts(SimpleNamespace(trajectories=(truth, other, None)))  # type: ignore[arg-type]
+        assert not found.charts and found.skipped[0][0].startswith("Forecast error")
 
 
 def test_frames_that_are_not_finite_are_infinitely_far(alanine_dipeptide: Scene) -> None:
@@ -80,12 +81,12 @@ def test_a_comparison_shows_the_replicate_and_the_baselines(simulate: Callable[.
 
     options = Options(n_bootstrap=50, n_permutations=50, peptide_recipe=False)
     paired = compare(reference, [started(candidate), candidate], started(replicate), options=options).judgements
-    charts = {c.title: c for c in paired[0].curves.charts if isinstance(c, LineChart) and c.section == "forecast"}
+    charts = {c.title: c for c in paired[0].charts if isinstance(c, LineChart) and c.section == "forecast"}
     assert set(charts) == {"Forecast error at a time (FDE)", "Forecast error up to a time (ADE)"}
     (final,) = (c for t, c in charts.items() if "FDE" in t)
     assert [line.name for line in final.lines] == ["candidate", "frozen frame", "constant velocity", "replicate"]
     assert "4 pairs over 28 ps after 2 shared frames" in final.caption
     ours, _, straight, theirs = (np.nanmean(line.y) for line in final.lines)
     assert ours == pytest.approx(theirs, rel=0.5) and straight > ours
-    assert not any(c.section == "forecast" for c in paired[1].curves.charts)
+    assert not any(c.section == "forecast" for c in paired[1].charts)
     assert any(what.startswith("Forecast error") for what, _ in paired[1].skipped)

@@ -16,7 +16,7 @@ from surrogate.judge.comparison import Judgement, compare
 from surrogate.judge.measure import structure
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows.motion import peptide_protocol
+from surrogate.judge.rows import peptide_protocol
 from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
 
@@ -92,7 +92,7 @@ def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
         return fit_recipe(reference, n_clusters=12, n_states=3)
 
     def distances(judgement: Judgement) -> list[float]:
-        (bars,) = (c for c in judgement.curves.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
+        (bars,) = (c for c in judgement.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
         return list(bars.to_dict()["candidate"])
 
     monkeypatch.setattr(peptide_protocol, "fit_recipe", counted)

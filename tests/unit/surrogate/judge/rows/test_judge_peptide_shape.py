@@ -22,7 +22,7 @@ def judged(simulate: Callable[..., Ensemble]) -> Judgement:
 
 
 def test_torsions_and_rmsd_are_drawn_along_time(judged: Judgement) -> None:
-    charts = {c.title: c for c in judged.curves.charts if isinstance(c, LineChart)}
+    charts = {c.title: c for c in judged.charts if isinstance(c, LineChart)}
     for title in ("RMSD along time", "φ of ALA 2 along time", "ψ of ALA 2 along time"):
         lines = charts[title].lines
         assert [line.name for line in lines] == ["reference", "candidate", "replicate"]

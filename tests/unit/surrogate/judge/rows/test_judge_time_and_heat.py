@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogate.judge.comparison import Judgement, compare
+from surrogate.judge.comparison import Judgement, account_of, compare
 from surrogate.judge.measure import kinetics
 from surrogate.judge.measure.slow_motion import longest_correlation, rarely_crossed
 from surrogate.judge.measure.statistics import block_length, bootstrap_weights, estimate, make_blocks, permutation_p
 from surrogate.judge.measure.structure import Features
 from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.rows.account import account_of
-from surrogate.judge.rows.motion import relaxation_rows
+from surrogate.judge.rows import relaxation_rows
 from surrogate.judge.rows.rows import Options
 from systems.scene import Scene
 
@@ -83,7 +82,7 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     from surrogate.judge import comparison, verdict
     from surrogate.judge.convergence import convergence_of
     from surrogate.judge.measure import structure
-    from surrogate.judge.rows.motion.within_rows import within_rows
+    from surrogate.judge.rows.within_rows import within_rows
 
     yardstick = structure.Yardstick.of(reference, probing=False)
     account = account_of(reference)
@@ -91,7 +90,7 @@ def _within(reference: Ensemble, measured: list[Features], candidate: Features) 
     common = reference.scene, yardstick.torsions, yardstick.geometry, measured[0], measured[2], OPTIONS, 300.0, account
     setting = comparison._Setting(*common, {}, (measured[0], measured[2]), found)
     trio = comparison._equal_terms(setting, candidate)[0]
-    return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio)[0], OPTIONS)}
+    return {r.key: r.verdict for r in verdict.judge_rows(within_rows(trio).rows, OPTIONS)}
 
 
 def test_a_reference_that_starts_in_one_state_breaks_no_short_candidate(simulate: Callable[..., Ensemble]) -> None:
@@ -132,7 +131,7 @@ def test_a_state_that_one_run_alone_has_met_is_no_wrong_time(
     """Steps are larger there, in the reference, the candidate or the replicate; every second frame is still seen."""
     from surrogate.judge import verdict
     from surrogate.judge.measure.structure import backbone
-    from surrogate.judge.rows.motion import within_rows
+    from surrogate.judge.rows import within_rows
     from surrogate.judge.rows.rows import Trio, make_sample
 
     def word(candidate: Features) -> str:
@@ -141,7 +140,7 @@ def test_a_state_that_one_run_alone_has_met_is_no_wrong_time(
         samples = [make_sample(f, blocks, OPTIONS, k, 10_000) for k, f in enumerate(three)]
         torsions = backbone(alanine_dipeptide)
         trio = Trio(alanine_dipeptide, torsions, None, *samples, OPTIONS)  # type: ignore[arg-type]
-        judged = verdict.judge_rows(within_rows.within_rows(trio)[0], OPTIONS)
+        judged = verdict.judge_rows(within_rows.step_rows(trio).rows, OPTIONS)
         return next(r.verdict for r in judged if r.key == "torsion_step")
 
     assert word(hopping(2, far=visitor == 1)) == "agrees"
@@ -156,15 +155,19 @@ def test_within_states_few_samples_blame_nobody_where_the_replicate_differs_too(
     """Below twenty samples a fast row stands, unless reference and replicate differ by it themselves."""
     from surrogate.judge import verdict
     from surrogate.judge.measure.statistics import Estimate
-    from surrogate.judge.rows.rows import Row
+    from surrogate.judge.rows.rows import Row, TimeScale
 
-    def row(key: str, p_replicate: float) -> Row:
+    def row(time_scale: TimeScale, p_replicate: float) -> Row:
         one = Estimate(1.0, 0.9, 1.1, 0.05)
-        return Row(key, "kinetics", key, "", "observable", one, one, one, None, 1e-6, p_replicate, 0.2, "", "")
+        return Row("x", "kinetics", "x", "", "observable", one, one, one, None, 1e-6, p_replicate, 0.2, "", "",
+                   time_scale=time_scale)  # fmt: skip
 
-    kept = verdict.untested([row("torsion_step", 0.5), row("torsion_step", 1e-5), row("bond_width:x", 1e-5),
-                             row("correlation_time:x", 0.5)])  # fmt: skip
-    assert [np.isfinite(r.p_value) for r in kept] == [True, False, True, False]
+    rows = [row("step", 0.5), row("step", 1e-5), row("within states", 0.5), row("within states", 1e-5),
+            row("fast", 1e-5), row("slow", 0.5)]  # fmt: skip
+    kept = [np.isfinite(r.p_value) for r in verdict.untested(rows)]
+    assert kept == [True, False, True, False, True, False]
+    kept = [np.isfinite(r.p_value) for r in verdict.untested(rows, start=True)]
+    assert kept == [True, False, False, False, True, False], "what moves within a state depends on the start"
 
 
 def test_blocks_of_one_kind_are_exchanged_with_their_like() -> None:

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
-from surrogate.data.features.peptide_chains import chain_features
 from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.models.peptides.balance import balance_entries, lacking_entries, told_phis
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.trainer import with_scale
+from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.trainer import balance_entries, lacking_entries, told_phis, with_scale
 from systems.prepare.peptide import build_peptide
 
 SHARE = 0.02

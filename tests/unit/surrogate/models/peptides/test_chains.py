@@ -9,13 +9,6 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from surrogate.data.features.peptide_chains import (
-    chain_layout,
-    chain_scale,
-    settled,
-    stated_torsions,
-    unknown_coordinates,
-)
 from surrogate.models.peptides.chains import (
     FREE_ENDS,
     RIGID,
@@ -25,6 +18,13 @@ from surrogate.models.peptides.chains import (
     ChainLayout,
     ChainScale,
     internal_coordinates,
+)
+from surrogate.models.peptides.layout import (
+    chain_layout,
+    chain_scale,
+    settled,
+    stated_torsions,
+    unknown_coordinates,
 )
 from surrogate.models.peptides.torsion_states import MOST_TORSIONS
 from systems.chemistry.validity import INVALID, check_frames, geometry_from_frames

@@ -9,23 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from peptide_distil import distil
 
+import surrogate as sm
 from small_scenes import with_phi_turned
 from surrogate.bench.cost_error.effective_samples import training_cost
-from surrogate.data.descriptions import describe
-from surrogate.data.features.peptide_chains import chain_features
-from surrogate.data.frames import TrainingFrames, canonicalise, quantise
-from surrogate.data.splits import Split
-from surrogate.data.weights import Weights, load_weights
-from surrogate.models.peptides import peptide_subjects
+from surrogate.data.frames import Split, TrainingFrames, canonicalise, quantise
+from surrogate.models.architecture import TrainingRequest
+from surrogate.models.peptides import subjects as peptide_subjects
 from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.choices import PeptideTrainer
-from surrogate.models.peptides.distil import distil
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.trainer import PeptideTraining, normalise, train_peptides, with_scale
+from surrogate.models.peptides.layout import PeptideConfig, chain_features
+from surrogate.models.peptides.model import PeptideSlide
+from surrogate.models.peptides.subjects import PeptideSubject
+from surrogate.models.peptides.trainer import PeptideTrainer, PeptideTraining, normalise, train_peptides, with_scale
+from surrogate.models.weights import Weights, load_weights
 from surrogate.sampling.runner import RolloutConfig, rollout
-from surrogate.training.trainer import TrainingRequest
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
 from systems.trajectory.codec import open_trajectory
@@ -307,7 +305,7 @@ def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, fra
     with pytest.raises(InputError, match=r"leave \[model\] of `config` out"):
         trainer.check(replace(request, model={"width": 64}))
     with pytest.raises(InputError, match="holds lam-slide-peptides, not lam-slide"):
-        trainer.check(replace(request, arch="lam-slide"))
+        sm.explain_training([tmp_path / "ref.h5"], arch="lam-slide", start_from=out, steps=2)
 
 
 def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
@@ -338,7 +336,7 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
 
     def rolled(weights: Weights, steps: int) -> torch.Tensor:
         model = weights.model
-        chunk = model.next_chunk(last, describe(model, frames.scene), noise, solver_steps=steps, solver="angular")
+        chunk = model.next_chunk(last, model.featurise(frames.scene), noise, solver_steps=steps, solver="angular")
         return chunk.frames_nm
 
     there = rolled(teacher, 6)

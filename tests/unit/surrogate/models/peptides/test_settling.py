@@ -5,11 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
-from surrogate.models.peptides import settling
-from surrogate.models.peptides.chains import ChainFeatures, dihedral
-from surrogate.models.peptides.model import PeptideConfig
-from surrogate.models.peptides.settling import mirrored, settle
+from surrogate.models.peptides import chains as settling
+from surrogate.models.peptides.chains import ChainFeatures, dihedral, mirrored, settle
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, PSI, RING, THREEFOLD, StatedTorsions
 from systems.prepare.peptide import build_peptide
 from systems.scene import Scene

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from surrogate.models.peptides import state_windows
-from surrogate.models.peptides.model import PeptideConfig
-from surrogate.models.peptides.peptide_subjects import PeptideSubject
-from surrogate.models.peptides.state_windows import StateWindows
+from surrogate.models.peptides import subjects as state_windows
+from surrogate.models.peptides.layout import PeptideConfig
+from surrogate.models.peptides.subjects import PeptideSubject, StateWindows
 
 _LENGTH = 400_000
 

@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
-from surrogate.data.descriptions import describe
-from surrogate.data.features.peptide_chains import chain_features, chain_layout, chain_scale
-from surrogate.models.peptides.chains import ChainFeatures
-from surrogate.models.peptides.model import PeptideConfig, PeptideSlide
-from surrogate.models.peptides.settling import settle
+from surrogate.models.peptides.chains import ChainFeatures, settle
+from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
+from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.torsion_states import (
     MOST_TORSIONS,
     PHI,
@@ -230,16 +228,16 @@ def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_othe
     """With numbers that scatter widely about the middles of states, many frames disobey; with the odds of changes at
     nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the end of
     their states, and a row alone is drawn as it is in a batch."""
+    from surrogate.models.peptides import chains as settling
     from surrogate.models.peptides import model as module
-    from surrogate.models.peptides import settling
 
     scene = build_peptide("ACE-ALA-NME")
     torch.manual_seed(0)
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
     model.lag_ps = 1.0
     torch.nn.init.constant_(model.jumps.logits.bias, -30.0)
-    molecule = describe(model, scene)
-    chain = molecule.chain
+    molecule = model.featurise(scene)
+    chain = molecule.own
     assert chain is not None
     last = torch.tensor(scene.positions_nm).float().expand(60, 1, -1, -1)
     noise = torch.randn(60, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
@@ -270,8 +268,8 @@ def test_states_in_which_atoms_always_overlap_are_drawn_again(monkeypatch: pytes
     torch.manual_seed(0)
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
     model.lag_ps = 1000.0
-    molecule = describe(model, scene)
-    chain = molecule.chain
+    molecule = model.featurise(scene)
+    chain = molecule.own
     assert chain is not None
     model.token_mean.copy_(_middles(model, chain))
     model.token_scale.fill_(0.01)
@@ -307,8 +305,8 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     model = PeptideSlide(_config(scene)).eval().requires_grad_(False)
     model.lag_ps = 1.0
     model.token_scale.fill_(1e-3)
-    molecule = describe(model, scene)
-    chain = molecule.chain
+    molecule = model.featurise(scene)
+    chain = molecule.own
     assert chain is not None
     model.token_mean.copy_(_middles(model, chain))
     seen: list[int] = []

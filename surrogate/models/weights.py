@@ -1,0 +1,257 @@
+"""Weights files: one safetensors file that carries its configuration, training domain and provenance."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surrogate.data.frames import TrainingFrames
+from surrogate.models.architecture import architecture
+from surrogate.models.propagator import Propagator
+from surrogate.training.loop import tensor_checksum
+from systems.chemistry.validity import geometry_from_frames, limits_from_frames
+from systems.errors import InputError, SurromdError, UnknownNameError, WeightsError, first_line
+from systems.files.outside import UNREADABLE
+from systems.files.schema import built, parsed
+from systems.files.whole_file import create_whole
+from systems.scene import Scene
+
+FORMAT = "surromd-weights-1"
+# Settings that are no sizes (an interval in ps) may be as large as this, however small the model.
+_LEAST_SIZE = 1_000_000
+
+
+@dataclass(frozen=True)
+class TrainingDomain:
+    """The training domain of weights. `scene` is the template: atom k of the model is its atom k, and canonical
+    frames are superposed on its positions. `conditions` are those of the reference (force field, temperature_k, ...);
+    `geometry` is what its frames say of valid ones (systems.chemistry.validity.Geometry as a dictionary), `limits` how
+    far they go beyond that (systems.chemistry.validity.Limits; None in files of older versions).
+
+    `lag_ps`: between frames, the shortest where the model takes a lag; `jumps` are then rows (lag, least and greatest
+    jump) that stand for those of `limits` at each lag. `further`: the domains of other molecules trained on.
+    `transferable`: other peptides of such residues are covered too (`sampling.domain`).
+    """
+
+    scene: Scene
+    lag_ps: float
+    conditions: dict[str, Any]
+    geometry: dict[str, Any]
+    limits: dict[str, Any] | None = None
+    jumps: tuple[tuple[float, float, float], ...] = ()
+    further: tuple[TrainingDomain, ...] = ()
+    transferable: bool = False
+
+    @property
+    def members(self) -> tuple[TrainingDomain, ...]:
+        """The domains of all molecules trained on."""
+        return (self, *self.further)
+
+    @property
+    def longest_lag_ps(self) -> float:
+        return self.jumps[-1][0] if self.jumps else self.lag_ps
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a weights file keeps (`systems.files.schema.built` takes it back); what a single molecule and lag
+        leave empty is left out."""
+        out: dict[str, Any] = {**vars(self), "scene": self.scene.to_dict()}
+        out["further"] = [domain.to_dict() for domain in self.further]
+        return {key: value for key, value in out.items() if value or key not in ("jumps", "further", "transferable")}
+
+    def describe(self) -> str:
+        """One line for people: 'alanine-dipeptide (C6H12N2O2, 22 atoms), ff14SB/obc2, 300 K, frames 1 ps apart'."""
+        c = self.conditions
+        lags = f"{self.lag_ps:g}" + (f" to {self.longest_lag_ps:g}" if self.jumps else "")
+        what = f"{self.scene.name} ({self.scene.formula}, {self.scene.n_atoms} atoms)"
+        if self.further:
+            names = [domain.scene.name for domain in self.members]
+            listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+            most = max(domain.scene.n_atoms for domain in self.members)
+            what = f"{len(names)} molecules of up to {most} atoms ({listed})"
+        what += " and molecules like them" if self.transferable else ""
+        return f"{what}, {c.get('force_field')}/{c.get('solvent')}, {c.get('temperature_k')} K, frames {lags} ps apart"
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A model ready to roll, with everything its file says of it. `hash` is that of the file's bytes."""
+
+    model: Propagator
+    domain: TrainingDomain
+    provenance: dict[str, Any]
+    hash: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class Header:
+    """A weights file's record: everything but its numbers."""
+
+    arch: str
+    config: dict[str, Any]
+    domain: TrainingDomain
+    provenance: dict[str, Any]
+
+
+def _check_sizes(config: Any, n_tensors: int, n_values: int) -> None:
+    """Raise ValueError for more layers than a file has tensors, or a size beyond that of all of them, before any is
+    made."""
+    entries = config.items() if isinstance(config, dict) else enumerate(config)
+    for key, value in entries:
+        if isinstance(value, dict | list):
+            _check_sizes(value, n_tensors, n_values)
+        elif isinstance(value, int | float) and not abs(value) <= (
+            n_tensors if str(key).endswith(("layers", "rounds")) else n_values
+        ):
+            raise ValueError(f"{key} = {value!r} in a file of {n_tensors} tensors with {n_values} numbers")
+
+
+def save_weights(
+    path: str | Path, model: Propagator, domain: TrainingDomain, provenance: dict[str, Any], *,
+    half: bool = False,
+) -> None:  # fmt: skip
+    """Write weights whole or not at all; `half` rounds them to float16, half the size, for shipping."""
+    from safetensors.torch import save_file
+
+    header = {
+        "arch": model.arch,
+        "config": model.config.to_dict(),
+        "domain": domain.to_dict(),
+        "provenance": provenance,
+    }
+    dtype = torch.float16 if half else torch.float32
+    tensors = {k: v.detach().to("cpu", dtype).contiguous() for k, v in model.state_dict().items()}
+    text = json.dumps(header)
+    metadata = {"format": FORMAT, "surromd": text, "sha256": tensor_checksum(text, tensors)}
+    create_whole(Path(path), lambda temporary: save_file(tensors, temporary, metadata=metadata))
+
+
+def read_header(path: str | Path) -> Header:
+    """Return a weights file's record without loading it. Raises InputError (no such file) or WeightsError."""
+    path = Path(path)
+    return _header(path, _metadata(path))
+
+
+def _header(path: Path, metadata: dict[str, str]) -> Header:
+    try:
+        return built(Header, parsed(metadata.get("surromd", "")))
+    except ValueError as error:
+        raise WeightsError(f"{path} is damaged or of a later version: its record is none ({error}).") from error
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise InputError(f"weights file {path} does not exist.")
+    try:
+        with safe_open(path, framework="pt") as handle:
+            metadata = handle.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise WeightsError(f"{path} is not a surromd weights file (format {metadata.get('format')!r}).")
+            unknown = set(metadata) - {"format", "surromd", "sha256"}
+            if unknown:
+                raise WeightsError(f"{path} is damaged or of a later version: it holds {min(unknown)!r}.")
+            return dict(metadata)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+
+
+def load_weights(path: str | Path) -> Weights:
+    """Load a weights file in evaluation mode. Raises InputError, WeightsError (damaged, non-finite, other shapes)."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    path = Path(path)
+    metadata = _metadata(path)
+    header = _header(path, metadata)
+    data = path.read_bytes()
+    try:
+        state = load(data)
+    except (SafetensorError, ValueError) as error:
+        raise WeightsError(f"{path} is damaged or not a weights file: {error}") from error
+    # Files of earlier versions state no checksum.
+    if "sha256" in metadata and metadata["sha256"] != tensor_checksum(metadata["surromd"], state):
+        raise WeightsError(f"{path} is damaged: it is not what was written (checksum); restore it from a whole copy.")
+    try:
+        arch = architecture(header.arch)
+    except UnknownNameError as error:
+        raise WeightsError(f"{path} is of another version of surromd: {error}") from error
+    try:
+        _check_sizes(header.config, len(state), max(sum(tensor.numel() for tensor in state.values()), _LEAST_SIZE))
+        model = arch.model(arch.config(header.config))
+    except (*UNREADABLE, ArithmeticError, AssertionError, SurromdError) as error:
+        raise WeightsError(f"{path} is damaged: its record is none of a model ({first_line(error)}).") from error
+    try:
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        raise WeightsError(f"{path} does not fit its own configuration: {first_line(error)}") from error
+    broken = [name for name, tensor in state.items() if not torch.isfinite(tensor).all()]
+    if broken:
+        raise WeightsError(
+            f"{path} holds values that are not finite (first in {broken[0]}); train again or re-download."
+        )
+    return Weights(
+        model=model.eval().requires_grad_(False),
+        domain=header.domain,
+        provenance=header.provenance,
+        hash=hashlib.sha256(data).hexdigest()[:16],
+        path=path,
+    )
+
+
+# Training domain and provenance of weights: what they cover, when, where and from what they were made.
+
+
+def training_domain(
+    frames: TrainingFrames, *, stride: int = 1, strides: Sequence[int] = (), n_geometry_frames: int = 20_000
+) -> TrainingDomain:
+    """Return the domain of weights trained on every `stride`-th of `frames`; its checks are measured on evenly spaced
+    training frames. `strides`: those of a model that takes the lag, from 1 on, for each of which jumps are measured."""
+    picked = frames.spread_starts(n_geometry_frames, stride + 1)
+    positions = frames.positions_nm(picked)
+    geometry = geometry_from_frames(frames.scene, positions)
+    limits = limits_from_frames(frames.scene, positions, frames.positions_nm(picked + stride))
+    jumps = []
+    for wide in strides:
+        picked = frames.spread_starts(n_geometry_frames, wide + 1)
+        found = limits_from_frames(frames.scene, frames.positions_nm(picked), frames.positions_nm(picked + wide))
+        jumps.append((frames.lag_ps * wide, found.jump_min_nm, found.jump_max_nm))
+    return TrainingDomain(frames.scene, frames.lag_ps * stride, frames.conditions, geometry.to_dict(), limits.to_dict(),
+                          tuple(jumps))  # fmt: skip
+
+
+def provenance_of(origin: dict[str, Any], settings: dict[str, Any], start: Weights | None = None) -> dict[str, Any]:
+    """Return when, where and from what weights were made. `origin`: of the frames trained on (`TrainingFrames.origin`);
+    `settings`: of the training; `start`: the weights that it began with, of whose trajectories those are told that are
+    not among `origin`'s."""
+    earlier = {}
+    if start is not None:
+        known = {source["sha256"] for source in origin.get("sources", ()) if "sha256" in source}
+        earlier = {"from": {"hash": start.hash, **_beside(start.provenance, known)}}
+    return {
+        **earlier,
+        "trained": datetime.now(UTC).isoformat(timespec="seconds"),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        **origin,
+        **settings,
+    }
+
+
+def _beside(record: dict[str, Any], known: set[str]) -> dict[str, Any]:
+    """Return what earlier weights say of themselves, and those that they began with, of trajectories those that are not
+    `known`."""
+    left = [source for source in record.get("sources", ()) if source.get("sha256") not in known]
+    found = {**record, "sources": left} if "sources" in record else dict(record)
+    if isinstance(record.get("from"), dict):
+        found["from"] = _beside(record["from"], known | {source["sha256"] for source in left if "sha256" in source})
+    return found
