@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scripted_model import CONDITIONS, LAG_PS, N_NEW, weights_of
 from surrogate import api
-from surrogate.data.weights import TrainingDomain
+from surrogate.models.weights import TrainingDomain
 from surrogate.sampling.runner import RolloutConfig
 from surrogate.sampling.runner import rollout as roll
 from surrogate.verbs.run import one_scene, stages
