@@ -1,4 +1,4 @@
-"""Learned simulators, the judge that compares them with the truth, and the command line.
+"""Learned simulators, the comparison that compares them with the reference, and the command line.
 
 `import surrogate as sm; sm.rollout(scene, weights, out, time_ps=...)`: the verbs of `surrogate.api`, loaded on use
 (PEP 562), so that importing the package costs nothing. Beside them `sm.Simulation`, a surrogate that OpenMM's reporters

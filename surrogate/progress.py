@@ -10,7 +10,7 @@ _LONGEST = 44
 
 
 class ProgressFn(Protocol):
-    """Called by a running verb with what is done and what there is to do; `note` replaces the default account, as
+    """Called by a running verb with what is done and what there is to do; `note` replaces the default summary, as
     for a stage that comes before what is counted."""
 
     def __call__(self, done: int, total: int, note: str | None = None) -> None: ...

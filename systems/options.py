@@ -1,6 +1,7 @@
 """Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
 
-From that declaration follow the command line, the signature and the documentation of the Python call (`takes`), the
+From that declaration follow the command line, the signature and the documentation of the Python call
+(`options_as_keywords`), the
 keys of a `config` file, their checks, and the manual's tables. A name ends in its unit (`time_ps`), which the command
 line and files leave out: there a value carries it (`time = "10ns"`). Imports no library, so that the command's help is
 quick.
@@ -354,7 +355,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 R = TypeVar("R")
 
 
-def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
+def options_as_keywords(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Let a function whose last parameter is `options`, a dataclass `kind`, be called with these options as keywords.
 
     Its signature lists them one by one, as an editor or `help` shows it, and its documentation says what each does.
@@ -383,12 +384,12 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
                     if not isinstance(options, kind):
                         raise TypeError(f"options must be a {kind.__name__}, not {type(options).__name__}")
                     given = {name: getattr(options, name) for name in known} | given
-                settled: Any = gather(kind, given, file=config)
+                resolved: Any = gather(kind, given, file=config)
             except MissingOptionError as error:
                 raise TypeError(f"{function.__name__}() {error.needs}") from None
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            return function(*bound.args, **bound.kwargs, options=settled)
+            return function(*bound.args, **bound.kwargs, options=resolved)
 
         call.__signature__ = whole  # type: ignore[attr-defined]
         call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\n{_documented(known)}\n"

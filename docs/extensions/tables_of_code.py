@@ -1,4 +1,5 @@
-"""The directives `definitions`, `metrics`, `flags` and `formats`: what the code says of the judge's terms and metrics,
+"""The directives `definitions`, `metrics`, `flags` and `formats`: what the code says of the comparison's terms and
+metrics,
 of frames' flags and of other programs' files, as tables."""
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from sphinx.util.docutils import SphinxDirective
 
 
 class Definitions(SphinxDirective):
-    """`{definitions}`: the judge's terms, as its report defines them."""
+    """`{definitions}`: the comparison's terms, as its report defines them."""
 
     def run(self) -> list[nodes.Node]:
-        from surrogate.judge.report.definitions import DEFINITIONS
+        from surrogate.comparison.report.definitions import DEFINITIONS
 
         parts = []
         for one in DEFINITIONS:
@@ -27,7 +28,7 @@ class MetricsTable(SphinxDirective):
     """`{metrics}`: what is measured, its kind and its time scale."""
 
     def run(self) -> list[nodes.Node]:
-        from surrogate.judge.metrics import METRICS
+        from surrogate.comparison.metrics import METRICS
 
         lines = ["| metric | kind | time scale |", "|---|---|---|"]
         lines += [

@@ -33,7 +33,7 @@ def numbers(cell: str) -> list[float]:
 
 
 def draw_effective(table: dict[str, Any], out: Path) -> None:
-    """Draw distance to the truth against effective samples a second, of the surrogates' settings and of MD, and the
+    """Draw distance to the reference against effective samples a second, of the surrogates' settings and of MD, and the
     front: what nothing beats in both."""
     from surrogate.bench.cost_error.effective_samples import pareto_front
 

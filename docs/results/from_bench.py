@@ -43,7 +43,7 @@ def reference_speed(measured: dict[str, Any]) -> dict[str, Any]:
 
 
 def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
-    """Return the table of run time against error: the settings that were judged."""
+    """Return the table of run time against error: the settings that were evaluated."""
     config, md = measured["config"], measured["md"]
     names = list(dict.fromkeys(row["weights"] for row in measured["rows"]))
     rows = []
@@ -57,24 +57,33 @@ def cost_error(measured: dict[str, Any]) -> dict[str, Any]:
                 significant(row["cpu_s_per_ns"]["mean"]),
                 interval(row["jsd"]),
                 f"> {md['errors'][0]:.2f}" if same is None else f"{same:.2f}",
-                row["worth"]["words"],
+                row["equivalent_time"]["words"],
                 f"{row['times_faster']:.1f}",
                 " / ".join(f"{value:.2f}" for value in valid),
             ]
         )
-    heads = ["solver, steps", "s/ns", "distance", "MD, same seconds", "worth of MD", "times faster", "0.5 Å / 20 %"]
+    heads = [
+        "solver, steps",
+        "s/ns",
+        "distance",
+        "MD, same seconds",
+        "equivalent MD time",
+        "times faster",
+        "0.5 Å / 20 %",
+    ]
     return {
         "command": _asked(measured),
         "machine": measured["machine"]["name"],
         "note": f"{1e-3 * config['time_ps']:g} ns at each setting, against two held-out runs of "
-        f"{1e-3 * md['length_ps']:g} ns, which are {md['floor']:.3f} apart; {config['threads']} thread(s).",
+        f"{1e-3 * md['length_ps']:g} ns, which are {md['replicate_baseline']:.3f} apart; "
+        f"{config['threads']} thread(s).",
         "columns": heads,
         "rows": rows,
     }
 
 
 def effective_samples(measured: dict[str, Any]) -> dict[str, Any]:
-    """Return the table of effective samples a processor second, of MD and of the settings that were judged."""
+    """Return the table of effective samples a processor second, of MD and of the settings that were evaluated."""
     md, slow = measured["md"], measured["md"]["slowest"]
     ns = 1e-3 * min(measured["config"]["time_ps"], md["lengths_ps"][-1])
     near = math.exp(_between(math.log(1e3 * ns), [math.log(x) for x in md["lengths_ps"]], md["errors"]))

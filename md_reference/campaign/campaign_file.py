@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_type_hi
 
 from md_reference.campaign.manifest import file_sha256
 from md_reference.forces.spec import ForceFieldSpec, WaterBox
-from md_reference.run.config import MDConfig, settle_by_name, to_config
+from md_reference.run.config import MDConfig, resolve_by_name, to_config
 from systems.errors import InputError, SurromdError, nearest
 from systems.files.outside import content
 from systems.files.schema import built, fitted, parsed
@@ -320,7 +320,7 @@ def _runs_of(spec: SceneSpec, shared: Settings, own: Settings, head: _Head) -> l
     shared, protocol = _by_protocol(shared, own)
     # Nobody trains on the water of a hundred runs.
     given = {"keep": "solute", **shared.values, **own.values}
-    values, _ = settle_by_name("" if _kind(spec.source) else spec.source, given, protocol)
+    values, _ = resolve_by_name("" if _kind(spec.source) else spec.source, given, protocol)
     axes = {**shared.axes, **own.axes}
     # A single temperature of the scene's own outweighs the campaign's list.
     if "temperature_k" in own.values and "temperatures" not in own.axes:

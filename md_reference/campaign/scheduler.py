@@ -34,7 +34,7 @@ from md_reference.campaign.manifest import (
 )
 from md_reference.run.config import flat_settings
 from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import Claim
+from systems.files.whole_file import OutputLock
 from systems.interrupts import deferred_interrupt
 
 _TICK_S = 0.1
@@ -350,11 +350,11 @@ def _only_process(folder: Path) -> Iterator[None]:
     existed = folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        claim = Claim(folder / MANIFEST_NAME)
+        lock = OutputLock(folder / MANIFEST_NAME)
     except TrajectoryError:
         raise InputError(f"{folder}: another process runs this campaign; wait for it, or stop it first.") from None
     try:
-        with claim:
+        with lock:
             yield
     finally:
         if not existed and not (folder / MANIFEST_NAME).exists():

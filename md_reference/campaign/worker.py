@@ -30,7 +30,7 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import InputError
 from systems.files.outside import content
 from systems.files.schema import built, parsed
-from systems.files.whole_file import Claim, create_whole
+from systems.files.whole_file import OutputLock, create_whole
 from systems.library.named_scenes import prepare
 from systems.options import Preparation, options_of
 from systems.scene import Scene
@@ -168,7 +168,7 @@ def _simulate(token: str, folder: Path, run: Run, checkpoint_every_s: float, exp
     out = folder / run.file
     out.parent.mkdir(parents=True, exist_ok=True)
     # A worker that this one stands in for, cut off and not yet stopped, may still have the file.
-    Claim(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
+    OutputLock(out, patience_s=2 * LEASE_S, stopped=session.should_stop).close()
     simulate(
         prepared.start_of(run.replica, run.config),
         replace(run.config, force=prepared.force),

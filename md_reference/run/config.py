@@ -189,7 +189,7 @@ def defaults() -> dict[str, Any]:
     return found | {"force_field": "auto", "solvent": "auto"}
 
 
-def settle(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
+def resolve_settings(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
     """Return all settings of a run of `scene`, and a line about what its protocol decided, empty where nothing.
 
     `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names a paper's.
@@ -199,11 +199,11 @@ def settle(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) 
     Raises UnknownNameError, and InputError for a model system, whose settings are its own.
     """
     name = scene.provenance.get("library_name")
-    return settle_by_name(name if isinstance(name, str) else "", given, protocol)
+    return resolve_by_name(name if isinstance(name, str) else "", given, protocol)
 
 
-def settle_by_name(name: str, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
-    """Return what `settle` does for the scene of this name, or any other if the library does not know it."""
+def resolve_by_name(name: str, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
+    """Return what `resolve_settings` does for the scene of this name, or any other if the library does not know it."""
     decisive, said_as = _decisive(name, protocol)
     if "force_field" in given:
         decisive.pop("solvent", None)

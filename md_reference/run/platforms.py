@@ -30,7 +30,7 @@ _TIMED_STEP_PS = 0.001
 _THREADS_TIMED_ATOMS = 100
 _DEVICES = ("CUDA", "HIP", "OpenCL")
 # More threads must pay for themselves: the cores they take could run another replica.
-_WORTH_A_THREAD = 1.2
+_EQUIVALENT_TIME_A_THREAD = 1.2
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def choose_fastest(
     single = [t for t in cost if t.threads == 1]
     best = min(single or cost, key=lambda t: cost[t])
     for t in sorted(cost, key=lambda t: t.threads):
-        if t.threads > best.threads and cost[t] * _WORTH_A_THREAD < cost[best]:
+        if t.threads > best.threads and cost[t] * _EQUIVALENT_TIME_A_THREAD < cost[best]:
             best = t
     others = [f"{_name(t)} {cost[t]:.3g}" for t in sorted(cost, key=lambda t: cost[t]) if t is not best]
     reason = f"measured here on {n_atoms} atoms: {cost[best]:.3g} µs a step"

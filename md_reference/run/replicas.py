@@ -45,7 +45,7 @@ from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.checkpoint import (
     Checkpoint,
     checkpoint_path,
-    claimed_outputs,
+    locked_outputs,
     new_header,
     supported_checkpoint,
     write_checkpoint,
@@ -84,7 +84,7 @@ def simulate_batch(
     if len(outs) > n_replicas():
         raise InputError(f"{len(outs)} replicas are more than the {n_replicas()} of a batch.")
     state_path = checkpoint_path(outs[0])
-    with deferred_interrupt() as asked_to_stop, claimed_outputs(list(outs), may_exist=resume or overwrite):
+    with deferred_interrupt() as asked_to_stop, locked_outputs(list(outs), may_exist=resume or overwrite):
         if resume and not state_path.exists() and any(out.exists() for out in outs):
             for out in outs:
                 already_complete(out, config)

@@ -26,7 +26,7 @@ from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
     checkpoint_path,
-    claimed_outputs,
+    locked_outputs,
     new_header,
     supported_checkpoint,
     write_checkpoint,
@@ -86,7 +86,7 @@ def simulate(
     chk = checkpoint_path(out)
     with (
         deferred_interrupt() as asked_to_stop,
-        claimed_outputs([out], may_exist=resume or overwrite),
+        locked_outputs([out], may_exist=resume or overwrite),
     ):
         if resume and out.exists() and not chk.exists():
             already_complete(out, config)

@@ -27,6 +27,7 @@ from surrogate.cli.parameters import (
     with_options,
 )
 from surrogate.cli.render import print_comparison, print_json, print_library, print_pairs, print_run, print_written
+from surrogate.verbs.messages import said
 from surrogate.verbs.options import (
     CampaignOptions,
     CompareOptions,
@@ -39,7 +40,6 @@ from surrogate.verbs.options import (
     TrainOptions,
     WindowsOptions,
 )
-from surrogate.verbs.telling import said
 from systems.errors import SurromdError
 from systems.files.outside import printable
 from systems.interrupts import interrupted_by_signals
@@ -154,7 +154,7 @@ def run(
     options: RunOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """SCENE and a budget in, a judged trajectory out, by what pays best on this machine."""
+    """SCENE and a budget in, a evaluated trajectory out, by what pays best on this machine."""
     from surrogate import api
 
     if out is None and not options.dry_run:
@@ -188,11 +188,11 @@ def plan(scene: SceneArg, *, options: PlanOptions, as_json: JsonOpt = False) -> 
     """What a reference run of SCENE will do, what it skips, why, and what that saves."""
     from surrogate import api
 
-    account = api.plan(scene, options=options)
+    summary = api.plan(scene, options=options)
     if as_json:
-        print_json(account)
+        print_json(summary)
     else:
-        print_pairs(account)
+        print_pairs(summary)
 
 
 @app.command()
@@ -324,13 +324,13 @@ def compare(
     options: CompareShown,
     as_json: JsonOpt = False,
 ) -> None:
-    """Judge trajectories against a reference: is it right, how wrong is it, what did it cost?"""
+    """Evaluate trajectories against a reference: is it right, how wrong is it, what did it cost?"""
     from surrogate import api
 
     result = api.compare(reference, candidates, out, options=options)
     print_comparison(result, out, as_json=as_json, quiet=options.quiet, show_all=options.show_all)
     bad = {"different": ("different", "broken"), "broken": ("broken",)}
-    if options.fail_on is not None and any(j.status in bad[options.fail_on] for j in result.judgements):
+    if options.fail_on is not None and any(j.status in bad[options.fail_on] for j in result.evaluations):
         raise typer.Exit(1)
 
 

@@ -92,11 +92,11 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     def run(**given: Any) -> None:
         for name, kind in kinds.items():
             try:
-                settled = _settled(kind, given)
+                resolved = _resolved(kind, given)
             except MissingOptionError as error:
                 raise usage_error(f"{command.__name__} {error.needs}") from None
-            _hush(getattr(settled, "quiet", False))
-            given[name] = settled
+            _hush(getattr(resolved, "quiet", False))
+            given[name] = resolved
         command(**given)
 
     run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
@@ -111,7 +111,7 @@ def _config_option(known: Iterable[Option]) -> Any:
     return typer.Option("--config", help=literal(f"TOML of these options{told}; what is given here comes first."))
 
 
-def _settled(kind: type, given: dict[str, Any]) -> Any:
+def _resolved(kind: type, given: dict[str, Any]) -> Any:
     """Take a dataclass's options out of what the command line gives, and return it. Raises what `gather` does."""
     typed = {name: given.pop(name) for name, found in options_of(kind).items() if found.flags}
     said = {name: _plain(value) for name, value in typed.items() if value is not None and value != []}

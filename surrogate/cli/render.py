@@ -11,7 +11,7 @@ from surrogate.cli.flags import as_flags
 from systems.files.outside import printable
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison, Judgement
+    from surrogate.comparison.comparison import Comparison, Evaluation
 
 
 def _say(text: str) -> None:
@@ -81,7 +81,7 @@ def print_written(paths: list[Path], as_json: bool, quiet: bool) -> None:
     for path, record in zip(paths, records, strict=False):
         if not as_json:
             _say(f"{path}: {record['summary']}")
-            for line in record.get("account", []):
+            for line in record.get("details", []):
                 _say(f"  {line}")
 
 
@@ -108,26 +108,26 @@ def print_comparison(result: Comparison, report: Path, *, as_json: bool, quiet: 
     if as_json:
         print_json(result.to_dict())
         return
-    for judgement in () if quiet else result.judgements:
-        use, *more = judgement.in_short
-        for line in (f"{judgement.account.label}: {use}", *(f"  {x}" for x in (*more, judgement.verdict))):
+    for evaluation in () if quiet else result.evaluations:
+        use, *more = evaluation.in_short
+        for line in (f"{evaluation.summary.label}: {use}", *(f"  {x}" for x in (*more, evaluation.verdict))):
             _say(line)
         if show_all:
-            for finding in judgement.findings:
+            for finding in evaluation.findings:
                 _say(f"  - {finding}")
-            _print_rows(judgement)
-        if judgement.speed_ratio is not None:
-            _say(f"  simulated time per wall time: {judgement.speed_ratio:.3g} times the reference's")
-        for note in judgement.notes:
+            _print_rows(evaluation)
+        if evaluation.speed_ratio is not None:
+            _say(f"  simulated time per wall time: {evaluation.speed_ratio:.3g} times the reference's")
+        for note in evaluation.notes:
             _say(f"  note: {note}")
     for note in () if quiet else result.notes:
         _say(f"note: {note}")
     _say(f"report: {report}")
 
 
-def _print_rows(judgement: Judgement) -> None:
+def _print_rows(evaluation: Evaluation) -> None:
     _say(f"  {'':<52} {'reference':>10} {'candidate':>10} {'replicate':>10}")
-    for row in judgement.rows:
+    for row in evaluation.rows:
         figures = (row.reference, row.candidate, row.replicate)
         numbers = " ".join(f"{'-' if e is None else _plain(e.value, 4):>10}" for e in figures)
         _say(f"  {row.metric[:52]:<52} {numbers} {row.unit:<8} {row.verdict}")

@@ -163,7 +163,7 @@ class Settings:
 
     model: Any
     training: Any
-    settled: frozenset[str] = frozenset()
+    resolved: frozenset[str] = frozenset()
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the tables of the configuration file that gives these settings; what is None is left out."""
@@ -171,7 +171,7 @@ class Settings:
         for name, value in (("model", self.model), ("training", self.training)):
             if value is not None:
                 record = value.to_dict() if name == "model" else {f.name: getattr(value, f.name) for f in fields(value)}
-                found[name] = {key: v for key, v in record.items() if key not in self.settled}
+                found[name] = {key: v for key, v in record.items() if key not in self.resolved}
         return found
 
 

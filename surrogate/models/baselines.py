@@ -220,7 +220,7 @@ def pick(noise: Tensor, n: Tensor) -> Tensor:
     return torch.minimum((share * n).long(), n - 1)
 
 
-# Fit baselines to reference frames and write them as weights, so that they roll out and are judged like any model.
+# Fit baselines to reference frames and write them as weights, so that they roll out and are evaluated like any model.
 
 N_KEPT_FRAMES = 4000
 N_STATES = 100

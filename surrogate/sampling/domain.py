@@ -248,7 +248,7 @@ class DomainMatch:
     seen: bool = True
     nearness: str = ""
 
-    def remarks(self, weights: str) -> tuple[str, ...]:
+    def input_notes(self, weights: str) -> tuple[str, ...]:
         """Return what is to be said before the scene is rolled with weights of this name; nothing inside the domain."""
         near = f" ({self.nearness})" if self.nearness else ""
         unseen = f"{weights} was not trained on this molecule{near}; compare with MD of it before you trust the rollout"

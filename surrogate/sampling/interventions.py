@@ -102,7 +102,7 @@ def finite(flags: Flags) -> npt.NDArray[np.bool_]:
     return found
 
 
-# The account of what a rollout did about its own failures: what stands in the file, and what it cost.
+# The summary of what a rollout did about its own failures: what stands in the file, and what it cost.
 
 # The column `intervention` of a trajectory: what a frame is, if it is not the surrogate's first draw.
 DRAWN_AGAIN, REPAIRED, MD_AFTER_FAILURE, MD_BETWEEN = 1, 2, 3, 4
@@ -127,7 +127,7 @@ _LOGGED = 200
 
 @dataclass
 class Tally:
-    """One replica's account. All numbers are of model frames, whether they are kept in the file or not.
+    """One replica's summary. All numbers are of model frames, whether they are kept in the file or not.
 
     `chunks` drawn, of which `chunks_caught` held a frame that a guard caught; `frames_caught` and `reasons` count the
     frames of first draws, `frames` those that an intervention left, `draws` the further draws. `md_in_a_row`: chunks
@@ -271,7 +271,7 @@ class Interventions:
         run.draw()
         if self.guard not in ("off", "flag"):
             run.help_rows()
-        run.judge()
+        run.compare()
         if self.n_between and run.chunk.failure is None:
             run.add_md()
         for tally, marks in zip(tallies, run.chunk.marks, strict=True):
@@ -316,7 +316,7 @@ class _Advance:
             if wrong:
                 self.chunk.failure = (wrong[0], f"two draws gave no frame that passes ({self._reasons(wrong[0])})")
                 return
-            pending = [row for row in pending if not self._settle(row, attempt)]
+            pending = [row for row in pending if not self._resolve(row, attempt)]
             if not pending:
                 return
         first = pending[0]
@@ -325,7 +325,7 @@ class _Advance:
             what = f"MD had to finish {MOST_MD_IN_A_ROW} chunks in a row, and {what}"
         self.chunk.failure = (first, what)
 
-    def judge(self) -> None:
+    def compare(self) -> None:
         """Enter in `chunk.failure` the row whose last frame is not finite, or which under 'flag' has had no valid frame
         for a whole chunk, or for as many short ones as hold MOST_INVALID_IN_A_ROW frames."""
         if self.chunk.failure is not None:
@@ -363,7 +363,7 @@ class _Advance:
         chunk.marks = np.concatenate([chunk.marks, marks], axis=1)
         chunk.energies_kj_mol = np.concatenate([chunk.energies_kj_mol, np.full(flags.shape, np.nan)], axis=1)
 
-    def _settle(self, row: int, attempt: int) -> bool:
+    def _resolve(self, row: int, attempt: int) -> bool:
         """Do what the guard says about a row that was just drawn; return whether it can stay as it is then. A first
         draw without a frame that passes is not worth it: there is another."""
         bad = np.flatnonzero(caught(self.chunk.flags[row]))
@@ -463,7 +463,7 @@ class _Advance:
                     self._check_energies(row, self.plan.energy)
 
     def _check_energies(self, row: int, check: EnergyCheck) -> None:
-        """Flag frames whose turn it is and whose energy is none that the truth has."""
+        """Flag frames whose turn it is and whose energy is none that the reference has."""
         steps = self.step + 1 + np.arange(self.chunk.flags.shape[1])
         energies = self.chunk.energies_kj_mol[row]
         for k in np.flatnonzero((steps % self.plan.energy_every == 0) & ~caught(self.chunk.flags[row])).tolist():

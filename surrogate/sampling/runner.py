@@ -22,7 +22,7 @@ from surrogate.sampling.chunks import ChunkSampler, noise_seed
 from surrogate.sampling.config import GUARDS, RolloutConfig
 from surrogate.sampling.domain import DomainMatch, fit_weights, in_bath
 from surrogate.sampling.interventions import Chunk, Clock, Guard, Interventions, Tally, none_through
-from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread, RelaxedEnergy, TruthDifference
+from surrogate.sampling.openmm.coupling import Coupling, EnergyCheck, MemberSpread, ReferenceDifference, RelaxedEnergy
 from systems.chemistry.validity import INVALID, Geometry, check_frames
 from systems.errors import InputError, SimulationError, first_line
 from systems.files.outside import UNREADABLE, arrays_in, check_disk
@@ -34,7 +34,7 @@ from systems.trajectory.checkpoint import (
     FLUSH_SHARE,
     Checkpoint,
     checkpoint_path,
-    claimed_outputs,
+    locked_outputs,
     new_header,
     read_checkpoint,
     supported_checkpoint,
@@ -74,7 +74,7 @@ class Plan:
         return self.n_frames * self.stride
 
 
-def settle_plan(
+def resolve_plan(
     scene: Scene, weights: Weights, match: DomainMatch, config: RolloutConfig, sampler: ChunkSampler, *, n_replicas: int
 ) -> Plan:
     """Turn durations into numbers of frames; `weights` and `match` are what `domain.fit_weights` made of the scene.
@@ -180,10 +180,10 @@ def progress_of(path: Path, state: Checkpoint, settings: dict[str, Any] | None) 
     return progress
 
 
-# Record of a rollout: settings, provenance and account in its files, and the lines shown while it runs.
+# Record of a rollout: settings, provenance and summary in its files, and the lines shown while it runs.
 
 # Options that stand in a part of the record, by its name.
-_ACCOUNTS = {"interventions": ("guard", "energy_every", "md_between_ps"), "selection": ("atoms", "select")}
+_SUMMARIES = {"interventions": ("guard", "energy_every", "md_between_ps"), "selection": ("atoms", "select")}
 
 
 def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int) -> dict[str, Any]:
@@ -219,11 +219,11 @@ def new_record(plan: Plan, sampler: ChunkSampler, checks: Guard, *, replica: int
     return record
 
 
-def _asked(config: RolloutConfig, account: str = "") -> dict[str, Any]:
-    """Return the options of one account of the record, else all that stand in none. How long it is, its frames say."""
+def _asked(config: RolloutConfig, summary: str = "") -> dict[str, Any]:
+    """Return the options of one summary of the record, else all that stand in none. How long it is, its frames say."""
     options = asdict(config)
-    apart = {"time_ps", *chain(*_ACCOUNTS.values())}
-    return {name: options[name] for name in _ACCOUNTS.get(account) or (name for name in options if name not in apart)}
+    apart = {"time_ps", *chain(*_SUMMARIES.values())}
+    return {name: options[name] for name in _SUMMARIES.get(summary) or (name for name in options if name not in apart)}
 
 
 def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: Guard) -> dict[str, Any]:
@@ -235,14 +235,14 @@ def _interventions(plan: Plan, tally: Tally, seconds: dict[str, float], checks: 
     }
 
 
-def close_account(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSampler,
+def close_summary(plan: Plan, state: Progress, checks: Guard, sampler: ChunkSampler,
                    writers: Sequence[TrajectoryWriter], *, completed: bool) -> None:  # fmt: skip
     """Enter what was done and what it cost, by now or in all."""
     for writer, tally in zip(writers, state.tallies, strict=True):
         done = {"completed": True} if completed else {}
-        account = _interventions(plan, tally, state.seconds, checks)
+        summary = _interventions(plan, tally, state.seconds, checks)
         writer.update_record(
-            {"interventions": account, "cost": _cost(plan, state, tally, sampler, len(writers)), **done}
+            {"interventions": summary, "cost": _cost(plan, state, tally, sampler, len(writers)), **done}
         )
 
 
@@ -296,7 +296,7 @@ __all__ = ["GUARDS", "RolloutConfig", "rollout"]
 # Stages of annealing, of which the first are hot: as hot as the states that potentials learn from.
 HOT_K, HOT_STAGES, ANNEAL_STAGES = 600.0, 3, 10
 
-# (frames done, frames in all, account of speed and interventions) of one replica -> None
+# (frames done, frames in all, summary of speed and interventions) of one replica -> None
 ProgressFn = Callable[[int, int, str], None]
 # A line about the run as a whole -> None
 AnnounceFn = Callable[[str], None]
@@ -319,7 +319,7 @@ def rollout(
     Frames stand at save_every_ps, 2 save_every_ps, ... up to time_ps, in the scene's own atom order and pose, each
     marked with its chunk, its validity flags (systems.chemistry.validity) against the
     training reference, and what was done about it (column `intervention`, `interventions.MARKS`); the record's
-    `interventions` accounts for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
+    `interventions` summaries for them. Replica k draws chunk c's noise from a generator seeded by (seed, k, c), so a
     replica does not depend on how many run beside it, and a resumed rollout continues as if it had not stopped. Ctrl-C
     and SIGTERM stop between two chunks, with everything on disk: KeyboardInterrupt. Memory that does not suffice for
     all replicas at once halves the batch. `announce` is told how the scene leaves what was trained on.
@@ -335,7 +335,7 @@ def rollout(
         save_every_ps=config.save_every_ps,
     )
     if announce is not None:
-        for line in match.remarks(weights.path.name):
+        for line in match.input_notes(weights.path.name):
             announce(line)
     state_path = checkpoint_path(outs[0])
     precision = config.precision
@@ -349,13 +349,13 @@ def rollout(
         precision=precision,
         compile=config.compile,
     )
-    plan = settle_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
+    plan = resolve_plan(scene, weights, match, config, sampler, n_replicas=len(outs))
     checks = Guard(weights.domain)
     check_disk(outs[0], plan.n_frames * len(outs), len(plan.kept_atoms))
 
     with ExitStack() as stack:
         asked_to_stop = stack.enter_context(deferred_interrupt())
-        stack.enter_context(claimed_outputs(outs, may_exist=resume or overwrite))
+        stack.enter_context(locked_outputs(outs, may_exist=resume or overwrite))
         if resume and not state_path.exists() and any(path.exists() for path in outs):
             return _already_complete(outs, plan)
         kept = supported_checkpoint(state_path, outs) if resume and state_path.exists() else None
@@ -379,7 +379,7 @@ def rollout(
         learned = isinstance(weights.model, Potential)
         energy: EnergyCheck | None = None
         if config.energy_every and coupling is not None:
-            energy = TruthDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
+            energy = ReferenceDifference(coupling, weights) if learned else RelaxedEnergy(coupling)
         engine = Interventions(sampler, checks, config.guard, config.seed, clock, coupling, config.energy_every,
                                plan.n_between, energy, MemberSpread(weights) if learned else None)  # fmt: skip
 
@@ -420,7 +420,7 @@ def rollout(
                 if config.guard in ("off", "flag"):
                     _buffer(plan, state, chunk, buffers)
                 flush()
-                close_account(plan, state, checks, sampler, writers, completed=False)
+                close_summary(plan, state, checks, sampler, writers, completed=False)
                 state_path.unlink(missing_ok=True)
                 raise SimulationError(why_stopped(plan, state, chunk, outs))
             _buffer(plan, state, chunk, buffers)
@@ -433,10 +433,10 @@ def rollout(
                 done = min(state.steps // plan.stride, plan.n_frames)
                 progress(done, plan.n_frames, speed.describe(plan, state, len(outs)))
             if stopping and not complete:
-                close_account(plan, state, checks, sampler, writers, completed=False)
+                close_summary(plan, state, checks, sampler, writers, completed=False)
                 raise KeyboardInterrupt
         state.wall_s = time.monotonic() - started
-        close_account(plan, state, checks, sampler, writers, completed=True)
+        close_summary(plan, state, checks, sampler, writers, completed=True)
         for writer in writers:
             writer.close()
         state_path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The verb `campaign`: runs on Dask with one progress bar, and an account of what its folder holds."""
+"""The verb `campaign`: runs on Dask with one progress bar, and a summary of what its folder holds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from md_reference.campaign.manifest import COMPLETE, FAILED, campaign_folder, read_manifest
 from surrogate.progress import progress_bar
 from surrogate.verbs.options import CampaignOptions, PathLike
-from systems.options import takes
+from systems.options import options_as_keywords
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SPEED_OVER_S = 30.0
 
 
-@takes(CampaignOptions)
+@options_as_keywords(CampaignOptions)
 def campaign(file: PathLike, out: PathLike | None = None, *, options: CampaignOptions) -> dict[str, Any]:
     """Simulate many scenes, temperatures and replicas as a TOML file says, on Dask, and return `info` of the folder.
 
@@ -110,7 +110,7 @@ def _list_runs(campaign: Campaign) -> dict[str, Any]:
 
 
 def describe_campaign(folder: Path) -> dict[str, Any]:
-    """Return a JSON-able account of a campaign's folder; `summary` is one line, `failed` the reasons.
+    """Return a JSON-able summary of a campaign's folder; `summary` is one line, `failed` the reasons.
 
     Raises InputError when the folder holds no manifest.
     """

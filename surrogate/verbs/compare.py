@@ -1,4 +1,4 @@
-"""The judge as a verb: files in, a comparison and its report out."""
+"""The comparison as a verb: files in, a comparison and its report out."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 from surrogate.verbs.options import CompareOptions, PathLike, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from systems.errors import InputError
-from systems.options import takes
+from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from surrogate.judge.comparison import Comparison
+    from surrogate.comparison.comparison import Comparison
     from systems.scene import Scene
 
 
-@takes(CompareOptions)
+@options_as_keywords(CompareOptions)
 def compare(
     reference: Trajectories,
     candidates: PathLike | Sequence[Trajectories],
@@ -28,19 +28,20 @@ def compare(
     *,
     options: CompareOptions,
 ) -> Comparison:
-    """Judge candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
+    """Evaluate candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
-    The reference, each candidate and the replicate (another run of the truth, the floor of every figure) is a file, a
+    The reference, each candidate and the replicate (another run of the reference, the replicate baseline of every
+    figure) is a file, a
     folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
     `candidates` is one candidate, and a sequence holds one each. `top`: topology for
     files that carry none. `dt_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
     stands for all, or there is one for the reference, each candidate and the replicate in this order, None where the
-    file says it itself. `energies`: judge the potential energy of every k-th frame too, by the force field that the
+    file says it itself. `energies`: evaluate the potential energy of every k-th frame too, by the force field that the
     reference's file names. A report that is there stays unless `overwrite`.
     Raises InputError, TrajectoryError, OutOfDomainError.
     """
-    from surrogate.judge.comparison import compare as judge
-    from surrogate.judge.read.ensemble import load_ensemble
+    from surrogate.comparison.comparison import compare as compare
+    from surrogate.comparison.read.ensemble import load_ensemble
 
     if isinstance(candidates, str | Path):
         candidates = [candidates]
@@ -56,24 +57,26 @@ def compare(
         check_outputs(beside, [".json", ".md"], overwrite=options.overwrite)
     n = 1 + len(candidates) + (options.replicate is not None)
     tops, lags = _one_each("top", options.top, n), _one_each("dt_ps", options.dt_ps, n)
-    truth = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
+    ref = load_ensemble(find_trajectories(reference), top=tops[0], lag_ps=lags[0])
     others = [
         load_ensemble(
             find_trajectories(candidate),
             label=labels[k] if labels else None,
-            template=truth.scene,
+            template=ref.scene,
             top=tops[1 + k],
             lag_ps=lags[1 + k],
         )
         for k, candidate in enumerate(candidates)
     ]
-    floor = None
+    replicate_baseline = None
     if options.replicate is not None:
-        floor = load_ensemble(find_trajectories(options.replicate), template=truth.scene, top=tops[-1], lag_ps=lags[-1])
-    energy_fn = _relaxed_energy(truth.scene, truth.record) if options.energies else None
-    result = judge(truth, others, floor, truth.scene, energy_fn=energy_fn)
+        replicate_baseline = load_ensemble(
+            find_trajectories(options.replicate), template=ref.scene, top=tops[-1], lag_ps=lags[-1]
+        )
+    energy_fn = _relaxed_energy(ref.scene, ref.record) if options.energies else None
+    result = compare(ref, others, replicate_baseline, ref.scene, energy_fn=energy_fn)
     if out_html is not None:
-        from surrogate.judge.report.report import write_report
+        from surrogate.comparison.report.report import write_report
 
         write_report(result, Path(out_html))
     return result

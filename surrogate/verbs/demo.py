@@ -11,13 +11,13 @@ from surrogate.verbs.options import DemoOptions, PathLike
 from surrogate.verbs.reference import reference
 from surrogate.verbs.rollout import rollout
 from systems.errors import InputError
-from systems.options import takes
+from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Comparison
+    from surrogate.comparison.comparison import Comparison
 
 
-@takes(DemoOptions)
+@options_as_keywords(DemoOptions)
 def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Comparison:
     """The whole way on alanine dipeptide: two OpenMM runs, longer rollouts with shipped weights, the comparison.
 
@@ -34,10 +34,10 @@ def demo(out_dir: PathLike = "surromd-demo", *, options: DemoOptions) -> Compari
     try:
         shared: dict[str, Any] = {"seed": options.seed, "quiet": options.quiet, "overwrite": True}
         out = folder / "reference.h5"
-        truth, replicate = reference(name, out, time_ps=options.reference_ps, replicas=2, **shared)
+        ref, replicate = reference(name, out, time_ps=options.reference_ps, replicas=2, **shared)
         out, n = folder / "surrogate.h5", options.rollout_replicas
         saved = {"save_every_ps": options.rollout_save_every_ps}
         rolled = rollout(name, weights, out, time_ps=options.rollout_ps, replicas=n, **saved, **shared)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was written is in {folder}; the demo starts over when it is run again") from None
-    return compare(truth, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)
+    return compare(ref, [rolled], folder / "report.html", replicate=replicate, labels=["surrogate"], overwrite=True)

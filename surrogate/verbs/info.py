@@ -53,7 +53,7 @@ def _run(folder: Path) -> dict[str, Any] | None:
     except UNREADABLE as error:
         raise InputError(f"{path} cannot be read as the record of a run ({first_line(error)}).") from None
     n_done = sum(not line["failed"] for line in found)
-    summary = f"{n_done} of {len(found)} molecules judged"
+    summary = f"{n_done} of {len(found)} molecules evaluated"
     return {"file": str(folder), "type": "runs", "summary": summary, "molecules": lines}
 
 
@@ -110,7 +110,7 @@ def _trajectory(path: Path) -> dict[str, Any]:
         "file": str(path),
         "type": record.get("kind", "foreign") + " trajectory",
         "summary": f"{n_frames} frames of {n_atoms} atoms{span}{wall}{unfinished}",
-        "account": [
+        "details": [
             *summary_lines(record.get("summary") or {}),
             *training_lines(record),
             *precision_lines(record),
@@ -153,25 +153,25 @@ def _percent(share: float) -> str:
 
 def intervention_lines(record: dict[str, Any]) -> list[str]:
     """Return what a rollout's guards caught and did, and what that cost; nothing of other files."""
-    account = record.get("interventions")
-    if not isinstance(account, dict):
+    summary = record.get("interventions")
+    if not isinstance(summary, dict):
         return []
-    helped, chunks = account["chunks_caught"], account["chunks"]
-    line = f"guard {account['guard']}: {helped} of {chunks} chunks caught"
+    helped, chunks = summary["chunks_caught"], summary["chunks"]
+    line = f"guard {summary['guard']}: {helped} of {chunks} chunks caught"
     if helped:
-        reasons = sorted(account.get("reasons", {}).items(), key=lambda r: -r[1])
+        reasons = sorted(summary.get("reasons", {}).items(), key=lambda r: -r[1])
         line += f" ({_percent(helped / max(chunks, 1))}): " + ", ".join(f"{name} ({n} frames)" for name, n in reasons)
     lines = [line]
-    if account["frames"]:
-        done = ", ".join(f"{n} {name}" for name, n in account["frames"].items())
-        seconds = account.get("seconds", {})
+    if summary["frames"]:
+        done = ", ".join(f"{n} {name}" for name, n in summary["frames"].items())
+        seconds = summary.get("seconds", {})
         extra = {name: value for name, value in seconds.items() if name != "draw"}
         drawn_s = seconds.get("draw") or math.inf
         shares = ", ".join(f"{name} {_percent(v / drawn_s)}" for name, v in extra.items())
         lines += [
             f"frames that are not the surrogate's first draw: {done}",
             f"cost beside drawing chunks: {shares}",
-            *(f"bias: {why}" for why in account["bias"]),
+            *(f"bias: {why}" for why in summary["bias"]),
         ]
     return lines
 

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surrogate.progress import progress_bar
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import PlanOptions, ReferenceOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs, join_replicas, summarised_outputs
 from surrogate.verbs.scene_listing import prepare_scene
-from surrogate.verbs.telling import tell
-from systems.options import takes
+from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
     from md_reference.run.simulate import MDConfig
     from systems.scene import Scene
 
 
-@takes(PlanOptions)
+@options_as_keywords(PlanOptions)
 def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     """Return what `reference` will do with these settings, what it skips, why, and what that saves here (JSON-able).
 
@@ -28,12 +28,12 @@ def plan(scene: str | Path | Scene, options: PlanOptions) -> dict[str, Any]:
     from md_reference.run.plan import make_plan
 
     molecule = prepare_scene(scene, options, quiet=False)
-    molecule, config, protocol = settle_run(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
+    molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps or 0.0}, quiet=True)
     found = make_plan(molecule, config, replicas=options.replicas).to_dict()
     return found | ({"protocol": protocol} if protocol else {})
 
 
-@takes(ReferenceOptions)
+@options_as_keywords(ReferenceOptions)
 def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOptions) -> list[Path]:
     """Simulate a scene with OpenMM and return the trajectories written; each record ends with a `summary` of its run.
 
@@ -60,13 +60,13 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     joined = [Path(out)] if options.join and len(outs) > 1 else []
     check_outputs([*outs, *joined], TRAJECTORY_SUFFIXES, resume=options.resume, overwrite=options.overwrite)
     molecule = prepare_scene(scene, options, quiet=options.quiet)
-    molecule, config, protocol = settle_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
+    molecule, config, protocol = resolve_run(molecule, options, {"time_ps": options.time_ps}, quiet=options.quiet)
     _ = config.n_frames, config.steps_per_frame  # uneven intervals are refused before anything runs
     if protocol and not options.quiet:
         tell(molecule.name, protocol)
     label = f"OpenMM {molecule.name}" + (f" x {len(outs)}" if len(outs) > 1 else "")
     with (
-        accounted_outputs(outs, resumable="the same again with `resume=True` goes on"),
+        summarised_outputs(outs, resumable="the same again with `resume=True` goes on"),
         progress_bar(label, quiet=options.quiet, ps_per_frame=config.save_every_ps) as progress,
     ):
         written = simulate_replicas(
@@ -81,7 +81,7 @@ def reference(scene: str | Path | Scene, out: str | Path, options: ReferenceOpti
     return join_replicas(written, joined, overwrite=options.resume or options.overwrite)
 
 
-def settle_run(
+def resolve_run(
     scene: Scene, options: PlanOptions | ReferenceOptions, length: dict[str, float], *, quiet: bool
 ) -> tuple[Scene, MDConfig, str]:
     """Return the scene, solvated if asked, the settings of a run, and a line about what the protocol decided.
@@ -91,7 +91,7 @@ def settle_run(
     from md_reference.forces.forcefield import resolve
     from md_reference.forces.solvation import require_molecules, solvate_if_asked
     from md_reference.forces.spec import ForceFieldSpec, at_level
-    from md_reference.run.config import MDConfig, resolved, settle, to_config
+    from md_reference.run.config import MDConfig, resolve_settings, resolved, to_config
 
     given = asdict(options) | {"force_field": at_level(options.level, options.force_field)}
     settings_of_a_run = {f.name for kind in (MDConfig, ForceFieldSpec) for f in fields(kind)} - {"hydrogen_mass_da"}
@@ -101,7 +101,7 @@ def settle_run(
     seed = asked.pop("seed", 0)
     if options.hydrogen_mass_da != "default":
         asked["hydrogen_mass_da"] = options.hydrogen_mass_da
-    settings, protocol = settle(scene, asked, options.protocol)
+    settings, protocol = resolve_settings(scene, asked, options.protocol)
     config = to_config(settings | length, seed=seed)
     config = replace(config, force=resolve(scene, config.force))
     if options.keep_water:

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 from surrogate.data.shipped import weights_path
 from surrogate.progress import progress_bar
 from surrogate.sampling.config import RolloutConfig
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import RolloutOptions
-from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, accounted_outputs, check_outputs, join_replicas
+from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs, join_replicas, summarised_outputs
 from surrogate.verbs.scene_listing import prepare_scene
-from surrogate.verbs.telling import tell
-from systems.options import part_of, takes
+from systems.options import options_as_keywords, part_of
 
 if TYPE_CHECKING:
     from systems.scene import Scene
 
 
-@takes(RolloutOptions)
+@options_as_keywords(RolloutOptions)
 def rollout(
     scene: str | Path | Scene, weights: str | Path | None, out: str | Path, options: RolloutOptions
 ) -> list[Path]:
@@ -71,7 +71,7 @@ def rollout(
     if saved_ps is None:
         saved_ps = choose_lag(loaded, config.lag_ps, None)
     with (
-        accounted_outputs(outs, resumable="the same again with `resume=True` goes on"),
+        summarised_outputs(outs, resumable="the same again with `resume=True` goes on"),
         # The verb counts the frames of one replica; all advance together.
         progress_bar(label, quiet=options.quiet, ps_per_frame=saved_ps * len(outs)) as progress,
     ):

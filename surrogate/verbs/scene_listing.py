@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surrogate.verbs.telling import tell
+from surrogate.verbs.messages import tell
 from systems.chemistry.graph import molecule_key
 from systems.options import Preparation, part_of
 

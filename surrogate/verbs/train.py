@@ -12,12 +12,12 @@ from surrogate.data.shipped import weights_path
 from surrogate.models.architecture import architecture, names
 from surrogate.progress import progress_bar
 from surrogate.verbs.learn_molecule import learn_molecule
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import PathLike, TrainOptions, Trajectories
 from surrogate.verbs.outputs import check_outputs, find_trajectories
-from surrogate.verbs.telling import tell
 from systems.errors import InputError
-from systems.files.whole_file import Claim
-from systems.options import takes
+from systems.files.whole_file import OutputLock
+from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
     from surrogate.data.references import References
@@ -38,7 +38,7 @@ class _Plan:
         return [f"arch = {self.request.arch}: {self.why}", *(choice.line() for choice in self.choices)]
 
 
-@takes(TrainOptions)
+@options_as_keywords(TrainOptions)
 def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Path:
     """Train a surrogate on trajectories, or on one windows file, and return the weights written (.safetensors).
 
@@ -77,7 +77,7 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
             tell(out.name, "this training is done, and nothing was changed; overwrite it to train anew")
         return out
     if options.level is not None:
-        with Claim(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):
+        with OutputLock(out), progress_bar(f"training {out.stem}", quiet=options.quiet) as bar, _said_when_stopped(out):
             written = learn_molecule(references, asked, options, _shown(bar))
         _conclude(written, fitted=False, quiet=options.quiet)
         return written
@@ -89,8 +89,8 @@ def train(references: Trajectories, out: PathLike, options: TrainOptions) -> Pat
     if first and not quiet:
         for line in plan.lines():
             tell(out.name, line)
-    claim = Claim(out) if first else nullcontext()
-    with claim, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
+    lock = OutputLock(out) if first else nullcontext()
+    with lock, progress_bar(f"training {prepared.scene}", quiet=quiet or not first) as bar, _said_when_stopped(out):
         written = prepared.start(_shown(bar))
     if first:
         _conclude(written, fitted=plan.trainer.fitted, quiet=quiet)
@@ -107,7 +107,7 @@ def _shown(bar: Callable[..., None] | None) -> Callable[[str, float], None]:
     return advance
 
 
-@takes(TrainOptions)
+@options_as_keywords(TrainOptions)
 def explain_training(references: Trajectories, options: TrainOptions) -> str:
     """Return the configuration file, filled in, that a training on these references would use; nothing is trained.
 
@@ -226,10 +226,10 @@ def _conclude(written: Path, *, fitted: bool, quiet: bool) -> None:
         plot_curves(curves)
     if fitted:
         return
-    from surrogate.verbs.train_verdict import judge_training, write_verdict
+    from surrogate.verbs.train_verdict import compare_training, write_verdict
 
     try:
-        verdict = judge_training(written)
+        verdict = compare_training(written)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{written} is written; only the rollout that tries it was cut short") from None
     write_verdict(written, verdict)

@@ -72,7 +72,7 @@ class TrainingVerdict:
         return [*lines, f"{help_}; what would help: {'; '.join(self.advice)}"]
 
 
-def judge_training(path: Path) -> TrainingVerdict:
+def compare_training(path: Path) -> TrainingVerdict:
     """Roll freshly trained weights from the structures they know, and say what they are good for.
 
     Draws each chunk once, so that the share of frames that pass is the network's own. Raises WeightsError, InputError.
@@ -104,7 +104,7 @@ def judge_training(path: Path) -> TrainingVerdict:
 
 
 def trial_s(model: Potential, scene: Scene) -> float:
-    """Return about how many seconds the rollout of `judge_training` takes with a potential of a scene, by timing its
+    """Return about how many seconds the rollout of `compare_training` takes with a potential of a scene, by timing its
     forces."""
     import torch
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from surrogate.verbs.options import PathLike, Trajectories, WindowsOptions
 from surrogate.verbs.outputs import check_outputs, find_trajectories
 from systems.errors import InputError
-from systems.options import takes
+from systems.options import options_as_keywords
 
 
-@takes(WindowsOptions)
+@options_as_keywords(WindowsOptions)
 def windows(references: Trajectories, out: PathLike, options: WindowsOptions) -> Path:
     """Read reference trajectories of one scene, canonicalise them once, and write one compact file for training.
 

@@ -83,22 +83,22 @@ def lewis_structure(
         return None
     orders = np.ones(len(pairs))
     charges = np.array([s[0][1] for s in states], dtype=np.int64)
-    unsettled = [i for i, s in enumerate(states) if len(s) > 1 or s[0][0] != len(neighbours[i])]
-    rest = None if total_charge is None else total_charge - int(charges.sum() - charges[unsettled].sum())
-    if not unsettled:
+    unresolved = [i for i, s in enumerate(states) if len(s) > 1 or s[0][0] != len(neighbours[i])]
+    rest = None if total_charge is None else total_charge - int(charges.sum() - charges[unresolved].sum())
+    if not unresolved:
         return None if rest else (orders, charges)
-    room = {i for i in unsettled if max(s[0] for s in states[i]) > len(neighbours[i])}
+    room = {i for i in unresolved if max(s[0] for s in states[i]) > len(neighbours[i])}
     open_bonds = [
         k
         for k, (i, j) in enumerate(pairs)
         if {i, j} <= room and ((stated or {}).get((i, j), 1) > 1 or not _is_ylide(elements, neighbours, i, j))
     ]
-    solved = _solve(elements, neighbours, states, unsettled, [pairs[k] for k in open_bonds], stated or {}, rest)
+    solved = _solve(elements, neighbours, states, unresolved, [pairs[k] for k in open_bonds], stated or {}, rest)
     if solved is None:
         return None
     extra, chosen = solved
     orders[open_bonds] += extra
-    charges[unsettled] = chosen
+    charges[unresolved] = chosen
     return orders, charges
 
 
@@ -385,7 +385,7 @@ class _Kekule:
         if not self.bad:
             self._oxidise()
             self._pair()
-            self._settle()
+            self._resolve()
             self.bad = [i for i, u in enumerate(self._open) if u > 0]
         self.orders = np.array([self.order[min(i, j), max(i, j)] for i, j in bonds.tolist()], dtype=np.float64)
 
@@ -452,7 +452,7 @@ class _Kekule:
                 self._open[a] -= 1
                 self._open[b] -= 1
 
-    def _settle(self) -> None:
+    def _resolve(self) -> None:
         """Give charges to what no double bond took."""
         for i, symbol in enumerate(self._elements):
             near = self._neighbours[i]

@@ -224,8 +224,8 @@ def _hydrogen_rows(near: list[list[int]], mapped: dict[int, int], parent: int, h
     rows: _Rows = []
     others = [j for j in near[parent] if j not in hydrogens]
     if len(near[parent]) == 4 and len(hydrogens) >= 2:
-        trio = [*others, *hydrogens][-3:]
-        rows.append(([parent, *trio], False))
+        inputs = [*others, *hydrogens][-3:]
+        rows.append(([parent, *inputs], False))
     for b in others:
         far = [a for a in near[b] if a != parent and a in mapped]
         if far:

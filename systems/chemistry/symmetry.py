@@ -80,7 +80,7 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
             centres[row[0]] = row
             signs[row[0]] = flip * _sign(x, row)
             marks[row[0]] = [signs[row[0]]]
-        settled = len(done)
+        resolved = len(done)
         for i, j in double - done:
             mark = _cis_trans(x, neighbours, colours, i, j)
             if mark:
@@ -95,7 +95,7 @@ def classify(scene: Scene, *, stereo: bool = True, mirrored: bool = False) -> At
         n_classes = len(set(colours))
         marked = [_hash(c, marks[i]) if i in marks else c for i, c in enumerate(colours)]
         colours = _refine(marked, neighbours, labels)
-        if not fresh and len(done) == settled and len(set(colours)) == n_classes:
+        if not fresh and len(done) == resolved and len(set(colours)) == n_classes:
             break
     order = sorted(centres)
     return AtomClasses(tuple(colours), tuple(centres[i] for i in order), tuple(signs[i] for i in order))

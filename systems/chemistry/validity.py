@@ -1,4 +1,4 @@
-"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the judge.
+"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison.
 
 For guards also limits of a reference's frames: angles, flat centres, jumps, stillness and drift. Every one is measured
 on the reference: the farthest that its frames go from their mean, and half as far again; the least that they change

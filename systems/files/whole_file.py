@@ -1,6 +1,6 @@
 """Output files: locked against a second writer, written whole or not at all, with checksums that show damage.
 
-- `Claim`: a lock on each output, so that one process writes it at a time;
+- `OutputLock`: a lock on each output, so that one process writes it at a time;
 - `create_whole`: a file that appears whole or not at all, and stays when the power fails;
 - `AtomicFile`: a file that HDF5 writes through, and that changes by whole transactions;
 - checksums of frames and of JSON text: what the disk or a copy has changed is noticed when it is read.
@@ -117,7 +117,7 @@ def replica_paths(out: Path, n_replicas: int) -> list[Path]:
     return [out.with_name(f"{out.stem}_r{k}{out.suffix}") for k in range(n_replicas)]
 
 
-class Claim:
+class OutputLock:
     """A lock on `.NAME.lock` beside an output, which the system gives back when this process ends, however it ends.
 
     It holds against other threads of this process, too. Raises TrajectoryError when another one has the output, and has
@@ -170,7 +170,7 @@ class Claim:
             os.close(self._fd)
             self._fd = -1
 
-    def __enter__(self) -> Claim:
+    def __enter__(self) -> OutputLock:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,

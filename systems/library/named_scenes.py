@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from systems.chemistry.residues import ONE_LETTER
 from systems.errors import InputError, UnknownNameError, nearest
-from systems.options import Preparation, takes
+from systems.options import Preparation, options_as_keywords
 from systems.scene import PARTICLE, Scene
 
 
@@ -396,7 +396,7 @@ _FILE_SUFFIXES = (".pdb", ".ent", ".cif", ".mmcif", ".gz")
 _OTHER_SUFFIXES = (".xyz", ".gro", ".pdbqt", ".prmtop", ".psf", ".h5", ".dcd", ".xtc")
 
 
-@takes(Preparation)
+@options_as_keywords(Preparation)
 def prepare(spec: str, options: Preparation) -> Scene:
     """Return the scene that `spec` names: `alanine-dipeptide`, `peptide.pdb`, `molecule.sdf`, `smiles:CCO`,
     `sequence:ACE-ALA-NME`.

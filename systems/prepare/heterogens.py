@@ -129,7 +129,7 @@ def _are_apart(oxygens: Sequence[tuple[float, float, float]]) -> bool:
     return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
 
 
-def settle_solvent(
+def resolve_solvent(
     atoms: Sequence[AtomRecord], kept: Sequence[int], *, keep_water: bool, keep_ions: bool, notes: list[str]
 ) -> tuple[list[int], list[int]]:
     """Return the indices that stay, and those of waters to be kept beside them; `notes` says what is left out.
@@ -210,7 +210,7 @@ def agent_atoms(atoms: Sequence[AtomRecord], ligands: Sequence[int], notes: list
     return sorted(found)
 
 
-def settle_ligands(
+def resolve_ligands(
     atoms: Sequence[AtomRecord], ligands: Sequence[int], *, keep: bool, drop: bool, notes: list[str]
 ) -> bool:
     """Whether the ligands stay. Raises PreparationError when neither keeping nor dropping was asked for."""

@@ -15,7 +15,7 @@ import numpy as np
 from systems.chemistry.element_data import atomic_weight_da
 from systems.errors import InputError, PreparationError, first_line
 from systems.prepare.read.mmcif_file import read_blocks
-from systems.prepare.read.mol_file import settle_molecule
+from systems.prepare.read.mol_file import resolve_molecule
 from systems.prepare.read.smiles import main_molecule
 from systems.scene import Scene
 
@@ -198,12 +198,12 @@ def scene_from_component(text: str, path: Path) -> Scene:
         try:
             if main_molecule(molecule, []).GetNumAtoms() < molecule.GetNumAtoms():
                 raise PreparationError("it is a salt of several molecules; give one of them.")
-            settled = settle_molecule(molecule, notes)
+            resolved = resolve_molecule(molecule, notes)
         except PreparationError as error:
             raise PreparationError(f"{path}: {error}") from error
     name = (block.find_value("_chem_comp.id") or block.name or "component").strip("'\"")
     scene = scene_from_rdkit(
-        settled,
+        resolved,
         name=name,
         provenance={
             "source": "file",

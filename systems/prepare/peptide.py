@@ -11,7 +11,7 @@ import numpy.typing as npt
 from systems.chemistry.geometry import extend, signed_volumes, superposition, torsion
 from systems.chemistry.residues import ONE_LETTER, amino_acid_names, template_for
 from systems.errors import PreparationError, nearest
-from systems.prepare.protonation import protonation_account
+from systems.prepare.protonation import protonation_summary
 from systems.prepare.read.records import D_RESIDUES
 from systems.prepare.repair import fixed_random_numbers, records_from_openmm
 from systems.prepare.rotamers import residue_shape
@@ -99,12 +99,12 @@ def build_peptide(text: str, *, ph: float = 7.0) -> Scene:
     keys = [("A", str(k), name) for k, name in enumerate(names, start=1)]
     records, bonds = records_from_openmm(modeller.topology, relaxed_nm, keys)
     labels = [f"{name} {number}" for _, number, name in keys]
-    account = protonation_account(labels, keys, variants, records, ph)
+    summary = protonation_summary(labels, keys, variants, records, ph)
     scene = scene_from_records(
         records,
         bonds,
         name="-".join(names),
-        provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": account},
+        provenance={"source": "sequence", "sequence": "-".join(names), "ph": ph, "repairs": summary},
     )
     _verify(scene)
     return scene

@@ -145,7 +145,7 @@ def variant_of(residue: Residue, atoms: Sequence[AtomRecord], neighbours: Sequen
     return template.name if not residue.lacks_hydrogens else None
 
 
-def protonation_account(
+def protonation_summary(
     labels: Sequence[str],
     keys: Sequence[tuple[str, str, str]],
     given: Sequence[Asked],

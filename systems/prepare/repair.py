@@ -16,9 +16,9 @@ import numpy.typing as npt
 from systems.chemistry.element_data import covalent_radius_nm
 from systems.chemistry.residues import template_for
 from systems.errors import PreparationError, first_line, listed
-from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_account
+from systems.prepare.protonation import TITRATED, asked_hydrogens, protonation_summary
 from systems.prepare.read.records import AtomRecord, Bonding, Residue
-from systems.prepare.rotamers import settle_side_chains
+from systems.prepare.rotamers import resolve_side_chains
 from systems.prepare.structure import atom_label
 
 _C_OXT_ANGSTROM = 1.25
@@ -30,7 +30,7 @@ _CHAIN_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789
 def complete(
     atoms: Sequence[AtomRecord], bonding: Bonding, *, ph: float
 ) -> tuple[list[AtomRecord], npt.NDArray[np.int64], list[str]]:
-    """Return atoms, bonds and an account of what was added to structures of residues that are all known by name.
+    """Return atoms, bonds and a summary of what was added to structures of residues that are all known by name.
 
     Heavy atoms of the file keep their positions; hydrogens of residues that had all of theirs keep them too, the others
     get new ones, in the protonation that the file shows or, where it shows none, the usual one at `ph`. Names become
@@ -70,14 +70,14 @@ def complete(
     names = {(r.key, a) for r in residues for a in r.heavy}
     records = _with_usual_lengths(records, bonds, names)
     records = _keep_hydrogens(records, bonds, atoms, bonding)
-    account = _account(residues, records, ph) + rebuilt
+    summary = _summary(residues, records, ph) + rebuilt
     replaced = _with_replaced_hydrogens(residues, records, atoms)
     if replaced:
-        account.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
-    account += protonation_account([r.label for r in residues], [r.key for r in residues], variants, records, ph)
+        summary.append(f"hydrogens of the file replaced on {listed(replaced)}: their atoms have others now")
+    summary += protonation_summary([r.label for r in residues], [r.key for r in residues], variants, records, ph)
     if [a.name for a in records if a.element != "H"] != [a.name for a in atoms if a.element != "H"]:
-        account.append("atoms stand in the standard order under their standard names")
-    return records, bonds, account
+        summary.append("atoms stand in the standard order under their standard names")
+    return records, bonds, summary
 
 
 def _forget_linked(fixer: Any, residues: Sequence[Residue]) -> None:
@@ -109,7 +109,7 @@ def _without_overlaps(fixer: Any, residues: Sequence[Residue]) -> list[str]:
     elements = [a.element.symbol for a in topology.atoms()]
     positions_nm = np.array(fixer.positions.value_in_unit(unit.nanometer), dtype=np.float64)
     sites = [{a.name: a.index for a in residue.atoms()} for residue in topology.residues()]
-    notes = settle_side_chains(
+    notes = resolve_side_chains(
         positions_nm,
         elements,
         [(a.index, b.index) for a, b in topology.bonds()],
@@ -343,7 +343,7 @@ def _distance(old: Sequence[int], new: Sequence[int], atoms: Sequence[AtomRecord
     return float(np.square(gaps).sum())
 
 
-def _account(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
+def _summary(residues: Sequence[Residue], records: Sequence[AtomRecord], ph: float) -> list[str]:
     notes = []
     for residue in residues:
         if residue.missing:

@@ -49,7 +49,7 @@ def _shape(name: str) -> dict[str, Vector]:
     return {a.name: np.array(a.position_angstrom) / 10.0 for a in read_structure(path).atoms if a.element != "H"}
 
 
-def settle_side_chains(
+def resolve_side_chains(
     positions_nm: Vector,
     elements: Sequence[str],
     bonds: Sequence[tuple[int, int]],

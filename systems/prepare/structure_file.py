@@ -33,8 +33,8 @@ from systems.prepare.heterogens import (
     complete_waters,
     ligand_atoms,
     refuse_bare_ligands,
-    settle_ligands,
-    settle_solvent,
+    resolve_ligands,
+    resolve_solvent,
 )
 from systems.prepare.read.mmcif_file import is_component
 from systems.prepare.read.mol2_file import read_peptide_mol2
@@ -75,7 +75,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
     found = made_whole(found)
     repairs = list(found.notes)
     kept = _choose_alternates(found, repairs)
-    kept, wet = settle_solvent(
+    kept, wet = resolve_solvent(
         found.atoms, kept, keep_water=options.keep_water, keep_ions=options.keep_ligand, notes=repairs
     )
     part = standardise([found.atoms[i] for i in kept], repairs)
@@ -91,7 +91,7 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
             bonding = find_bonds(structure.atoms, structure.conect, structure.chain_ends)
             ligands = ligand_atoms(structure.atoms, bonding)
     if ligands:
-        stays = settle_ligands(
+        stays = resolve_ligands(
             structure.atoms, ligands, keep=options.keep_ligand, drop=options.drop_ligand, notes=repairs
         )
         rest = structure.without(ligands)
@@ -115,8 +115,8 @@ def _prepare_file(path: Path, options: Preparation) -> Scene:
         _refuse_beyond_repair(bonding, atoms)
         from systems.prepare.repair import complete
 
-        atoms, bonds, account = complete(atoms, bonding, ph=options.ph)
-        repairs += account
+        atoms, bonds, summary = complete(atoms, bonding, ph=options.ph)
+        repairs += summary
         after = heavy_of_records(atoms)
         names = {r.key: r.template.name for r in bonding.residues if r.template is not None}
         hands = handedness((key, names[key], heavy) for key, heavy in after.items() if key in names)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import Checksums, Claim, frames_digest
+from systems.files.whole_file import Checksums, OutputLock, frames_digest
 from systems.scene import Scene
 from systems.trajectory.frame_store import Float32Array, Float64Array, FrameBlock, FrameStore
 
@@ -27,7 +27,7 @@ class TrajectoryWriter(ABC):
     scene: Scene
     n_frames: int
     last_time_ps: float | None
-    claim: Claim | None = None
+    lock: OutputLock | None = None
     _store: FrameStore
 
     @property
@@ -120,8 +120,8 @@ class TrajectoryWriter(ABC):
     def close(self) -> None:
         """Close the file; twice does no harm."""
         self._store.close()
-        if self.claim is not None:
-            self.claim.close()
+        if self.lock is not None:
+            self.lock.close()
 
     def __enter__(self) -> TrajectoryWriter:
         return self

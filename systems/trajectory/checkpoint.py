@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from systems.errors import InputError, StorageError, SurromdError, TrajectoryError
 from systems.files.schema import built
-from systems.files.whole_file import Claim, create_whole, packed, refuse_existing, storage_error, unpacked
+from systems.files.whole_file import OutputLock, create_whole, packed, refuse_existing, storage_error, unpacked
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter
 from systems.trajectory.codec import companions, open_trajectory, open_writer
@@ -107,7 +107,7 @@ def writer_at(out: Path, scene: Scene, record: dict[str, Any], header: dict[str,
     """
     n_frames = header["files"][k]["n_frames"]
     how: dict[str, Any] = {"append": True} if n_frames else {"overwrite": resumed or header["overwrite"]}
-    writer = open_writer(out, scene, record, columns=columns, run_id=header["run_id"], claimed=True, **how)
+    writer = open_writer(out, scene, record, columns=columns, run_id=header["run_id"], locked=True, **how)
     try:
         writer.truncate(n_frames)
         if writer.record["completed"]:
@@ -142,7 +142,7 @@ def _unsupported(out: Path, header: dict[str, Any], k: int, *, begun: bool) -> s
 
 
 @contextmanager
-def claimed_outputs(
+def locked_outputs(
     outs: Sequence[Path],
     *,
     may_exist: bool,
@@ -152,12 +152,13 @@ def claimed_outputs(
     """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
-    Raises what `Claim` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another file
+    Raises what `OutputLock` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another
+    file
     lies in the place of the checkpoint, StorageError for an OSError of the run's own.
     """
     with ExitStack() as stack:
         for out in outs:
-            stack.enter_context(Claim(out, patience_s=patience_s, stopped=stopped))
+            stack.enter_context(OutputLock(out, patience_s=patience_s, stopped=stopped))
         refuse_foreign(checkpoint_path(outs[0]))
         for out in outs:
             refuse_existing(out, may_exist)

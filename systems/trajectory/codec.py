@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.errors import InputError, TrajectoryError
-from systems.files.whole_file import Claim, journal_path
+from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import PARTICLE, Scene
 from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
 from systems.trajectory.frame_store import WEIGHTS, FrameBlock, FrameStore, open_hdf5
@@ -39,7 +39,7 @@ def open_writer(
     overwrite: bool = False,
     columns: Sequence[str] = (),
     run_id: str = "",
-    claimed: bool = False,
+    locked: bool = False,
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5`, `.dcd` or `.xtc`), or continue one with `append=True`.
 
@@ -72,7 +72,7 @@ def open_writer(
     from systems.trajectory.hdf5_file import Hdf5Writer
     from systems.trajectory.xtc_file import XtcWriter
 
-    claim = None if claimed else Claim(path)
+    lock = None if locked else OutputLock(path)
     how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
     try:
         writer: TrajectoryWriter
@@ -81,12 +81,12 @@ def open_writer(
         else:
             writer = Hdf5Writer(path, scene, record, columns=columns, **how)
     except BaseException:
-        if claim is not None:
-            claim.close()
+        if lock is not None:
+            lock.close()
         raise
-    if claim is not None:
-        writer.claim = claim
-        weakref.finalize(writer, claim.close)
+    if lock is not None:
+        writer.lock = lock
+        weakref.finalize(writer, lock.close)
     return writer
 
 
@@ -356,12 +356,13 @@ def _numbers(scene: Scene) -> list[int]:
 
 FloatArray = npt.NDArray[np.floating[Any]]
 
-# Scalar column of a rollout: U_truth - U_model in kJ/mol, NaN where the truth was not asked.
+# Scalar column of a rollout: U_truth - U_model in kJ/mol, NaN where the reference was not asked.
 DIFFERENCE_COLUMN = "energy_difference_kj_mol"
 
 
 def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
-    """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the truth, and how many
+    """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the reference, and how
+    many
     effective frames they leave (Kish: 1 / sum w^2).
 
     `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent

@@ -287,7 +287,7 @@ def test_compare_writes_its_three_reports(here: Path, tmp_path_factory: pytest.T
         assert (here / name).read_bytes() == before
         for away in here.glob("*.away"):
             away.rename(here / away.stem)
-    rows = {row["key"]: row for row in json.loads((here / "report.json").read_text())["judgements"][0]["rows"]}
+    rows = {row["key"]: row for row in json.loads((here / "report.json").read_text())["evaluations"][0]["rows"]}
     # Stiff bonds at rest: below what the run itself recorded, by less than half of kT for each degree of freedom.
     with open_trajectory(made / "x_r0.h5") as reader:
         recorded = float(reader.scalars["potential_kj_mol"].mean())

@@ -123,7 +123,7 @@ def test_commands_are_found_at_all(repository: Path) -> None:
 
 def test_a_command_that_does_not_exist_would_be_noticed(repository: Path, tmp_path: Path) -> None:
     text = """
-Prose: surromd makes trajectories. `surromd simulate ala.pdb` and `python docs/studies/judge/nothing.py REF`.
+Prose: surromd makes trajectories. `surromd simulate ala.pdb` and `python docs/studies/comparison/nothing.py REF`.
 
 ```bash
 surromd rollout ala2.pdb --wieghts alanine-dipeptide

@@ -44,8 +44,8 @@ def files(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> list[P
 def test_scripts_can_fail_on_a_verdict(
     monkeypatch: pytest.MonkeyPatch, status: str, fail_on: str | None, code: int
 ) -> None:
-    judged = SimpleNamespace(judgements=[SimpleNamespace(status="close"), SimpleNamespace(status=status)], notes=())
-    monkeypatch.setattr(api, "compare", lambda *args, **kwargs: judged)
+    evaluated = SimpleNamespace(evaluations=[SimpleNamespace(status="close"), SimpleNamespace(status=status)], notes=())
+    monkeypatch.setattr(api, "compare", lambda *args, **kwargs: evaluated)
     extra = [] if fail_on is None else ["--fail-on", fail_on]
     assert RUNNER.invoke(app, ["compare", "a.h5", "b.h5", "c.h5", "--quiet", *extra]).exit_code == code
 
@@ -59,14 +59,14 @@ def test_each_file_has_its_topology_and_time(
 ) -> None:
     top = shared_data / "alanine-dipeptide" / "ala2.pdb"
     found = compare(files[0], [files[1]], replicate=files[2], top=[top, None, top], dt_ps=["2ps", "2ps", 2.0])
-    assert found.lag_ps == 2.0 and found.judgements[0].n_frames == 300
-    assert found.reference.top == str(top) and found.judgements[0].account.top is None
+    assert found.lag_ps == 2.0 and found.evaluations[0].n_frames == 300
+    assert found.reference.top == str(top) and found.evaluations[0].summary.top is None
     with pytest.raises(InputError, match="2 values of top for 3 trajectories"):
         compare(files[0], [files[1]], replicate=files[2], top=[top, top], dt_ps=1.0)
     # Through the command: '-' where a file needs none.
     seen: dict[str, object] = {}
     monkeypatch.setattr(
-        api, "compare", lambda *args, **kwargs: seen.update(kwargs) or SimpleNamespace(judgements=[], notes=())
+        api, "compare", lambda *args, **kwargs: seen.update(kwargs) or SimpleNamespace(evaluations=[], notes=())
     )
     arguments = ["compare", "a.xtc", "b.h5", "--top", "a.pdb", "--top", "-", "--dt", "1ps", "--dt", "-", "--quiet"]
     assert RUNNER.invoke(app, arguments).exit_code == 0

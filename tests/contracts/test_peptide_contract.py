@@ -12,7 +12,7 @@ from torch import Tensor
 from surrogate.models.conformance import PropagatorContract
 from surrogate.models.peptides.layout import PeptideConfig, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide
-from surrogate.models.peptides.torsion_states import MOST_TORSIONS, told_states
+from surrogate.models.peptides.torsion_states import MOST_TORSIONS, conditioning_states
 from surrogate.models.propagator import Molecule, Propagator
 from systems.errors import InputError
 from systems.prepare.peptide import build_peptide
@@ -104,19 +104,19 @@ def test_time_and_neighbours_and_chain_order_reach_the_flow() -> None:
     times = torch.arange(1.0, 6.0).expand(2, -1)
     tau = torch.full((2,), 0.5)
     states = torch.zeros(2, 6, 4, MOST_TORSIONS, dtype=torch.long)
-    told, other_states = (told_states(x, chain.stated.counts) for x in (states, 1 - states))
+    conditioning, other_states = (conditioning_states(x, chain.stated.counts) for x in (states, 1 - states))
 
-    def found(o: Tensor, *told: Tensor) -> Tensor:
-        return model.flow(o, tau, model.flow.told(*told))
+    def found(o: Tensor, *conditioning: Tensor) -> Tensor:
+        return model.flow(o, tau, model.flow.conditioning(*conditioning))
 
-    base = found(o, known, times, chain.places, told)
+    base = found(o, known, times, chain.places, conditioning)
     swapped = chain.places.clone()
     swapped[1, 2] = swapped[2, 2]
     for other in (
-        found(o, known, 7 * times, chain.places, told),
-        found(o, known, times, swapped, told),
+        found(o, known, 7 * times, chain.places, conditioning),
+        found(o, known, times, swapped, conditioning),
         found(o, known, times, chain.places, other_states),
-        found(o.flip(2), known.flip(1), times, chain.places.flip(0), told).flip(2),
+        found(o.flip(2), known.flip(1), times, chain.places.flip(0), conditioning).flip(2),
     ):
         assert float((other - base).abs().max()) > 1e-3
 

@@ -1,4 +1,4 @@
-"""A report that only counts; the judge takes seconds, and is tested elsewhere."""
+"""A report that only counts; the comparison takes seconds, and is tested elsewhere."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from surrogate.verbs.run.stages import REPORT_NAME, Site
 from systems.trajectory.checkpoint import frames_in
 
 
-def judged_at_once(site: Site, record: RunRecord) -> RunRecord:
+def evaluated_at_once(site: Site, record: RunRecord) -> RunRecord:
     held_ps, rolled_ps = (
         float(sum(frames_in(site.folder / file) for file in files)) for files in (record.held_out, record.trajectory)
     )
-    (site.folder / REPORT_NAME).write_text("judged")
+    (site.folder / REPORT_NAME).write_text("evaluated")
     return replace(record, outcome=Outcome("head", "close", "verdict", held_ps, rolled_ps))

@@ -101,7 +101,7 @@ class Rolled:
             self.frames, self.flags, self.record = reader.read(), reader.flags, dict(reader.record)
             self.marks, self.times = reader.scalars["intervention"], reader.time_ps
             self.scalars, self.scene = dict(reader.scalars), reader.scene
-        self.account: dict[str, Any] = self.record["interventions"]
+        self.summary: dict[str, Any] = self.record["interventions"]
 
 
 def roll(out: Path, scene: Scene, weights: Weights, guard: str, n_chunks: int = 4, **settings: Any) -> Rolled:

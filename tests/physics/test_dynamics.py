@@ -15,8 +15,8 @@ from md_reference.run.config import Conditions
 from md_reference.run.engine import Engine
 from md_reference.run.replicas import simulate_replicas
 from md_reference.run.simulate import MDConfig, simulate
-from surrogate.judge.measure.kinetics import zero_crossing
-from surrogate.judge.measure.statistics import effective_samples
+from surrogate.comparison.measure.kinetics import zero_crossing
+from surrogate.comparison.measure.statistics import effective_samples
 from systems.library.named_scenes import load
 from systems.scene import FloatArray, Scene
 from systems.trajectory.codec import open_trajectory

@@ -274,7 +274,7 @@ def test_contradictions_are_refused() -> None:
     assert solvate_if_asked(scene, ForceFieldSpec()) is scene
 
 
-def test_auto_settles_by_what_templates_cover() -> None:
+def test_auto_resolves_by_what_templates_cover() -> None:
     auto = ForceFieldSpec("auto", "auto")
     assert resolve(load("alanine-dipeptide"), auto) == ForceFieldSpec("ff14SB", "obc2")
     assert resolve(load("aspirin"), auto) == ForceFieldSpec("gaff2", "vacuum")

@@ -26,7 +26,7 @@ def copies(scene: Scene, n: int) -> Scene:
     return particles("copies", law, np.repeat(scene.positions_nm, n, axis=0), masses_da=np.full(n, scene.masses_da[0]))
 
 
-def sampled(scene: Scene, temperature_k: float, *, n_frames: int, every_ps: float, settle_ps: float) -> FloatArray:
+def sampled(scene: Scene, temperature_k: float, *, n_frames: int, every_ps: float, discarded_ps: float) -> FloatArray:
     """Positions `(n_frames, n_copies, 3)` nm in the bath; each particle is an independent run."""
     timestep_ps = 0.02
     with Engine(
@@ -34,7 +34,7 @@ def sampled(scene: Scene, temperature_k: float, *, n_frames: int, every_ps: floa
         Conditions(force=MODEL, temperature_k=temperature_k, timestep_ps=timestep_ps, seed=5, platform="Reference"),
     ) as engine:
         engine.thermalise()
-        engine.step(round(settle_ps / timestep_ps))
+        engine.step(round(discarded_ps / timestep_ps))
         frames = np.empty((n_frames, N_COPIES, 3))
         for k in range(n_frames):
             engine.step(round(every_ps / timestep_ps))
@@ -53,7 +53,7 @@ def agrees(per_particle: FloatArray, expected: Any) -> Any:
 
 def test_the_harmonic_variance_is_kt_over_k_along_each_axis() -> None:
     scene = harmonic_oscillator()
-    x = sampled(scene, 300.0, n_frames=40, every_ps=0.5, settle_ps=10.0)
+    x = sampled(scene, 300.0, n_frames=40, every_ps=0.5, discarded_ps=10.0)
     squares = (x**2).mean(axis=0)  # (n_copies, 3)
     expected = harmonic_answers(scene, 300.0)["variance_nm2"]
     np.testing.assert_allclose(expected, 8.314462618e-3 * 300.0 / np.array([50.0, 100.0, 200.0]), rtol=1e-9)
@@ -96,7 +96,7 @@ def test_the_harmonic_oscillator_has_the_frequency_root_k_over_m() -> None:
 
 @cache
 def left_share(temperature_k: float) -> FloatArray:
-    x = sampled(double_well(), temperature_k, n_frames=40, every_ps=1.0, settle_ps=40.0)
+    x = sampled(double_well(), temperature_k, n_frames=40, every_ps=1.0, discarded_ps=40.0)
     return (x[..., 0] < 0).mean(axis=0)
 
 

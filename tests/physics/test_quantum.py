@@ -15,7 +15,7 @@ import pytest
 from md_reference.forces.forcefield import resolve
 from md_reference.forces.quantum import KJ_MOL_PER_HARTREE, NM_PER_BOHR, Potential, build_quantum_system
 from md_reference.forces.spec import ForceFieldSpec, at_level
-from md_reference.run.config import Conditions, settle
+from md_reference.run.config import Conditions, resolve_settings
 from md_reference.run.engine import Engine
 from md_reference.run.frame_relaxation import Relaxer
 from systems.errors import InputError, PreparationError, UnknownNameError
@@ -154,12 +154,12 @@ def test_level_and_settings_go_together() -> None:
         ({"constrain_hydrogens": False}, (0.0005, None, False)),
         ({"timestep_ps": 0.002, "constrain_hydrogens": False}, (0.002, 3.0, False)),
     ):
-        settings, _ = settle(scene, {"force_field": "gfn2-xtb", **given})
+        settings, _ = resolve_settings(scene, {"force_field": "gfn2-xtb", **given})
         assert tuple(settings[name] for name in names) == expected, given
-    by_protocol, _ = settle(scene, {"force_field": "gfn2-xtb"}, "md17")
+    by_protocol, _ = resolve_settings(scene, {"force_field": "gfn2-xtb"}, "md17")
     assert tuple(by_protocol[name] for name in names) == (0.0005, None, False), "of the paper"
     with pytest.raises(InputError, match="4fs"):
-        settle(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.005})
+        resolve_settings(scene, {"force_field": "gfn2-xtb", "timestep_ps": 0.005})
 
 
 ZWITTERION = "[NH3+]CC(=O)[O-]"

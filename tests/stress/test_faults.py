@@ -44,12 +44,12 @@ def everything(path: Path) -> dict[str, Any]:
     """All that a finished file holds, but for times of day and seconds spent."""
     with open_trajectory(path) as reader:
         assert reader.flags is not None and reader.chunk_idx is not None
-        account = {key: value for key, value in reader.record["interventions"].items() if key != "seconds"}
+        summary = {key: value for key, value in reader.record["interventions"].items() if key != "seconds"}
         return {
             "frames": reader.read().tobytes(),
             "columns": [reader.time_ps.tobytes(), reader.flags.tobytes(), reader.chunk_idx.tobytes()],
             "scalars": {name: values.tobytes() for name, values in reader.scalars.items()},
-            "account": account,
+            "summary": summary,
             "completed": reader.record["completed"],
         }
 

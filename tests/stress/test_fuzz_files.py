@@ -179,7 +179,7 @@ KINDS = ("a.h5", "a.dcd", "a.meta.h5", "a.pdb", "weights", "rollout checkpoint",
          "simulation checkpoint")  # fmt: skip
 
 
-def outcome(path: Path, read: Callable[[Path], Any], truth: Any) -> str:
+def outcome(path: Path, read: Callable[[Path], Any], reference: Any) -> str:
     """Return 'same' or 'refused'; raise AssertionError for anything else."""
     try:
         with time_limit(SECONDS_A_FILE):
@@ -187,23 +187,23 @@ def outcome(path: Path, read: Callable[[Path], Any], truth: Any) -> str:
     except SurromdError as error:
         assert str(error).strip() and "\n" not in str(error), f"not one line: {error!r}"
         return "refused"
-    if found == truth:
+    if found == reference:
         return "same"
-    changed = [key for key in truth if found[key] != truth[key]] if isinstance(truth, dict) else found
+    changed = [key for key in reference if found[key] != reference[key]] if isinstance(reference, dict) else found
     raise AssertionError(f"read, but altered: {changed}")
 
 
 def fuzz(kind: str, seeds: range, folder: Path, scene: Scene, weights: Weights) -> tuple[Counter[str], list[str]]:
     """Return how often each outcome came, and every fault with the seed that makes it again."""
     path, read = prepare(kind, folder, scene, weights)
-    whole, truth = path.read_bytes(), read(path)
+    whole, reference = path.read_bytes(), read(path)
     counts: Counter[str] = Counter()
     faults = []
     for seed in seeds:
         what, data = mutated(whole, seed)
         path.write_bytes(data)
         try:
-            counts[outcome(path, read, truth)] += 1
+            counts[outcome(path, read, reference)] += 1
         except Exception as error:  # whatever else is raised is the finding
             counts["fault"] += 1
             faults.append(f"{kind}, seed {seed} ({what}): {type(error).__name__}: {error}")
@@ -212,12 +212,12 @@ def fuzz(kind: str, seeds: range, folder: Path, scene: Scene, weights: Weights) 
 
 def test_an_alteration_is_noticed(tmp_path: Path, alanine_dipeptide: Scene, small_weights: Weights) -> None:
     path, read = prepare("rollout checkpoint", tmp_path, alanine_dipeptide, small_weights)
-    truth = read(path)
-    assert outcome(path, read, truth) == "same"
+    reference = read(path)
+    assert outcome(path, read, reference) == "same"
     with pytest.raises(AssertionError, match="altered: \\['steps'\\]"):
-        outcome(path, read, truth | {"steps": "64"})
+        outcome(path, read, reference | {"steps": "64"})
     path.write_bytes(b"")
-    assert outcome(path, read, truth) == "refused"
+    assert outcome(path, read, reference) == "refused"
 
 
 @pytest.mark.parametrize("kind", KINDS)

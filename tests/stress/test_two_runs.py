@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from systems.errors import TrajectoryError
-from systems.files.whole_file import Claim
+from systems.files.whole_file import OutputLock
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory, open_writer
 
@@ -38,18 +38,18 @@ def outcome(out: Path, repository: Path, *more: str) -> str:
     return "exact" if fine else f"lost: {ended}"
 
 
-def test_a_claim_is_held_against_everybody(tmp_path: Path, alanine_dipeptide: Scene) -> None:
+def test_a_lock_is_held_against_everybody(tmp_path: Path, alanine_dipeptide: Scene) -> None:
     out = tmp_path / "a.h5"
-    with Claim(out):
+    with OutputLock(out):
         with pytest.raises(TrajectoryError, match="being written by another process"):
-            Claim(tmp_path / "." / "a.h5")
+            OutputLock(tmp_path / "." / "a.h5")
         with pytest.raises(TrajectoryError, match="being written by another process"):
             open_writer(out, alanine_dipeptide, {}, overwrite=True)
-        Claim(tmp_path / "b.h5").close()
+        OutputLock(tmp_path / "b.h5").close()
     (tmp_path / "link.h5").symlink_to(out)
     with open_writer(out, alanine_dipeptide, {}), pytest.raises(TrajectoryError, match="another process"):
-        Claim(tmp_path / "link.h5")
-    Claim(out).close()
+        OutputLock(tmp_path / "link.h5")
+    OutputLock(out).close()
     assert not list(tmp_path.glob(".*"))
 
 
@@ -57,7 +57,7 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("mine")
     (tmp_path / ".a.h5.lock").symlink_to(tmp_path / "precious")
     with pytest.raises(Exception, match="Cannot write"):
-        Claim(tmp_path / "a.h5")
+        OutputLock(tmp_path / "a.h5")
     assert (tmp_path / "precious").read_text() == "mine"
 
 

@@ -1,4 +1,4 @@
-"""The made-up trajectories of the judge's benchmark are what they say, and the benchmark measures what it runs."""
+"""The made-up trajectories of the comparison's benchmark are what they say, and the benchmark measures what it runs."""
 
 from __future__ import annotations
 
@@ -56,4 +56,4 @@ def test_a_run_is_timed_and_profiled(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").is_file()
     assert timing.frames == 400 and timing.atoms == 22
     assert timing.cpu_s > 0 and 0.05 < timing.memory_gb < 4.0
-    assert any("surrogate/judge/comparison.py:compare" in line for line in profile_lines(tmp_path / "profile"))
+    assert any("surrogate/comparison/comparison.py:compare" in line for line in profile_lines(tmp_path / "profile"))

@@ -41,20 +41,20 @@ def test_equal_runs_are_nearer_than_hotter_ones(ethanol: Scene) -> None:
 
 def test_replicas_count_until_a_bond_is_half_an_angstrom_off(ethanol: Scene) -> None:
     md = [shaken(ethanol, 400, 0.002, seed) for seed in (1, 2)]
-    truth = study.Truth.__new__(study.Truth)
-    truth.geometry = geometry_from_frames(ethanol, np.concatenate(md))
-    truth.densities = [study.distance_density([run]) for run in md]
+    reference = study.ReferenceForces.__new__(study.ReferenceForces)
+    reference.geometry = geometry_from_frames(ethanol, np.concatenate(md))
+    reference.densities = [study.distance_density([run]) for run in md]
     whole, lost = shaken(ethanol, 100, 0.002, 3), shaken(ethanol, 100, 0.002, 4)
     bond = ethanol.bonds[0]
     along = ethanol.positions_nm[bond[1]] - ethanol.positions_nm[bond[0]]
     lost[40, bond[1]] += 0.06 * along / np.linalg.norm(along)  # and the frames behind it are fine again
-    words, far = truth.judge([whole, lost], 0.1)
+    words, far = reference.compare([whole, lost], 0.1)
     assert words == "7 of 10 ps, 1 of 2 lost"
     assert all(float(value) < 0.25 for value in far.split(" and "))
     lost[40, bond[1]] -= 0.02 * along / np.linalg.norm(along)
-    assert truth.judge([whole, lost], 0.1)[0] == "10 of 10 ps, 0 of 2 lost"
+    assert reference.compare([whole, lost], 0.1)[0] == "10 of 10 ps, 0 of 2 lost"
     lost[:, 0] = np.nan
-    assert truth.judge([lost], 0.1) == ["0 of 10 ps, 1 of 1 lost", "no frames"]
+    assert reference.compare([lost], 0.1) == ["0 of 10 ps, 1 of 1 lost", "no frames"]
 
 
 def test_forces_are_compared_in_kcal_per_mol_and_angstrom() -> None:

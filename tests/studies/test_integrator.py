@@ -1,4 +1,4 @@
-"""The judge of integrators, held against an exact one and against one that heats what it integrates."""
+"""The comparison of integrators, held against an exact one and against one that heats what it integrates."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from integrator import IntegratorReport, angles, bonds, judge_integrator
+from integrator import IntegratorReport, angles, bonds, compare_integrator
 from torch import Tensor
 
 from surrogate.data.frames import TrainingFrames, quantise
@@ -57,18 +57,18 @@ def energy(x: np.ndarray) -> float:
     return float(0.5 * STIFFNESS * np.square(x - rest).sum())
 
 
-def judged(scene: Scene, **settings: Any) -> IntegratorReport:
+def evaluated(scene: Scene, **settings: Any) -> IntegratorReport:
     rng = np.random.default_rng(0)
     kt = 2.494
     x = scene.positions_nm + rng.normal(size=(400, 3, 3)) * np.sqrt(kt / STIFFNESS)
     v = rng.normal(size=(400, 3, 3)) * np.sqrt(kt / MASSES)[:, None]
     frames = TrainingFrames(scene, quantise(x), np.array([0, 400]), LAG_PS, False, {}, (), v.astype(np.float32))
     model = ExactSprings(scene, **settings)
-    return judge_integrator(model, frames, energy, nve=model, starts=24, chunks=20)
+    return compare_integrator(model, frames, energy, nve=model, starts=24, chunks=20)
 
 
 def test_an_exact_integrator_does_not_drift_and_samples_what_it_should(springs: Scene) -> None:
-    report = judged(springs)
+    report = evaluated(springs)
     assert abs(report.drift) < 1e-3
     assert report.spread < 1e-3
     assert report.finite == 1.0
@@ -79,11 +79,11 @@ def test_an_exact_integrator_does_not_drift_and_samples_what_it_should(springs: 
 
 
 def test_one_that_heats_is_seen_to_drift(springs: Scene) -> None:
-    report = judged(springs, heating=1.05)
+    report = evaluated(springs, heating=1.05)
     assert report.drift > 10 * report.drift_error
     assert report.bond_ratio > 1.25
     assert report.potential > 1.5 * report.reference_potential
-    lost = judged(springs, heating=float("nan"))
+    lost = evaluated(springs, heating=float("nan"))
     assert lost.finite == 0.0
     assert np.isnan(lost.drift) and np.isnan(lost.bond_ratio)
 

@@ -49,19 +49,19 @@ def charges() -> ParticleSet:
 
 
 def test_errors_equal_those_computed_by_hand() -> None:
-    truth = np.zeros((2, 2, 2, 3))
+    reference = np.zeros((2, 2, 2, 3))
     predicted = np.zeros((2, 2, 2, 2, 3))
     predicted[0, 0, 0, 0] = [3.0, 4.0, 0.0]  # sample 0, trajectory 0, frame 0, particle 0: off by 5
     predicted[1, 0, 1, 1] = [0.0, 0.0, 2.0]  # sample 1, trajectory 0, last frame, particle 1: off by 2
     predicted[:, 1] += [1.0, 2.0, 2.0]  # trajectory 1: off by 3 everywhere
-    ade, fde = forecast_errors(predicted, truth)
+    ade, fde = forecast_errors(predicted, reference)
     np.testing.assert_allclose(ade, [(5.0 + 2.0) / 8, 3.0], rtol=1e-14)
     np.testing.assert_allclose(fde, [2.0 / 4, 3.0], rtol=1e-14)
     # Negative controls: neither the best sample nor the root mean square nor the sum of coordinates gives these.
-    distance = np.linalg.norm(predicted - truth, axis=-1)
+    distance = np.linalg.norm(predicted - reference, axis=-1)
     assert not np.allclose(distance.mean((2, 3)).min(0), ade)
     assert not np.allclose(np.sqrt((distance**2).mean((0, 2, 3))), ade)
-    assert not np.allclose(np.abs(predicted - truth).sum(-1).mean((0, 2, 3)), ade)
+    assert not np.allclose(np.abs(predicted - reference).sum(-1).mean((0, 2, 3)), ade)
 
 
 # ---- the generator -------------------------------------------------------------------------------------------------
@@ -165,10 +165,10 @@ def test_sets_are_made_once_go_on_and_share_nothing(tmp_path: Path) -> None:
 def test_extrapolation_is_exact_for_its_polynomial_and_not_beyond() -> None:
     t = 0.1 * np.arange(30)
     cubic = np.stack([1 - t + t**3, 2 * t**2, 0.5 - t**3], axis=-1)[None, :, None, :]
-    given, truth = cubic[:, :N_GIVEN], cubic[:, N_GIVEN:]
+    given, reference = cubic[:, :N_GIVEN], cubic[:, N_GIVEN:]
     for n_points in (4, 7):
-        np.testing.assert_allclose(extrapolate(given, polynomial_weights(3, n_points)), truth, rtol=0, atol=1e-10)
-    assert np.abs(extrapolate(given, polynomial_weights(2, 4)) - truth).max() > 1.0
+        np.testing.assert_allclose(extrapolate(given, polynomial_weights(3, n_points)), reference, rtol=0, atol=1e-10)
+    assert np.abs(extrapolate(given, polynomial_weights(2, 4)) - reference).max() > 1.0
     np.testing.assert_allclose(extrapolate(given, polynomial_weights(1, 2))[:, 0], 2 * given[:, -1] - given[:, -2])
     with pytest.raises(ValueError, match="degree 4"):
         polynomial_weights(4, 4)
@@ -202,16 +202,16 @@ def test_pair_forces_are_the_true_law_when_given_it_and_keep_momentum(charges: P
     with torch.no_grad():
         model.constant[0, 3], model.constant[1, 3] = -1.0, 1.0  # Coulomb: 1/r^2, unlike charges attract
     _, _, x, v, _, pairs = _turned(charges)
-    given, truth = x[:, :N_GIVEN], x[:, N_GIVEN:]
+    given, reference = x[:, :N_GIVEN], x[:, N_GIVEN:]
     forecast = model.forecast(given, pairs, 20)
-    errors = (forecast - truth).norm(dim=-1).mean((1, 2))
+    errors = (forecast - reference).norm(dim=-1).mean((1, 2))
     assert errors.median() < 5e-3
     velocity = model.last_velocity(x[:, 4:10], pairs)
     assert (velocity - v[:, 9]).norm(dim=-1).median() < 5e-3
     torch.testing.assert_close(model.forces(x[:, 0], pairs).sum(1), torch.zeros(len(x), 3).double(), atol=1e-9, rtol=0)
     with torch.no_grad():
         model.constant.neg_()  # negative control: the wrong sign
-    wrong = (model.forecast(given, pairs, 20) - truth).norm(dim=-1).mean((1, 2))
+    wrong = (model.forecast(given, pairs, 20) - reference).norm(dim=-1).mean((1, 2))
     assert wrong.median() > 0.3
 
 
@@ -290,21 +290,21 @@ def _split(m: MoleculeWindows, split: str = "test") -> tuple[np.ndarray, np.ndar
 
 def test_the_linear_forecast_is_exact_for_vibrations_and_not_for_anharmonic_ones() -> None:
     m = vibrating()
-    given, truth = _split(m)
+    given, reference = _split(m)
     fitted = LinearForecast.fit(m)
-    error = forecast_errors(fitted.forecast(m, given)[None], truth)[0].mean()
+    error = forecast_errors(fitted.forecast(m, given)[None], reference)[0].mean()
     assert error < 2e-5  # nm; the atom that vibrates moves by 0.01
     rotation = Rotation.random(random_state=2).as_matrix()
     np.testing.assert_allclose(
         fitted.forecast(m, given @ rotation.T), fitted.forecast(m, given) @ rotation.T, atol=1e-8
     )
     bent = vibrating(anharmonic=0.5)
-    given, truth = _split(bent)
-    assert forecast_errors(LinearForecast.fit(bent).forecast(bent, given)[None], truth)[0].mean() > error
+    given, reference = _split(bent)
+    assert forecast_errors(LinearForecast.fit(bent).forecast(bent, given)[None], reference)[0].mean() > error
     # Negative control: fitted to one molecule's motion it does not know another's.
     other = vibrating(seed=5)
     shuffled = replace(other, frames_nm=np.random.default_rng(0).permutation(other.frames_nm))
-    assert forecast_errors(LinearForecast.fit(shuffled).forecast(m, given)[None], truth)[0].mean() > 100 * error
+    assert forecast_errors(LinearForecast.fit(shuffled).forecast(m, given)[None], reference)[0].mean() > 100 * error
 
 
 # ---- the whole way -------------------------------------------------------------------------------------------------
@@ -345,7 +345,7 @@ def test_md17_goes_the_whole_way_to_the_table(tmp_path: Path) -> None:
         )
 
     result = run(settings)
-    assert [a.method for a in result.accounts] == list(MOLECULE_METHODS)
+    assert [a.method for a in result.summaries] == list(MOLECULE_METHODS)
     lines = md17.table_lines(result)
     assert any("LaM-SLidE, published" in line and "0.087" in line and "0.167" in line for line in lines)
     by_name = {row.method: row for row in result.rows if row.molecule == "ethanol"}

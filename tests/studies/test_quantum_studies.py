@@ -10,16 +10,16 @@ from typing import Any
 
 import corrected_md
 import energy_conservation
-import gain
 import numpy as np
 import pytest
 import rivals
+import speed_up
 import torch
 import torsion_profiles
 import torsion_states
 
+from surrogate.comparison.equivalent_time import EquivalentTime
 from surrogate.data.shipped import weights_path
-from surrogate.judge.worth import Worth
 from surrogate.models.painet.potential.trainer import Samples
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import Weights, load_weights, save_weights
@@ -52,7 +52,7 @@ def test_profiles_tell_right_weights_from_shaken_ones(shipped: Weights, tmp_path
 def test_fluctuations_of_energy_go_with_the_square_of_the_step(
     shipped: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(energy_conservation, "SETTLE_PS", 0.5)
+    monkeypatch.setattr(energy_conservation, "DISCARDED_PS", 0.5)
     model, scene = shipped.model, shipped.domain.scene
     model.config = replace(model.config, timestep_ps=0.0005, hydrogen_mass_da=None)
     run = energy_conservation.Run(model.eval().requires_grad_(False), scene.positions_nm, Molecule.of(scene))
@@ -65,7 +65,7 @@ def test_fluctuations_of_energy_go_with_the_square_of_the_step(
     assert run.energies(0.0005, 0.2, 0.005).std(0).mean() > 5 * widths[0]
 
 
-def test_a_corrected_chain_follows_the_truth_whatever_moves_it() -> None:
+def test_a_corrected_chain_follows_the_reference_whatever_moves_it() -> None:
     masses = torch.tensor([[12.0], [16.0]], dtype=torch.float64)
     true, wrong = 4_000.0, 6_000.0  # kJ/mol/nm^2 of a spring of no length between two atoms
 
@@ -154,12 +154,13 @@ def test_chains_start_all_over() -> None:
     assert np.ptp(bonds, axis=0).max() < 1e-6 and len({round(float(x), 6) for x in found[:, 17, 2]}) == 12
 
 
-def test_gain_is_worth_over_what_the_time_buys() -> None:
-    worth = Worth("rotors", "distribution", "rotors", 4_000.0, 1_000.0, None, "at least", 0.1, (1e3, 4e3), (2.0, 1.0),
-                  (), ())  # fmt: skip
-    assert gain.gain_words(worth, 800.0) == "at least 5 [1.2, ...]"
-    assert gain.gain_words(replace(worth, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
-    assert gain.gain_words(replace(worth, low_ps=None), 800.0) == "at least 5"
+def test_speed_up_is_equivalent_time_over_what_the_time_buys() -> None:
+    equivalent_time = EquivalentTime(
+        "rotors", "distribution", "rotors", 4_000.0, 1_000.0, None, "at least", 0.1, (1e3, 4e3), (2.0, 1.0), (), ()
+    )
+    assert speed_up.speed_up_words(equivalent_time, 800.0) == "at least 5 [1.2, ...]"
+    assert speed_up.speed_up_words(replace(equivalent_time, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
+    assert speed_up.speed_up_words(replace(equivalent_time, low_ps=None), 800.0) == "at least 5"
 
 
 def test_chains_that_forget_slowly_are_less_md() -> None:
@@ -168,10 +169,10 @@ def test_chains_that_forget_slowly_are_less_md() -> None:
             key=key, reference=SimpleNamespace(value=chains), candidate=SimpleNamespace(value=rollout)
         )
 
-    judged: Any = SimpleNamespace(rows=[row(0.8, 0.4), row(0.8, 0.6), row(8.0, 0.1, "torsion"), row(1.0, 3.0)])
-    assert gain.pace(judged) == pytest.approx(0.5)
-    judged.rows = [row(0.4, 0.8)]
-    assert gain.pace(judged) == 1.0
+    evaluated: Any = SimpleNamespace(rows=[row(0.8, 0.4), row(0.8, 0.6), row(8.0, 0.1, "torsion"), row(1.0, 3.0)])
+    assert speed_up.pace(evaluated) == pytest.approx(0.5)
+    evaluated.rows = [row(0.4, 0.8)]
+    assert speed_up.pace(evaluated) == 1.0
 
 
 def test_states_of_a_torsion_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The account of what a frame costs names every part, and adds them up."""
+"""The summary of what a frame costs names every part, and adds them up."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class WalkTrainer(Trainer):
     def settings(self, request: TrainingRequest) -> Settings:
         asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
         return Settings(
-            WalkConfig.from_dict(request.model), request.settings(WalkTraining, asked), settled=frozenset(asked)
+            WalkConfig.from_dict(request.model), request.settings(WalkTraining, asked), resolved=frozenset(asked)
         )
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:

@@ -57,7 +57,7 @@ def circles(*packages: str) -> list[list[str]]:
 
 def test_no_name_stands_twice_in_a_package(repository: Path, tmp_path: Path) -> None:
     assert not repeated_names(repository)
-    for room in ("surrogate/data", "surrogate/judge"):
+    for room in ("surrogate/data", "surrogate/comparison"):
         (tmp_path / room).mkdir(parents=True)
         (tmp_path / room / "frames.py").touch()
         (tmp_path / room / "config.py").touch()

@@ -17,7 +17,15 @@ from typer.testing import CliRunner
 from surrogate.cli.flags import as_flags
 from surrogate.cli.parameters import with_options
 from systems.errors import InputError, UnitError, UnknownNameError
-from systems.options import MissingOptionError, check_options, gather, option, option_rows, options_of, takes
+from systems.options import (
+    MissingOptionError,
+    check_options,
+    gather,
+    option,
+    option_rows,
+    options_as_keywords,
+    options_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +49,7 @@ class Settings(Timing):
 SEEN: list[Any] = []
 
 
-@takes(Settings)
+@options_as_keywords(Settings)
 def verb(scene: str, options: Settings) -> Settings:
     """Do something."""
     return options

@@ -57,7 +57,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
     MDAnalysis with the same coordinates. `energy_spread`: in NVE, the standard deviation of the total energy over the
     mean kinetic one.
     """
-    from md_reference.run.config import settle, to_config
+    from md_reference.run.config import resolve_settings, to_config
     from md_reference.run.simulate import simulate
     from systems.chemistry.validity import INVALID, check_frames, geometry_from_scene
     from systems.library import named_scenes
@@ -66,7 +66,7 @@ def run_scene(name: str, folder: Path, *, time_ps: float = 10.0) -> Outcome:
     began = time.perf_counter()
     try:
         scene = named_scenes.load(name)
-        settings, _ = settle(scene, {}, next(iter(named_scenes.protocols(name)), None))
+        settings, _ = resolve_settings(scene, {}, next(iter(named_scenes.protocols(name)), None))
         settings |= {
             "time_ps": time_ps,
             "equilibrate_ps": min(settings["equilibrate_ps"], 10.0 / settings["friction_per_ps"]),

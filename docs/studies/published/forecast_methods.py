@@ -114,7 +114,7 @@ class Fitted(Generic[Subject]):
 
 
 @dataclass(frozen=True)
-class MethodAccount:
+class MethodSummary:
     """What a method cost, and what is to be said of it."""
 
     method: str
@@ -127,7 +127,7 @@ class MethodAccount:
 
 def measured(
     method: str, fit: Callable[[], Fitted[Subject]], tests: Sequence[tuple[Subject, Array]]
-) -> tuple[MethodAccount, list[tuple[Array, Array]]]:
+) -> tuple[MethodSummary, list[tuple[Array, Array]]]:
     """Fit a method; return what it cost, and ADE and FDE (n,) of each of `tests`: a subject and its windows
     `(n, n_given + n_new, n_atoms, 3)` nm."""
     cpu = time.process_time()
@@ -138,9 +138,9 @@ def measured(
         for subject, windows in tests
     ]
     took = time.perf_counter() - began
-    account = MethodAccount(method, fitted.note, fitted.n_parameters, round(fitted.seconds, 1), round(cpu, 1),
+    summary = MethodSummary(method, fitted.note, fitted.n_parameters, round(fitted.seconds, 1), round(cpu, 1),
                             round(took, 2))  # fmt: skip
-    return account, errors
+    return summary, errors
 
 
 def check_known(**asked: tuple[Sequence[str], Mapping[str, object] | Sequence[str]]) -> None:

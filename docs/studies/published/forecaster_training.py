@@ -95,17 +95,18 @@ PAPER_STEPS = 94_000
 
 @dataclass(frozen=True, eq=False)
 class Jump:
-    """States `x`, `v` (b, n, 3) of systems of one size, `types` (b, n), `pairs` (b, n, n), and positions `truth` of a
+    """States `x`, `v` (b, n, 3) of systems of one size, `types` (b, n), `pairs` (b, n, n), and positions `reference`
+    of a
     later frame, or of all `(b, n_new, n, 3)`."""
 
     x: Tensor
     v: Tensor
     types: Tensor
     pairs: Tensor
-    truth: Tensor
+    reference: Tensor
 
     def to(self, device: torch.device) -> Jump:
-        return Jump(*(t.to(device) for t in (self.x, self.v, self.types, self.pairs, self.truth)))
+        return Jump(*(t.to(device) for t in (self.x, self.v, self.types, self.pairs, self.reference)))
 
 
 # Batch, frame to come -> states; batch -> windows (b, n_frames, n, 3) and types (b, n).
@@ -143,7 +144,7 @@ def train_egnn(model: EgnnJump, draw: DrawJump, held: Sequence[Jump], training: 
     generator = torch.Generator().manual_seed(training.seed)
     for frame in range(model.config.n_new):
         jump, time_ps = draw(512, frame, generator), (frame + 1) * model.config.lag_ps
-        change = jump.truth - jump.x - (time_ps * jump.v if model.config.from_velocity else 0.0)
+        change = jump.reference - jump.x - (time_ps * jump.v if model.config.from_velocity else 0.0)
         model.reach[frame] = change.square().sum(-1).mean().sqrt()
     model.to(device)
     held = [jump.to(device) for jump in held]
@@ -151,12 +152,12 @@ def train_egnn(model: EgnnJump, draw: DrawJump, held: Sequence[Jump], training: 
     def loss_fn(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         frame = int(torch.randint(model.config.n_new, (1,), generator=generator))
         jump = draw(stage.batch, frame, generator).to(device)
-        error = mean_distance(model(jump.x, jump.v, jump.types, jump.pairs, frame), jump.truth)
+        error = mean_distance(model(jump.x, jump.v, jump.types, jump.pairs, frame), jump.reference)
         return error / model.reach[frame], {"distance": error.detach()}
 
     @torch.no_grad()
     def validate() -> dict[str, float]:
-        errors = [mean_distance(model.all_frames(j.x, j.v, j.types, j.pairs), j.truth) for j in held]
+        errors = [mean_distance(model.all_frames(j.x, j.v, j.types, j.pairs), j.reference) for j in held]
         return {"validation_ade": float(torch.stack(errors).mean())}
 
     return run_training(model, stage, loss_fn, validate, training)

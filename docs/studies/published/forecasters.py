@@ -134,10 +134,10 @@ def compare_errors(
     windows = StateWindows(unseen, config, torch.device("cpu"))
     starts = thinned(windows.starts, windows_at_most)
     blocks = np.minimum(starts // windows.span, max(0, unseen.n_frames // windows.span - 1))
-    (x, v), (truth, _) = windows.state(starts), windows.future(starts)
+    (x, v), (reference, _) = windows.state(starts), windows.future(starts)
     times = whole.lag_ps * config.frame_stride * torch.arange(1, config.n_new + 1)[None, :, None, None]
     guesses = (x[:, None], x[:, None] + times * v[:, None])
-    frozen, moving = (100.0 * float((guess - truth).square().mean()) for guess in guesses)
+    frozen, moving = (100.0 * float((guess - reference).square().mean()) for guess in guesses)
     return Errors(
         scene=whole.scene.name,
         windows=len(starts),

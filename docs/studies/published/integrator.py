@@ -53,7 +53,7 @@ class IntegratorReport:
     reference_potential: float
 
 
-def judge_integrator(model: Propagator, frames: TrainingFrames, energy: EnergyFn, *, nve: Propagator, starts: int,
+def compare_integrator(model: Propagator, frames: TrainingFrames, energy: EnergyFn, *, nve: Propagator, starts: int,
                      chunks: int, seed: int = 0) -> IntegratorReport:  # fmt: skip
     """Roll `chunks` chunks from `starts` evenly spaced frames of `frames` (with velocities), with and without the bath
     (`model`, `nve`), and compare."""
@@ -91,8 +91,8 @@ def judge_integrator(model: Propagator, frames: TrainingFrames, energy: EnergyFn
     )
 
 
-def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: int, seed: int = 0) -> IntegratorReport:
-    """`judge_integrator` of a weights file of PAINET, with OpenMM's energies of its force field, bonds flexible.
+def compare_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: int, seed: int = 0) -> IntegratorReport:
+    """`compare_integrator` of a weights file of PAINET, with OpenMM's energies of its force field, bonds flexible.
 
     Raises InputError for weights that carry no velocities.
     """
@@ -109,7 +109,9 @@ def judge_weights(path: Path, frames: TrainingFrames, *, starts: int, chunks: in
     nve.load_state_dict(weights.model.state_dict())
     strided = replace(frames, lag_ps=frames.lag_ps * weights.model.config.frame_stride)
     with Engine(frames.scene, Conditions(force=spec, platform="Reference", timestep_ps=0.0005)) as engine:
-        return judge_integrator(weights.model, strided, engine.energy, nve=nve, starts=starts, chunks=chunks, seed=seed)
+        return compare_integrator(
+            weights.model, strided, engine.energy, nve=nve, starts=starts, chunks=chunks, seed=seed
+        )
 
 
 @torch.inference_mode()
@@ -176,7 +178,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     _, frames = cut(collect_frames([args.reference], canonical=False, velocities=True), args.share)
-    report = judge_weights(args.weights, frames, starts=args.starts, chunks=args.chunks, seed=args.seed)
+    report = compare_weights(args.weights, frames, starts=args.starts, chunks=args.chunks, seed=args.seed)
     for key, value in asdict(report).items():
         sys.stdout.write(f"{key:20} {value:.5g}\n")
     if args.json is not None:

@@ -21,7 +21,7 @@ from forecast_methods import (
     N_NEW,
     N_SAMPLES,
     Array,
-    MethodAccount,
+    MethodSummary,
     Settings,
     check_known,
     measured,
@@ -63,7 +63,7 @@ class MoleculeReproduction:
     """All rows, by method and molecule, and what each method cost; `time_ps` of trajectory of each molecule."""
 
     rows: tuple[MoleculeRow, ...]
-    accounts: tuple[MethodAccount, ...]
+    summaries: tuple[MethodSummary, ...]
     time_ps: float
     budget_s: float | None
     seed: int
@@ -79,7 +79,7 @@ class MoleculeReproduction:
             "samples": N_SAMPLES,
             "published": PUBLISHED_MD17,
             "rows": [row.to_dict() for row in self.rows],
-            "methods": [vars(account) for account in self.accounts],
+            "methods": [vars(summary) for summary in self.summaries],
         }
 
 
@@ -97,7 +97,7 @@ def reproduce_molecules(
     windows: dict[str, int] | None = None,
     md17_ethanol: Path | None = None,
     progress: ProgressFn | None = None,
-    report: Callable[[MethodAccount], None] | None = None,
+    report: Callable[[MethodSummary], None] | None = None,
 ) -> MoleculeReproduction:
     """Make the trajectories in `settings.folder`, fit each method to all molecules, forecast each; what is there stays.
 
@@ -111,14 +111,14 @@ def reproduce_molecules(
     tested = [*learned, *([read_md17_ethanol(md17_ethanol, span)] if md17_ethanol and "ethanol" in molecules else [])]
     tests = [(m, m.windows(m.starts["test"])) for m in tested]
     rows: list[MoleculeRow] = []
-    accounts: list[MethodAccount] = []
+    summaries: list[MethodSummary] = []
     for method in dict.fromkeys(methods):
-        account, errors = measured(method, partial(METHODS[method], learned, settings), tests)
+        summary, errors = measured(method, partial(METHODS[method], learned, settings), tests)
         rows += [_row(method, m, *found) for m, found in zip(tested, errors, strict=True)]
-        accounts.append(account)
+        summaries.append(summary)
         if report is not None:
-            report(accounts[-1])
-    result = MoleculeReproduction(tuple(rows), tuple(accounts), time_ps, settings.budget_s, settings.seed)
+            report(summaries[-1])
+    result = MoleculeReproduction(tuple(rows), tuple(summaries), time_ps, settings.budget_s, settings.seed)
     create_whole(settings.folder / f"{NAME}.json", json.dumps(result.to_dict(), indent=1))
     return result
 
@@ -147,12 +147,12 @@ def table_lines(result: MoleculeReproduction) -> list[str]:
         published = PUBLISHED_MD17.get(molecule.removesuffix(" (MD17)"), {})
         lines += [f"  {method + ', published':<30}{ade:>9.3f} {fde:>28.3f}" for method, (ade, fde) in published.items()]
         lines += [f"  {row.method:<30}{row.ade!s:>27} {row.fde!s:>27}" for row in ours]
-    return [*lines, "methods", *(account_line(account) for account in result.accounts)]
+    return [*lines, "methods", *(summary_line(summary) for summary in result.summaries)]
 
 
-def account_line(account: MethodAccount) -> str:
+def summary_line(summary: MethodSummary) -> str:
     """Return one line about a method."""
     cost = (
-        f"{account.n_parameters:,} parameters, {account.training_s:.0f} s of training; " if account.n_parameters else ""
+        f"{summary.n_parameters:,} parameters, {summary.training_s:.0f} s of training; " if summary.n_parameters else ""
     )
-    return f"  {account.method:<18}{cost}forecasts {account.forecast_s:.1f} s; {account.note}"
+    return f"  {summary.method:<18}{cost}forecasts {summary.forecast_s:.1f} s; {summary.note}"

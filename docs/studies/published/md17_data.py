@@ -38,14 +38,14 @@ def make_trajectories(
     files stay and interrupted ones go on. Raises InputError for files of other settings.
     """
     from md_reference.forces.forcefield import resolve
-    from md_reference.run.config import settle, to_config
+    from md_reference.run.config import resolve_settings, to_config
     from md_reference.run.simulate import simulate
 
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.h5" for name in names}
     for k, (name, path) in enumerate(paths.items()):
         scene = named_scenes.load(name)
-        settings, _ = settle(scene, {"ensemble": "nve"}, "md17")
+        settings, _ = resolve_settings(scene, {"ensemble": "nve"}, "md17")
         config = to_config(settings | {"time_ps": time_ps}, seed=seed)
         config = replace(config, force=resolve(scene, config.force), save_velocities=True)
 

@@ -77,12 +77,12 @@ def egnn(molecules: Sequence[MoleculeWindows], settings: Settings) -> Fitted[Mol
         EgnnJumpConfig(n_types=len(ELEMENTS), n_new=N_NEW, lag_ps=molecules[0].lag_ps, from_velocity=False)
     )
 
-    def jump(m: MoleculeWindows, given: Array, truth: Array) -> Jump:
+    def jump(m: MoleculeWindows, given: Array, reference: Array) -> Jump:
         last = given[:, -1]
         centre = last.mean(axis=1, keepdims=True)
         # Lengths in units of a bond's: 0.1 nm.
         x, v = 10.0 * (last - centre), 10.0 * (last - given[:, -2]) / m.lag_ps
-        ahead = 10.0 * (truth - (centre if truth.ndim == 3 else centre[:, None]))
+        ahead = 10.0 * (reference - (centre if reference.ndim == 3 else centre[:, None]))
         types = torch.tensor([ELEMENTS.index(e) for e in m.elements.tolist()]).expand(len(given), -1)
         kinds = torch.from_numpy(m.kinds).expand(len(given), -1, -1)
         state = [torch.from_numpy(a).float() for a in (x, v, ahead)]

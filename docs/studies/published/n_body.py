@@ -14,7 +14,7 @@ from forecast_methods import (
     N_GIVEN,
     N_SAMPLES,
     Array,
-    MethodAccount,
+    MethodSummary,
     Settings,
     check_known,
     measured,
@@ -45,16 +45,16 @@ class Row:
     fde: Estimate
     median_ade: float
     over_egnn: Estimate | None
-    account: MethodAccount
+    summary: MethodSummary
 
     @property
     def method(self) -> str:
-        return self.account.method
+        return self.summary.method
 
     def to_dict(self) -> dict[str, Any]:
         errors = {"ade": self.ade.to_dict(), "fde": self.fde.to_dict(), "median_ade": self.median_ade}
         over = None if self.over_egnn is None else self.over_egnn.to_dict()
-        return {**errors, "over_egnn": over, **vars(self.account)}
+        return {**errors, "over_egnn": over, **vars(self.summary)}
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,10 @@ def reproduce(
     # EGNN first: the others' rows are given relative to it.
     for method in sorted(dict.fromkeys(methods), key=lambda m: m != _OUR_ANCHOR):
         fit = partial(METHODS[method], train, validation, settings)
-        account, [(ade, fde)] = measured(method, fit, [(test, test.positions_nm)])
+        summary, [(ade, fde)] = measured(method, fit, [(test, test.positions_nm)])
         anchor = ade if method == _OUR_ANCHOR else anchor
         over = None if anchor is None else ratio(ade, anchor)
-        rows.append(Row(estimate(ade), estimate(fde), float(np.median(ade)), over, account))
+        rows.append(Row(estimate(ade), estimate(fde), float(np.median(ade)), over, summary))
         if report is not None:
             report(rows[-1])
     result = Reproduction(name, tuple(rows), dict(sizes), settings.budget_s, settings.seed)
@@ -145,6 +145,6 @@ def table_lines(result: Reproduction) -> list[str]:
 def row_line(row: Row) -> str:
     """Return one of our rows, as it stands in the table."""
     over = "" if row.over_egnn is None else str(row.over_egnn)
-    cost = f"{row.account.training_s:.0f} s" if row.account.n_parameters else "-"
+    cost = f"{row.summary.training_s:.0f} s" if row.summary.n_parameters else "-"
     figures = f"{row.ade!s:>22} {row.fde!s:>24} {row.median_ade:>#8.3g} {over:>20} {cost:>9}"
-    return f"  {row.method:<20}{figures}  {row.account.note}"
+    return f"  {row.method:<20}{figures}  {row.summary.note}"

@@ -65,7 +65,7 @@ class Change:
     what one through the frames before leaves of each. `velocities`: told those of the next frame, which nobody knows.
     `noised`: noise on what is given in training, in units of its size. `mean_only`: a plain regression, flow time 0 and
     no noise. `n_train`: so few trajectories, not turned, to be learned by heart. `batch`, `steps`: fewer where a step
-    is dear."""
+    is expensive."""
 
     name: str
     code: dict[str, Any] = field(default_factory=dict)
@@ -160,7 +160,7 @@ def run(change: Change, train: ParticleSet, held: ParticleSet, folder: Path, ste
         errors.update(mean_ade=mean[0], sample_ade=sample[0], sample_fde=sample[1])
         return errors
 
-    every_s = 100.0 if change.steps is None else 600.0  # where a step is dear, so are forecasts
+    every_s = 100.0 if change.steps is None else 600.0  # where a step is expensive, so are forecasts
     stage = StageConfig(
         "flow", change.batch, 2e-3, None, steps, warmup_steps=50, ema_decay=0.99, validate_every_s=every_s
     )

@@ -36,12 +36,12 @@ _BLOCK = 250
 
 def best_polynomial(data: ParticleSet) -> tuple[int, int, Array]:
     """Return the degree, the points and the weights with the least ADE on a set."""
-    given, truth = data.positions_nm[:, :N_GIVEN], data.positions_nm[:, N_GIVEN:]
+    given, reference = data.positions_nm[:, :N_GIVEN], data.positions_nm[:, N_GIVEN:]
     tried = []
     for n_points in range(1, N_GIVEN + 1):
         for degree in range(n_points):
             weights = polynomial_weights(degree, n_points)
-            ade = forecast_errors(extrapolate(given, weights)[None], truth)[0].mean()
+            ade = forecast_errors(extrapolate(given, weights)[None], reference)[0].mean()
             tried.append((float(ade), degree, n_points, weights))
     _, degree, n_points, weights = min(tried, key=lambda entry: entry[0])
     return degree, n_points, weights

@@ -60,7 +60,7 @@ def run(chosen: argparse.Namespace) -> list[str]:
                 time_ps=parse_time_ps(chosen.time, "--time"),
                 windows={split: asked[split] or n for split, n in md17.WINDOWS.items()},
                 md17_ethanol=chosen.md17_ethanol,
-                report=lambda account: _say(chosen, md17.account_line(account)),
+                report=lambda summary: _say(chosen, md17.summary_line(summary)),
                 **how,
             )
             return md17.table_lines(found)

@@ -6,7 +6,7 @@
 Generalised hybrid Monte Carlo (Horowitz, Phys. Lett. B 268, 247 (1991)): velocities are refreshed as friction of 1/ps
 does it, RATTLE moves a molecule by the potential for 0.6 ps (3 fs, hydrogens of 3 Da, their bonds rigid), GFN2-xTB's
 energy of both ends decides; what is refused turns back. Frames follow GFN2-xTB's Boltzmann law at 300 K whatever the
-potential is: a wrong one is refused more often. A ns costs a twentieth of MD by GFN2-xTB or less, so that truths of
+potential is: a wrong one is refused more often. A ns costs a twentieth of MD by GFN2-xTB or less, so that references of
 tens of ns can be had. Replicas start with torsions turned at random and settle for 0.25 ns. What is there goes on.
 With `--turn` half a turn about the middle bond of four atoms is offered after each piece, too: such chains know the
 sides of a torsion that seldom turns, and have no times of their own.
@@ -36,7 +36,7 @@ from systems.trajectory.codec import open_trajectory, open_writer
 from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
 TEMPERATURE_K, FRICTION_PER_PS, TIMESTEP_PS, PIECE_PS = 300.0, 1.0, 0.003, 0.6
-SAVE_PS, SETTLE_PS = 0.6, 250.0
+SAVE_PS, DISCARDED_PS = 0.6, 250.0
 # Frames of a replica that are written at once.
 TOGETHER = 50
 _OUT_OF_REACH = 1e9
@@ -112,11 +112,11 @@ class Chain:
 
 def energies_of(scene: Scene) -> Energies:
     """Return what asks GFN2-xTB; where it finds no ground state nothing is accepted."""
-    truth = Potential(scene)
+    reference = Potential(scene)
 
     def energy(at: FloatArray) -> float:
         try:
-            return truth(at)[0]
+            return reference(at)[0]
         except PreparationError:
             return _OUT_OF_REACH
 
@@ -186,7 +186,7 @@ def main() -> None:
         chain = chain_of(weights, np.stack(lasts), given.seed + 1_000, given.turn)
     else:
         chain = chain_of(weights, starts(scene, given.replicas, given.seed), given.seed, given.turn)
-        for _ in range(round(SETTLE_PS / PIECE_PS)):
+        for _ in range(round(DISCARDED_PS / PIECE_PS)):
             chain.step()
         sys.stdout.write(f"{chain.free()} of {given.replicas} replicas never left their start and begin elsewhere\n")
     record = {"made_by": "docs/studies/quantum/corrected_md.py", "lag_ps": SAVE_PS, "temperature_k": TEMPERATURE_K}

@@ -29,7 +29,7 @@ from surrogate.models.weights import load_weights
 from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K, parse_time_ps
 
-REPLICAS, TEMPERATURE_K, SETTLE_PS, SHORT = 16, 300.0, 2.0, 50
+REPLICAS, TEMPERATURE_K, DISCARDED_PS, SHORT = 16, 300.0, 2.0, 50
 # Between energies of short runs, and of the long one.
 OFTEN_PS, SELDOM_PS = 0.005, 0.1
 
@@ -43,7 +43,7 @@ class Run:
         self.thermal = (GAS_CONSTANT_KJ_MOL_K * TEMPERATURE_K / self.masses).sqrt()
         self.generator = torch.Generator().manual_seed(0)
         x = torch.tensor(scene_nm).repeat(REPLICAS, 1, 1)
-        draw = torch.randn(*x.shape[:2], round(SETTLE_PS / 0.0005), 3, generator=self.generator, dtype=x.dtype)
+        draw = torch.randn(*x.shape[:2], round(DISCARDED_PS / 0.0005), 3, generator=self.generator, dtype=x.dtype)
         v = self.thermal * torch.randn(x.shape, generator=self.generator, dtype=x.dtype)
         self.start = model.langevin(x, v, molecule, self.masses, self.thermal, draw, timestep_ps=0.0005)
 

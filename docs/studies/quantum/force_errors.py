@@ -17,7 +17,7 @@ import torch
 from four_molecules import force_error, frames_of
 
 import surrogate as sm
-from md_reference.run.teacher import Teacher
+from md_reference.run.labeller import Labeller
 from surrogate.data.shipped import weights_path
 from surrogate.models.propagator import Molecule
 from surrogate.models.weights import load_weights
@@ -32,13 +32,13 @@ def main() -> None:
         weights = load_weights(weights_path(name))
         scene, model = weights.domain.scene, weights.model.eval()
         molecule = Molecule.of(scene)
-        with tempfile.TemporaryDirectory() as folder, Teacher(scene) as truth:
+        with tempfile.TemporaryDirectory() as folder, Labeller(scene) as ref:
             (md,) = sm.reference(scene, Path(folder) / "md.h5", time_ps=20.0, save_every_ps=0.1, equilibrate_ps=2.0,
                                  level="gfn2-xtb", seed=SEED, quiet=True)  # fmt: skip
             sets = {"GFN2-xTB, 300 K": frames_of(md)}
-            sets |= {f"GAFF2, {t:g} K": truth.motion(80, 1.0, t, seed=SEED) for t in (300.0, 500.0, 700.0)}
+            sets |= {f"GAFF2, {t:g} K": ref.motion(80, 1.0, t, seed=SEED) for t in (300.0, 500.0, 700.0)}
             for what, states in sets.items():
-                asked = truth.label(states)
+                asked = ref.label(states)
                 told = model.evaluate(torch.tensor(asked.positions_nm), molecule)
                 error = force_error(told.forces_kj_mol_nm.numpy(), asked.forces_kj_mol_nm)
                 off = (told.energy_kj_mol.numpy() - asked.energies_kj_mol).std()

@@ -1,4 +1,4 @@
-"""Potentials of four molecules at 500 K, truth GFN2-xTB, after 'Forces are not enough' (Fu et al., TMLR 2023).
+"""Potentials of four molecules at 500 K, reference GFN2-xTB, after 'Forces are not enough' (Fu et al., TMLR 2023).
 
     python docs/studies/quantum/four_molecules.py FOLDER [--molecules ethanol,uracil] [--budget 20min]
         [-o docs/results/tables/four_molecules.json]
@@ -71,12 +71,12 @@ def until_lost(run: FloatArray, lost: FloatArray) -> FloatArray:
     return run[: int(np.argmax(lost))] if lost.any() else run
 
 
-def force_error(answer: FloatArray, truth: FloatArray) -> float:
+def force_error(answer: FloatArray, ref: FloatArray) -> float:
     """Return the mean absolute difference of forces in kJ/mol/nm as kcal/mol/Å."""
-    return float(np.abs(answer - truth).mean()) / KJ_MOL_NM
+    return float(np.abs(answer - ref).mean()) / KJ_MOL_NM
 
 
-class Truth:
+class ReferenceForces:
     """Two MD runs of a scene by GFN2-xTB, what it says of states of them, and what it costs."""
 
     def __init__(self, scene: Scene, folder: Path, md_ps: float) -> None:
@@ -100,7 +100,7 @@ class Truth:
         """How far one run's h(r) is from the other's."""
         return density_error(*self.densities)
 
-    def judge(self, runs: list[FloatArray], save_ps: float) -> list[str]:
+    def compare(self, runs: list[FloatArray], save_ps: float) -> list[str]:
         """Return of replicas: how long they are stable, how many are lost, how far their h(r) is from each MD run's."""
         kept = [until_lost(run, check_frames(run, self.geometry) & HALF_ANGSTROM_RULE != 0) for run in runs]
         stable_ps = np.array([len(run) for run in kept]) * save_ps
@@ -117,7 +117,7 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
     """Make what a molecule lacks and return its line of the table."""
     scene = scene_from_smiles(MOLECULES[name])
     folder.mkdir(parents=True, exist_ok=True)
-    truth = Truth(scene, folder, md_ps)
+    ref = ReferenceForces(scene, folder, md_ps)
     file, spent_s = folder / "painet.safetensors", folder / "rollout_s"
     if not file.is_file():
         sm.train(f"smiles:{MOLECULES[name]}", file, arch="painet", level="gfn2-xtb", budget_s=budget_s, resume=True,
@@ -125,7 +125,7 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
     outs = [folder / f"roll_r{k}.h5" for k in range(REPLICAS)]
     if not spent_s.is_file():
         began = time.process_time()
-        with suppress(SimulationError):  # one flew apart: what all of them did until then is judged
+        with suppress(SimulationError):  # one flew apart: what all of them did until then is evaluated
             sm.rollout(scene, file, folder / "roll.h5", time_ps=time_ps, save_every_ps=SAVE_PS, replicas=REPLICAS,
                        temperature_k=TEMPERATURE_K, timestep_ps=TIMESTEP_PS, hydrogen_mass_da=1.008, guard="off",
                        seed=ROLL_SEED, overwrite=True, quiet=True)  # fmt: skip
@@ -133,20 +133,20 @@ def potential_row(name: str, folder: Path, budget_s: float, md_ps: float, time_p
     weights = load_weights(file)
     model, trained_s = weights.model, float(weights.provenance["training_s"])
     n_states = len(Samples.load(samples_path(file), scene.topology_hash))
-    answer = model.evaluate(torch.tensor(truth.states), Molecule.of(scene)).forces_kj_mol_nm.numpy()
+    answer = model.evaluate(torch.tensor(ref.states), Molecule.of(scene)).forces_kj_mol_nm.numpy()
     runs = [frames_of(out) for out in outs]
     forces_a_s = sum(map(len, runs)) * SAVE_PS / TIMESTEP_PS / float(spent_s.read_text())
-    stable, far = truth.judge(runs, SAVE_PS)
-    error = force_error(answer, truth.forces)
+    stable, far = ref.compare(runs, SAVE_PS)
+    error = force_error(answer, ref.forces)
     return [
         f"{name}, {scene.n_atoms}",
         f"{n_states:,} in {format_wall(trained_s)}",
         f"{error:.2f}",
         stable,
         far,
-        f"{truth.replicate:.3f} ({format_time_ps(md_ps)})",
+        f"{ref.replicate:.3f} ({format_time_ps(md_ps)})",
         f"{forces_a_s:,.0f}",
-        f"{truth.forces_a_s:,.0f}",
+        f"{ref.forces_a_s:,.0f}",
     ]
 
 

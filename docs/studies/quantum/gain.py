@@ -1,15 +1,16 @@
 """What a potential's rollout is worth by long sampling at GFN2-xTB's own law, over the MD that its time buys.
 
-    python docs/studies/quantum/gain.py WEIGHTS FOLDER --truth 'CHAINS_r[0-7].h5'
+    python docs/studies/quantum/gain.py WEIGHTS FOLDER --reference 'CHAINS_r[0-7].h5'
         --replicate 'CHAINS_r[89].h5,CHAINS_r1?.h5' [--time 510ps] [--replicas 32]
-        [-o docs/results/tables/potential_gain.json]
+        [-o docs/results/tables/potential_speed_up.json]
 
-Truth and replicate are chains of `corrected_md.py`; worth ends at the length of one of them. FOLDER gets the rollout,
+Reference and replicate are chains of `corrected_md.py`; worth ends at the length of one of them. FOLDER gets the
+rollout,
 annealed first, and as much MD by GFN2-xTB, a process a core, as tells its speed: nothing else should run. What is there
 is not made again. Chains that turn back now and then forget more slowly than MD does: a length of theirs is as much
 less MD as their torsions take longer to relax than those of the rollout, which moves as MD does. Gain: worth in MD over
 the MD that all cores make in the wall time of training (with its answers of GFN2-xTB) and of the part of the rollout
-that comes so near, with the 95 % interval of the worth.
+that comes so near, with the 95 % interval of the equivalent MD time.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from corrected_md import SAVE_PS
 
 import surrogate as sm
 from md_reference.run.machine import machine_name
+from surrogate.comparison.comparison import Evaluation
+from surrogate.comparison.equivalent_time import EquivalentTime
 from surrogate.data.shipped import weights_path
-from surrogate.judge.comparison import Judgement
-from surrogate.judge.worth import Worth
 from surrogate.models.weights import load_weights
 from systems.scene import Scene
 from systems.trajectory.codec import open_trajectory
@@ -49,31 +50,33 @@ def md_ps_per_s(scene: Scene, folder: Path) -> float:
     return cores * MD_PS / max(walls)
 
 
-def gain_words(worth: Worth, bought_ps: float) -> str:
-    """Return a worth over the length that its cost buys, with the interval: 'at least 5.7 [1.9, ...]'."""
-    ends = [None if end is None else f"{end / bought_ps:.2g}" for end in (worth.low_ps, worth.high_ps)]
-    said = f"{worth.bound} {worth.worth_ps / bought_ps:.2g}".strip()
+def speed_up_words(equivalent_time: EquivalentTime, bought_ps: float) -> str:
+    """Return an equivalent MD time over the length that its cost buys, with the interval: 'at least 5.7 [1.9, ...]'."""
+    ends = [
+        None if end is None else f"{end / bought_ps:.2g}" for end in (equivalent_time.low_ps, equivalent_time.high_ps)
+    ]
+    said = f"{equivalent_time.bound} {equivalent_time.equivalent_ps / bought_ps:.2g}".strip()
     if ends == [None, None]:
         return said
     return f"{said} [{ends[0] or '...'}, {ends[1] or '...'}]"
 
 
-def pace(judged: Judgement) -> float:
+def pace(evaluated: Evaluation) -> float:
     """Return how much MD a length of the chains is: the least ratio of relaxation times, and never more than 1."""
-    rows = [row for row in judged.rows if row.key.startswith("correlation_time:") and row.reference is not None]
+    rows = [row for row in evaluated.rows if row.key.startswith("correlation_time:") and row.reference is not None]
     return min([1.0, *(row.candidate.value / row.reference.value for row in rows if row.reference is not None)])
 
 
-def differing(judged: Judgement) -> list[str]:
+def differing(evaluated: Evaluation) -> list[str]:
     """Return the metrics by which a rollout differs from the chains, but for those of time."""
-    return [row.metric for row in judged.rows if row.verdict == "differs" and row.group != "kinetics"]
+    return [row.metric for row in evaluated.rows if row.verdict == "differs" and row.group != "kinetics"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--truth", required=True)
+    parser.add_argument("--reference", required=True)
     parser.add_argument("--replicate", required=True)
     parser.add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=510.0)
     parser.add_argument("--replicas", type=int, default=32)
@@ -88,32 +91,37 @@ def main() -> None:
     )  # fmt: skip
     speed = md_ps_per_s(scene, given.folder)
     report = given.folder / "report.html"
-    comparison = sm.compare(given.truth, [rolled], report, replicate=given.replicate, overwrite=True)
-    judged = comparison.judgements[0]
-    training_s, rolled_ps = float(weights.provenance["training_s"]), judged.account.total_ps
-    rolling_s = judged.account.wall_s or 0.0
+    comparison = sm.compare(given.ref, [rolled], report, replicate=given.replicate, overwrite=True)
+    evaluated = comparison.evaluations[0]
+    training_s, rolled_ps = float(weights.provenance["training_s"]), evaluated.summary.total_ps
+    rolling_s = evaluated.summary.wall_s or 0.0
     rows = [
         ["trained for", format_wall(training_s)],
         ["rolled", f"{format_time_ps(rolled_ps, 2)} in {format_wall(rolling_s)}"],
         ["MD by GFN2-xTB on all cores", f"{format_time_ps(3600.0 * speed, 3)} an hour"],
         ["a rollout's speed over that", f"{rolled_ps / rolling_s / speed:.0f}"],
-        ["a ns of chains is so much MD", f"{pace(judged):.2f} ns"],
-        ["differs from the chains in", ", ".join(differing(judged)) or "nothing but its pace"],
+        ["a ns of chains is so much MD", f"{pace(evaluated):.2f} ns"],
+        ["differs from the chains in", ", ".join(differing(evaluated)) or "nothing but its pace"],
     ]
-    for worth in (w for w in judged.worth if w.kind == "distribution"):  # chains have no times of their own
-        bought_ps = speed * (training_s + worth.share * rolling_s)
+    for equivalent_time in (
+        w for w in evaluated.equivalent_time if w.kind == "distribution"
+    ):  # chains have no times of their own
+        bought_ps = speed * (training_s + equivalent_time.share * rolling_s)
         rows += [
-            [f"worth by {worth.measure}, of chains", f"{worth.in_words()} by {worth.share:.2g} of it"],
+            [
+                f"equivalent MD time by {equivalent_time.measure}, of chains",
+                f"{equivalent_time.in_words()} by {equivalent_time.share:.2g} of it",
+            ],
             ["MD in as much time", format_time_ps(bought_ps, 2)],
-            ["gain", gain_words(worth, bought_ps / pace(judged))],
+            ["speed_up", speed_up_words(equivalent_time, bought_ps / pace(evaluated))],
         ]
     for row in rows:
         sys.stdout.write(" | ".join(row) + "\n")
     if given.out is not None:
         table = {
-            "command": f"python docs/studies/quantum/gain.py {given.weights} FOLDER --truth ... --replicate ...",
+            "command": f"python docs/studies/quantum/gain.py {given.weights} FOLDER --reference ... --replicate ...",
             "machine": machine_name(),
-            "note": f"{given.replicas} replicas of {format_time_ps(given.time)}; truth and replicate "
+            "note": f"{given.replicas} replicas of {format_time_ps(given.time)}; reference and replicate "
                     f"{format_time_ps(comparison.reference.total_ps, 2)} each of corrected_md.py.",
             "columns": ["of the potential", ""],
             "rows": rows,

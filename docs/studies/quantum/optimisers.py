@@ -34,8 +34,8 @@ def learned(scene: Any, samples: Path, budget_s: float, seed: int, matrix_rate: 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "new.safetensors"
         shutil.copy(samples, samples_path(out))
-        truth: Any = SimpleNamespace(scene=scene)  # asked nothing: there are more samples than `most`
-        learner = Learner(model, truth, config, out, resume=True)
+        reference: Any = SimpleNamespace(scene=scene)  # asked nothing: there are more samples than `most`
+        learner = Learner(model, reference, config, out, resume=True)
         stage = StageConfig("potential", config.batch, config.learning_rate, budget_s, matrix_rate=matrix_rate,
                             seed=seed, bf16=False, validate_every_s=1e9)  # fmt: skip
         learner.begin(budget_s)

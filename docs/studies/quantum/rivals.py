@@ -1,4 +1,4 @@
-"""EGNN and MACE as potentials, on what `four_molecules.py` had PAINET learn, trained, rolled and judged alike.
+"""EGNN and MACE as potentials, on what `four_molecules.py` had PAINET learn, trained, rolled and evaluated alike.
 
     python docs/studies/quantum/rivals.py FOLDER [--molecules ethanol] [--rivals egnn,mace] [--budget 20min]
         [-o docs/results/tables/potential_rivals.json]
@@ -154,7 +154,7 @@ def roll(energy: EnergyFn, scale: float, start: FloatArray, molecule: Molecule, 
 def rival_row(rival: str, name: str, folder: Path, budget_s: float, roll_s: float, given: Any) -> list[str]:
     """Train and roll a rival where that is not done, and return its line of the table."""
     scene = scene_from_smiles(four.MOLECULES[name])
-    molecule, truth = Molecule.of(scene), four.Truth(scene, folder, given.md)
+    molecule, reference = Molecule.of(scene), four.ReferenceForces(scene, folder, given.md)
     learned = folder / "painet.safetensors"
     samples = Samples.load(samples_path(learned), scene.topology_hash)
     file, rolled = folder / f"{rival}.pt", folder / f"{rival}.npz"
@@ -170,11 +170,11 @@ def rival_row(rival: str, name: str, folder: Path, budget_s: float, roll_s: floa
         frames, forces_a_s = roll(network, kept["scale"], scene.positions_nm, molecule, given.time, roll_s)
         np.savez(rolled, frames=frames, forces_a_s=forces_a_s)
     made = np.load(rolled)
-    parts = [gradient_of(network)(part)[1] for part in torch.tensor(truth.states).split(50)]
-    error = four.force_error(-kept["scale"] * torch.cat(parts).double().numpy(), truth.forces)
+    parts = [gradient_of(network)(part)[1] for part in torch.tensor(reference.states).split(50)]
+    error = four.force_error(-kept["scale"] * torch.cat(parts).double().numpy(), reference.forces)
     runs = list(made["frames"].astype(np.float64).swapaxes(0, 1))
-    stable, far = truth.judge(runs, four.SAVE_PS)
-    return [f"{name}, {rival.upper()}", f"{kept['steps']:,}", f"{error:.2f}", stable, far, f"{truth.replicate:.3f}",
+    stable, far = reference.compare(runs, four.SAVE_PS)
+    return [f"{name}, {rival.upper()}", f"{kept['steps']:,}", f"{error:.2f}", stable, far, f"{reference.replicate:.3f}",
             f"{float(made['forces_a_s']):,.0f}"]  # fmt: skip
 
 

@@ -42,12 +42,12 @@ def rows(name: str) -> list[list[str]]:
     """Return a line for each torsion."""
     weights = load_weights(weights_path(name))
     scene, model = weights.domain.scene, weights.model.eval()
-    at, truth, graph = minimum(scene), Potential(scene), bonded_graph(scene)
+    at, reference, graph = minimum(scene), Potential(scene), bonded_graph(scene)
     molecule = Molecule.of(scene)
     found = []
     for quad in rotatable_torsions(scene, rotors=True).tolist():
         scan = np.stack([turned(at, quad, 2.0 * np.pi * k / STEPS, graph) for k in range(STEPS)])
-        asked = np.array([truth(x)[0] for x in scan])
+        asked = np.array([reference(x)[0] for x in scan])
         told = model.evaluate(torch.tensor(scan), molecule).energy_kj_mol.numpy()
         low = asked - asked.min() < HIGHEST_KJ_MOL
         off = (told - asked)[low] - (told - asked)[low].mean()

@@ -135,7 +135,7 @@ def _cases(scratch: Path, time_ps: float) -> list[dict[str, Any]]:
     file = scratch / "forty.toml"
     file.write_text(campaign_text(time_ps))
     rows: list[dict[str, Any]] = []
-    truth: dict[str, str] = {}
+    reference: dict[str, str] = {}
     for case in ("undisturbed", "worker killed", "all killed"):
         folder = scratch / case.replace(" ", "-")
         began = time.monotonic()
@@ -147,14 +147,14 @@ def _cases(scratch: Path, time_ps: float) -> list[dict[str, Any]]:
             what = "nothing" if killer is None else killer.said
         wall_s = time.monotonic() - began
         found = frames_of(manifest)
-        truth = truth or found
+        reference = reference or found
         campaign_trajectories(folder, verify=True)
         rows.append(
             {
                 "case": case,
                 "runs": len(manifest.runs),
                 "complete": manifest.counts().get(COMPLETE, 0),
-                "identical": sum(bool(found[name]) and found[name] == truth[name] for name in truth),
+                "identical": sum(bool(found[name]) and found[name] == reference[name] for name in reference),
                 "frames": sum(run.n_frames for run in manifest.runs.values()),
                 "wall_s": wall_s,
                 "what": what,

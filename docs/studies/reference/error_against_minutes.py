@@ -30,14 +30,14 @@ import surrogate as sm
 from md_reference.run.machine import machine_name
 from md_reference.run.replicas import simulate_replicas
 from md_reference.simd.force_field import n_replicas
-from surrogate.judge.convergence import angles_of, find_wells, tested_reference
-from surrogate.judge.md_answer import Answer, md_answer
-from surrogate.judge.measure.distributions import distance
-from surrogate.judge.measure.structure import Yardstick
-from surrogate.judge.read.ensemble import Ensemble, load_ensemble
-from surrogate.judge.worth import Worth
+from surrogate.comparison.convergence import angles_of, find_wells, tested_reference
+from surrogate.comparison.equivalent_time import EquivalentTime
+from surrogate.comparison.md_answer import Answer, md_answer
+from surrogate.comparison.measure.distributions import distance
+from surrogate.comparison.measure.structure import Baseline
+from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
 from surrogate.verbs.options import ReferenceOptions
-from surrogate.verbs.reference import settle_run
+from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.run_record import RUN_NAME
 from surrogate.verbs.run.run_result import RunResult
 from surrogate.verbs.run.stage_clock import Clock
@@ -80,7 +80,7 @@ def make_reference(folder: Path, names: Sequence[str], time_ps: float, replicas:
             options = ReferenceOptions(
                 time_ps=time_ps, save_every_ps=EVERY_PS, seed=SEED + first, platform="simd", quiet=True
             )
-            scene, config, _ = settle_run(scene, options, {"time_ps": time_ps}, quiet=True)
+            scene, config, _ = resolve_run(scene, options, {"time_ps": time_ps}, quiet=True)
             simulate_replicas(scene, config, files, resume=True)
             said(f"{name}: {first + size} replicas of {format_time_ps(time_ps)}")
 
@@ -136,38 +136,38 @@ def rolled(place: Path, name: str, budget_s: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class ReferenceForces:
     """Long MD of one molecule: its angles, its own answer, and whether it has forgotten where it began."""
 
     files: list[Path]
-    yardstick: Yardstick
+    baseline: Baseline
     ensemble: Ensemble
     angles: Angles
     answer: Answer
     r_hat: float
-    floor: float
+    replicate_baseline: float
 
     @classmethod
-    def of(cls, folder: Path) -> Truth | None:
+    def of(cls, folder: Path) -> ReferenceForces | None:
         """Return what a folder of replicas tells, None for fewer than four."""
         files = sorted(folder.glob("run_*.h5"))
         if len(files) < 4:
             return None
         ensemble = load_ensemble(files)
-        yardstick = Yardstick.of(ensemble, parent=ensemble.scene, kept=ensemble.kept)
-        angles = measured(yardstick, ensemble)
+        baseline = Baseline.of(ensemble, parent=ensemble.scene, kept=ensemble.kept)
+        angles = measured(baseline, ensemble)
         halves = ({k: x[: len(x) // 2] for k, x in angles.items()}, {k: x[len(x) // 2 :] for k, x in angles.items()})
         r_hat = tested_reference([ensemble]).r_hat
-        return cls(files, yardstick, ensemble, angles, md_answer(ensemble, KELVIN), r_hat, torsion_distance(*halves))
+        return cls(files, baseline, ensemble, angles, md_answer(ensemble, KELVIN), r_hat, torsion_distance(*halves))
 
     def of_files(self, files: Sequence[Path]) -> Angles:
-        return measured(self.yardstick, load_ensemble(files, template=self.ensemble.scene))
+        return measured(self.baseline, load_ensemble(files, template=self.ensemble.scene))
 
 
-def measured(yardstick: Yardstick, ensemble: Ensemble) -> Angles:
+def measured(baseline: Baseline, ensemble: Ensemble) -> Angles:
     """Return every torsion in rad, `(n_frames,)` a replica."""
     return {k: [np.asarray(x, dtype=np.float64) for x in s]
-            for k, s in angles_of([yardstick.measure(ensemble)], yardstick.torsions)}  # fmt: skip
+            for k, s in angles_of([baseline.measure(ensemble)], baseline.torsions)}  # fmt: skip
 
 
 def pooled(segments: Sequence[FloatArray], weights: Sequence[FloatArray] | None) -> tuple[FloatArray, FloatArray]:
@@ -176,10 +176,10 @@ def pooled(segments: Sequence[FloatArray], weights: Sequence[FloatArray] | None)
     return values[np.isfinite(values)], w[np.isfinite(values)]
 
 
-def torsion_distance(truth: Angles, other: Angles, weights: Sequence[FloatArray] | None = None) -> float:
+def torsion_distance(ref: Angles, other: Angles, weights: Sequence[FloatArray] | None = None) -> float:
     """Return the mean Jensen-Shannon distance (square root, natural logarithm) of all torsions, 50 bins."""
     found = []
-    for name, segments in truth.items():
+    for name, segments in ref.items():
         counts = []
         for of, w in ((segments, None), (other[name], weights)):
             values, each = pooled(of, w)
@@ -188,10 +188,10 @@ def torsion_distance(truth: Angles, other: Angles, weights: Sequence[FloatArray]
     return float(np.mean(found))
 
 
-def energy_error(truth: Angles, other: Angles, weights: Sequence[FloatArray] | None = None) -> float:
+def energy_error(ref: Angles, other: Angles, weights: Sequence[FloatArray] | None = None) -> float:
     """Return the root mean square error of free energies of the states of every torsion, kJ/mol."""
     rt, squares = GAS_CONSTANT_KJ_MOL_K * KELVIN, []
-    for name, segments in truth.items():
+    for name, segments in ref.items():
         wells = find_wells(name, segments)
         if len(wells.names) < 2:
             continue
@@ -205,7 +205,7 @@ def energy_error(truth: Angles, other: Angles, weights: Sequence[FloatArray] | N
     return math.sqrt(float(np.mean(squares))) if squares else math.nan
 
 
-def intervals_held(told: dict[str, Any], truth: Answer) -> tuple[int, int]:
+def intervals_held(told: dict[str, Any], ref: Answer) -> tuple[int, int]:
     """Return how many 95 % intervals of populations in a run's equilibrium.json hold the reference's, and of how many;
     wells of torsions are the same where their means are within 30 degrees."""
 
@@ -217,7 +217,7 @@ def intervals_held(told: dict[str, Any], truth: Answer) -> tuple[int, int]:
 
     held = total = 0
     for state in told.get("states", ()):
-        right = [s for s in truth.states if s.torsion == state["torsion"] and same(s.state, state["state"])]
+        right = [s for s in ref.states if s.torsion == state["torsion"] and same(s.state, state["state"])]
         if state["missing"] or len(right) != 1:
             continue
         total += 1
@@ -225,36 +225,36 @@ def intervals_held(told: dict[str, Any], truth: Answer) -> tuple[int, int]:
     return held, total
 
 
-def worth_held(result: RunResult, truth: Truth) -> bool | None:
+def equivalent_time_held(result: RunResult, ref: ReferenceForces) -> bool | None:
     """Return whether the equivalent MD time that a run tells of its rollout holds what long MD tells of it, None where
     it tells none."""
-    told = of_distribution(json.loads((result.folder / "report.json").read_text("utf-8"))["judgements"][0])
-    if not result["outcome"]["worth"] or told is None:
+    told = of_distribution(json.loads((result.folder / "report.json").read_text("utf-8"))["evaluations"][0])
+    if not result["outcome"]["equivalent_time"] or told is None:
         return None
-    half = len(truth.files) // 2
-    judged = sm.compare(truth.files[:half], [result.trajectory], replicate=truth.files[half:]).judgements[0]
-    right: Worth | None = next((w for w in judged.worth if w.kind == "distribution"), None)
+    half = len(ref.files) // 2
+    evaluated = sm.compare(ref.files[:half], [result.trajectory], replicate=ref.files[half:]).evaluations[0]
+    right: EquivalentTime | None = next((w for w in evaluated.equivalent_time if w.kind == "distribution"), None)
     if right is None:
         return None
     low, high = told["low_ps"] or 0.0, told["high_ps"]
     if told["bound"] == "at least":
-        low, high = told["worth_ps"], None
+        low, high = told["equivalent_ps"], None
     if told["bound"] == "less than":
-        low, high = 0.0, told["worth_ps"]
+        low, high = 0.0, told["equivalent_ps"]
     return low <= (right.high_ps or math.inf) and (high is None or (right.low_ps or 0.0) <= high)
 
 
-def of_distribution(judged: dict[str, Any]) -> dict[str, Any] | None:
-    return next((w for w in judged["worth"] if w["kind"] == "distribution"), None)
+def of_distribution(evaluated: dict[str, Any]) -> dict[str, Any] | None:
+    return next((w for w in evaluated["equivalent_time"] if w["kind"] == "distribution"), None)
 
 
-def row(name: str, minutes: float, place: Path, truth: Truth) -> dict[str, Any]:
+def row(name: str, minutes: float, place: Path, ref: ReferenceForces) -> dict[str, Any]:
     """Return a line of the table; a way that was not gone has no error."""
     line: dict[str, Any] = {
         "molecule": name,
         "minutes": minutes,
-        "R-hat": round(truth.r_hat, 3) if math.isfinite(truth.r_hat) else None,
-        "reference's halves": round(truth.floor, 4),
+        "R-hat": round(ref.r_hat, 3) if math.isfinite(ref.r_hat) else None,
+        "reference's halves": round(ref.replicate_baseline, 4),
     }
     for way in WAYS:
         if way == "rollout":
@@ -266,15 +266,15 @@ def row(name: str, minutes: float, place: Path, truth: Truth) -> dict[str, Any]:
             weights = None if way == "one" else [sm.frame_weights(f) for f in files]
         if not files:
             continue
-        angles = truth.of_files(files)
-        line[f"{way}: distance"] = round(torsion_distance(truth.angles, angles, weights), 4)
-        error = energy_error(truth.angles, angles, weights)
+        angles = ref.of_files(files)
+        line[f"{way}: distance"] = round(torsion_distance(ref.angles, angles, weights), 4)
+        error = energy_error(ref.angles, angles, weights)
         line[f"{way}: kJ/mol"] = round(error, 3) if math.isfinite(error) else None
     if "run: distance" in line:
         result = RunResult.of(place / "run")
-        held, total = intervals_held(result.answer, truth.answer)
+        held, total = intervals_held(result.answer, ref.answer)
         line |= {"way": result["decision"]["way"], "intervals held": held, "of": total}
-        line["equivalent MD time held"] = worth_held(result, truth)
+        line["equivalent MD time held"] = equivalent_time_held(result, ref)
         if not result["outcome"]["converged"]:
             line["verdict"] = "not converged"
         else:
@@ -286,14 +286,14 @@ def make_table(folder: Path, out: Path | None, figure: Path | None) -> None:
     """Lay all runs beside the references, print and write the table and the figure."""
     rows = []
     for name in MOLECULES:
-        truth = Truth.of(folder / name)
-        if truth is None:
+        ref = ReferenceForces.of(folder / name)
+        if ref is None:
             continue
-        warning = "" if truth.r_hat < ENOUGH_R_HAT else ", not converged itself"
-        length = f"{len(truth.files)} replicas of {format_time_ps(truth.answer.replica_ps)}"
-        said(f"{name}: {length}, split R-hat {truth.r_hat:.3f}{warning}")
+        warning = "" if ref.r_hat < ENOUGH_R_HAT else ", not converged itself"
+        length = f"{len(ref.files)} replicas of {format_time_ps(ref.answer.replica_ps)}"
+        said(f"{name}: {length}, split R-hat {ref.r_hat:.3f}{warning}")
         for place in sorted((folder / name).glob("*min"), key=lambda p: float(p.name[:-3])):
-            rows.append(row(name, float(place.name[:-3]), place, truth))
+            rows.append(row(name, float(place.name[:-3]), place, ref))
             said("  " + ", ".join(f"{k} {v}" for k, v in rows[-1].items()))
     if not rows:
         raise SystemExit(f"{folder} holds no reference of four replicas with runs beside it.")
@@ -333,8 +333,8 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
     found.append(
         f"intervals of populations that hold, of answers that are not told to be unconverged: {held} of {total}"
     )
-    worths = [r["equivalent MD time held"] for r in told if r["equivalent MD time held"] is not None]
-    found.append(f"intervals of equivalent MD time that hold: {sum(worths)} of {len(worths)}")
+    equivalent_times = [r["equivalent MD time held"] for r in told if r["equivalent MD time held"] is not None]
+    found.append(f"intervals of equivalent MD time that hold: {sum(equivalent_times)} of {len(equivalent_times)}")
     return found
 
 
@@ -358,8 +358,8 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
         low, middle, high = (np.array([np.quantile(v, q) for _, v in points]) for q in (0.25, 0.5, 0.75))
         axes.plot(at, middle, "o-", color=f"C{k}", label=words)
         axes.fill_between(at, low, high, color=f"C{k}", alpha=0.15, linewidth=0)
-    floor = float(np.median([r["reference's halves"] for r in rows]))
-    axes.axhline(floor, color="0.6", linestyle=":", label="two halves of the reference")
+    replicate_baseline = float(np.median([r["reference's halves"] for r in rows]))
+    axes.axhline(replicate_baseline, color="0.6", linestyle=":", label="two halves of the reference")
     axes.set(xscale="log", yscale="log", xlabel="budget / min", ylabel="mean distance of torsions to long MD")
     axes.set_xticks(minutes, [f"{m:g}" for m in minutes])
     axes.minorticks_off()

@@ -85,10 +85,11 @@ def summarise(psi_rad: Sequence[FloatArray], lag_ps: float, alpha: tuple[float, 
 
     Each is a mean over trajectories. The mean psi within a basin settles within picoseconds: it compares the force
     fields far more sharply than the occupancies, of which 10 ns hold some twenty independent samples.
-    The relaxation time is the integrated autocorrelation time up to the first zero crossing (judge.kinetics), of each
+    The relaxation time is the integrated autocorrelation time up to the first zero crossing (evaluate.kinetics), of
+    each
     trajectory about its own mean.
     """
-    from surrogate.judge.measure.kinetics import zero_crossing
+    from surrogate.comparison.measure.kinetics import zero_crossing
 
     in_alpha = [(psi - alpha[0]) % (2 * np.pi) < (alpha[1] - alpha[0]) % (2 * np.pi) for psi in psi_rad]
     inside = [float(np.mean(x)) for x in in_alpha]
@@ -120,8 +121,8 @@ def difference(quantity: str, unit: str, ours: Mean, theirs: Mean) -> Difference
 
 def read_psi(paths: Sequence[Path], *, top: Path | None = None) -> list[FloatArray]:
     """Return psi of each trajectory, `(n_frames,)` rad, atoms matched to the library's by the bond graph."""
-    from surrogate.judge.measure.structure import backbone
-    from surrogate.judge.read.ensemble import load_ensemble
+    from surrogate.comparison.measure.structure import backbone
+    from surrogate.comparison.read.ensemble import load_ensemble
     from systems.chemistry.geometry import torsion
     from systems.library.named_scenes import load
 

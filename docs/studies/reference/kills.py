@@ -5,7 +5,7 @@
 Each kind of run is made once undisturbed. Then, `--trials` times, it is started anew, killed with all that descends
 from it after a random part of that time, and started again with `--resume` until it ends. Printed is a table: exact
 (all that the finished file holds is that of the undisturbed run), refused (one line, nothing changed), lost (anything
-else). Of `surromd run`, which the clock ends, exact means that it ends judged, and with every frame up to the last
+else). Of `surromd run`, which the clock ends, exact means that it ends evaluated, and with every frame up to the last
 checkpoint before it was killed; a line says in which stage that was, and what was spent of the budget in the end.
 """
 
@@ -89,7 +89,7 @@ def stage(folder: Path) -> str:
     return next((entry["name"] for entry in found["decision"]["stages"] if entry["name"] not in ended), "done")
 
 
-def judged(folder: Path, kept: dict[str, Any]) -> str:
+def evaluated(folder: Path, kept: dict[str, Any]) -> str:
     """Return what came of a run that was gone on with; `kept`: its frames when it was killed."""
     found, now = record(folder), frames(folder)
     for name, positions in kept.items():
@@ -109,7 +109,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def trial(command: list[str], names: list[str], truth: list[bytes], after_s: float) -> tuple[str, bool]:
+def trial(command: list[str], names: list[str], reference: list[bytes], after_s: float) -> tuple[str, bool]:
     """Return the outcome, and whether the run was still going when it was killed."""
     folder = Path(tempfile.mkdtemp(prefix="surromd-kills-"))
     try:
@@ -130,8 +130,8 @@ def trial(command: list[str], names: list[str], truth: list[bytes], after_s: flo
             same = contents(folder) == before
             return ("refused" if same and len(said.splitlines()) == 1 else f"lost: {said.strip()}"), alive
         if not names:
-            return judged(folder, kept), alive
-        return ("exact" if whole([folder / name for name in names]) == truth else "lost: other frames"), alive
+            return evaluated(folder, kept), alive
+        return ("exact" if whole([folder / name for name in names]) == reference else "lost: other frames"), alive
     except Exception as error:
         return f"lost: {type(error).__name__}: {error}", True
     finally:
@@ -152,12 +152,12 @@ def main() -> None:
         folder = Path(tempfile.mkdtemp(prefix="surromd-kills-"))
         began = time.monotonic()
         subprocess.run([args.command, *words], cwd=folder, check=True)
-        span_s, truth = time.monotonic() - began, whole([folder / name for name in names])
+        span_s, reference = time.monotonic() - began, whole([folder / name for name in names])
         shutil.rmtree(folder)
         counts, killed = Counter[str](), 0
         for _ in range(args.trials):
             least = 0.1 if names else 0.02
-            outcome, alive = trial([args.command, *words], names, truth, rng.uniform(least, 1.0) * span_s)
+            outcome, alive = trial([args.command, *words], names, reference, rng.uniform(least, 1.0) * span_s)
             counts[outcome.partition(":")[0]] += 1
             killed += alive
             if outcome.startswith("lost"):

@@ -90,7 +90,7 @@ CASES = (
 class Row:
     """One scene in one solvent. Speeds in ns/day of all cores together, ratios within rounds: median, least, greatest.
 
-    `ratio` is ours over the faster of OpenMM's two ways, `gain_long_step` ours at 4 fs over ours at 2 fs.
+    `ratio` is ours over the faster of OpenMM's two ways, `speed_up_long_step` ours at 4 fs over ours at 2 fs.
     `processor_ratio`: ours over OpenMM's with one thread, by processor time, which other work on the machine hardly
     changes (None on a device). `energy_gap`: the largest difference in kJ/mol over five frames, and `force_gap` the
     largest relative difference of all forces.
@@ -103,7 +103,7 @@ class Row:
     plain: str
     ns_per_day: dict[str, float]
     ratio: tuple[float, float, float]
-    gain_long_step: tuple[float, float, float]
+    speed_up_long_step: tuple[float, float, float]
     processor_ratio: float | None
     energy_kj_mol: float
     energy_gap: float
@@ -192,7 +192,7 @@ def _run_case(workers: _Workers, case: Case, rounds: int, seconds: float) -> Row
         plain=f"{facts[_ALL_CORES]}; {facts[_PER_CORE]}",
         ns_per_day={mode: statistics.median(values) for mode, values in speeds.items()},
         ratio=_spread(speeds[_OURS], best),
-        gain_long_step=_spread(speeds[_LONG], speeds[_OURS]),
+        speed_up_long_step=_spread(speeds[_LONG], speeds[_OURS]),
         # The best of each: a processor shared with others has colder caches, never faster ones.
         processor_ratio=None if on_device else max(by_processor[_OURS]) / max(by_processor[_PER_CORE]),
         **gaps,
@@ -366,7 +366,7 @@ def table_line(row: Row) -> str:
     gap = f"{row.energy_gap:.1e}" + ("" if row.equal_energies else " UNEQUAL")
     return (
         f"{row.case:<18}{row.n_atoms:>6} {row.solvent:<8}{speeds}  {ratio:<20}"
-        f"{by_cpu:<9}{f'x {row.gain_long_step[0]:.2f}':<11}{gap:>11}  {row.ours} / {row.plain}"
+        f"{by_cpu:<9}{f'x {row.speed_up_long_step[0]:.2f}':<11}{gap:>11}  {row.ours} / {row.plain}"
     )
 
 

@@ -27,7 +27,7 @@ from systems.scene import FloatArray, Scene
 from systems.units import parse_time_ps
 
 SAVE_PS = 0.02
-SETTLE_PS = 3.0
+DISCARDED_PS = 3.0
 PIECE_PS = 5.0
 # Blocks of a run of which means are compared.
 BLOCKS = (5, 8, 10, 16)
@@ -44,7 +44,7 @@ def run(out: Path, smiles: str, timestep_ps: float, mass_da: float | None, rigid
     with Engine(scene, conditions) as engine:
         engine.minimise(max_iterations=200)
         engine.thermalise()
-        engine.step(round(SETTLE_PS / timestep_ps))
+        engine.step(round(DISCARDED_PS / timestep_ps))
         began = time.process_time()
         for k in range(1, round(time_ps / SAVE_PS) + 1):
             engine.step(round(SAVE_PS / timestep_ps))

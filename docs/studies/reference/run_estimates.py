@@ -1,9 +1,10 @@
-"""What `surromd run` estimates, and the worth it tells, held against long MD made for the purpose.
+"""What `surromd run` estimates, and the equivalent MD time it tells, held against long MD made for the purpose.
 
     python docs/studies/reference/run_estimates.py RUNS LONG [--time 20ns] [-o docs/results/tables/run_estimates.json]
 
 RUNS holds folders of runs. LONG gets a folder of the same name for each, with sixteen SIMD replicas of MD of
-`--time` each, from another seed; what is there is not made again. Half of them is the truth, the other its replicate.
+`--time` each, from another seed; what is there is not made again. Half of them is the reference, the other its
+replicate.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ def row(run: Path, long: list[Path]) -> list[str]:
     made_ps = outcome["held_out_ps"] + outcome["rolled_ps"]
     planned_ps = decision["expected_md_ps"] + decision["expected_rollout_ps"]
     half = len(long) // 2
-    judged = sm.compare(
+    evaluated = sm.compare(
         long[:half], [[run / file for file in record["trajectory"]]], replicate=long[half:]
-    ).judgements[0]  # fmt: skip
-    worth = next((w for w in judged.worth if w.kind == "distribution"), None)
+    ).evaluations[0]  # fmt: skip
+    equivalent_time = next((w for w in evaluated.equivalent_time if w.kind == "distribution"), None)
     return [
         run.name,
         f"{decision['way']}, {format_wall(settings['budget_s'])}",
         f"{record['spent_s'] / settings['budget_s'] - 1:+.0%}",
         f"{format_time_ps(planned_ps, 2)}",
         f"{made_ps / planned_ps:.2f}",
-        outcome["worth"] or "not told",
-        worth.in_words() if worth and judged.worth_words else "not told",
+        outcome["equivalent_time"] or "not told",
+        equivalent_time.in_words() if equivalent_time and evaluated.equivalent_time_words else "not told",
         outcome["status"],
-        judged.status,
+        evaluated.status,
     ]
 
 
@@ -82,8 +83,9 @@ def main() -> None:
             "command": "python docs/studies/reference/run_estimates.py RUNS LONG",
             "machine": machine_name(),
             "note": f"Long MD: {REPLICAS} replicas of {format_time_ps(given.time)} each, by SIMD, from another seed.",
-            "columns": ["scene", "way, budget", "time over budget", "planned in all", "made, of planned", "worth told",
-                        "worth by long MD", "verdict told", "verdict by long MD"],
+            "columns": ["scene", "way, budget", "time over budget", "planned in all", "made, of planned",
+                        "equivalent MD time told",
+                        "equivalent MD time by long MD", "verdict told", "verdict by long MD"],
             "rows": rows,
         }  # fmt: skip
         given.out.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")

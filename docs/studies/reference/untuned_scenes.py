@@ -42,7 +42,7 @@ def heavy_pdb(sequence: str, folder: Path) -> Path:
     return path
 
 
-def judged(name: str, scene: str, folder: Path) -> dict[str, Any]:
+def evaluated(name: str, scene: str, folder: Path) -> dict[str, Any]:
     """Return the record of a scene's run, with `failed` where it came to nothing."""
     out = folder / name
     is_there = (out / RUN_NAME).is_file()
@@ -65,7 +65,7 @@ def row(name: str, record: dict[str, Any]) -> list[str]:
     way = record["decision"]["way"] + (" by SIMD" if rates["at_once"] > 1 else "")
     lengths = [format_time_ps(outcome[key], 2) for key in ("rolled_ps", "held_out_ps")]
     return [f"{name}, {rates['n_atoms']}", format_wall(record["spent_s"]), others, way,
-            " + ".join(lengths), outcome["worth"] or "not told", outcome["status"]]  # fmt: skip
+            " + ".join(lengths), outcome["equivalent_time"] or "not told", outcome["status"]]  # fmt: skip
 
 
 def main() -> None:
@@ -78,7 +78,7 @@ def main() -> None:
     cases += [(name, str(heavy_pdb(name, given.folder))) for name in PEPTIDES]
     rows = []
     for name, scene in cases:
-        rows.append(row(name, judged(name, scene, given.folder)))
+        rows.append(row(name, evaluated(name, scene, given.folder)))
         sys.stdout.write(" | ".join(rows[-1]) + "\n")
         sys.stdout.flush()
     if given.out is not None:
@@ -86,7 +86,8 @@ def main() -> None:
             "command": "python docs/studies/reference/untuned_scenes.py FOLDER",
             "machine": machine_name(),
             "note": f"A budget of {format_wall(BUDGET_S)} each. Taken by others: of the cores, in the first seconds.",
-            "columns": ["scene, atoms", "wall time", "taken by others", "way", "judged + held out", "worth", "verdict"],
+            "columns": ["scene, atoms", "wall time", "taken by others", "way", "evaluated + held out",
+                        "equivalent MD time", "verdict"],
             "rows": rows,
         }  # fmt: skip
         given.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")

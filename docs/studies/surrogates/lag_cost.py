@@ -25,8 +25,8 @@ from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting
 from surrogate.bench.held_out import refuse_trained_on
 from surrogate.bench.machine import machine_facts
 from surrogate.bench.rolling import Roller
+from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
 from surrogate.data.shipped import weights_path
-from surrogate.judge.measure.distributions import RAMACHANDRAN_BINS, distance, is_positive
 from surrogate.models.weights import load_weights
 from surrogate.sampling.chunks import ChunkSampler
 from surrogate.sampling.domain import fit_weights
@@ -75,13 +75,13 @@ def relaxation_ps(runs: list[Angles], lag_ps: float) -> float:
     return lag_ps * (0.5 + float(found[1 : below[0] if len(below) else None].sum()))
 
 
-def told(runs: list[Angles], lag_ps: float, truth: npt.NDArray[np.float64]) -> dict[str, Any]:
+def told(runs: list[Angles], lag_ps: float, reference: npt.NDArray[np.float64]) -> dict[str, Any]:
     """Return what is printed of runs with frames `lag_ps` apart."""
     at = autocorrelation(runs, round(LAGS_PS[-1] / lag_ps))
     positive = float(np.mean(is_positive(np.concatenate(runs)[:, 0])))
     return {
         "ns": 1e-3 * lag_ps * sum(map(len, runs)),
-        "distance": float(distance(counts(runs), truth)),
+        "distance": float(distance(counts(runs), reference)),
         "cos psi": [float(at[round(lag / lag_ps)]) for lag in LAGS_PS],
         "tau_ps": relaxation_ps(runs, lag_ps),
         "phi > 0, kT": -float(np.log(positive / (1 - positive))) if positive else None,
@@ -104,10 +104,10 @@ def main() -> None:
     refuse_trained_on(weights, args.held[:1], args.held[1:])
     held = [torsions_of(path) for path in args.held]
     runs, apart_ps = [angles for angles, _ in held], held[0][1]
-    truth, tau_ps = counts(runs), relaxation_ps(runs, apart_ps)
-    rows: dict[str, Any] = {"MD, all": told(runs, apart_ps, truth)}
+    reference, tau_ps = counts(runs), relaxation_ps(runs, apart_ps)
+    rows: dict[str, Any] = {"MD, all": told(runs, apart_ps, reference)}
     for k, path in enumerate(args.held):
-        rows[f"MD, {path.stem}"] = told(runs[k : k + 1], apart_ps, truth - counts(runs[k : k + 1]))
+        rows[f"MD, {path.stem}"] = told(runs[k : k + 1], apart_ps, reference - counts(runs[k : k + 1]))
     fitted, _ = fit_weights(weights.domain.scene, weights, lag_ps=args.lag)
     geometry = Geometry.from_dict(fitted.domain.geometry)
     config = CostErrorConfig(time_ps=1e3 * args.ns)
@@ -119,7 +119,7 @@ def main() -> None:
         roller.advance(sampler.n_new)  # settles, and compiles
         parts, cost = roll_in_turns(fitted, roller, sampler, setting, config)
         frames = np.concatenate(parts, axis=1)
-        row = told(list(torsions(fitted.domain.scene, frames)), args.lag, truth)
+        row = told(list(torsions(fitted.domain.scene, frames)), args.lag, reference)
         flags = np.concatenate([check_frames(x, geometry) for x in frames])
         rate = samples_per_second(cost["cpu_s_per_ns"]["mean"], row["tau_ps"], tau_ps)
         md_rate = samples_per_second(cost["md_s_per_ns"]["mean"], tau_ps, tau_ps)

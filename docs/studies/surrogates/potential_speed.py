@@ -38,9 +38,9 @@ def least_ms(call: Callable[[], object]) -> float:
     return min(times[2:])
 
 
-def ask(truth: Potential, frames: Iterator[torch.Tensor]) -> None:
-    """Have the truth answer at the next frame: at the one before it would begin where it ended."""
-    truth(next(frames).numpy())
+def ask(reference: Potential, frames: Iterator[torch.Tensor]) -> None:
+    """Have the reference answer at the next frame: at the one before it would begin where it ended."""
+    reference(next(frames).numpy())
 
 
 def main() -> None:
@@ -53,12 +53,12 @@ def main() -> None:
     model = PainetPotential(PotentialConfig()).eval().requires_grad_(False)
     for smiles in given.molecules:
         scene = scene_from_smiles(smiles)
-        molecule, truth = Molecule.of(scene), Potential(scene)
+        molecule, reference = Molecule.of(scene), Potential(scene)
         at = torch.tensor(scene.positions_nm)[None]
         fabric = model.fabric(molecule)
         made = model.network.prepare(fabric, at)
         moved = iter(at + 0.003 * torch.randn(2 + ROUNDS, *at.shape[1:], dtype=at.dtype))
-        line = [f"{smiles}, {scene.n_atoms} atoms: GFN2-xTB {least_ms(partial(ask, truth, moved)):.3g} ms"]
+        line = [f"{smiles}, {scene.n_atoms} atoms: GFN2-xTB {least_ms(partial(ask, reference, moved)):.3g} ms"]
         for rows in map(int, given.batches.split(",")):
             x = at + 0.003 * torch.randn(rows, *at.shape[1:], dtype=at.dtype)
             by_torch = gradient_of(partial(model.members, fabric=fabric, made=made))

@@ -163,16 +163,16 @@ def sampling_ratio(batch: int, rounds: int, *, compiled: bool = False) -> dict[s
             return flow.euler(network(), noise, n_steps, "linear")
 
     seconds = [{name: least_seconds(lambda n=name: sample(n), 1) for name in ways} for _ in range(rounds)]  # type: ignore[misc]
-    truth = sample("plain fp32", 1)[:, PAPER.n_conditioning :]
+    reference = sample("plain fp32", 1)[:, PAPER.n_conditioning :]
     result: dict[str, Any] = {"batch": batch}
     for name in ways:
         ratios = sorted(s["plain fp32"] / s[name] for s in seconds)
-        error = (sample(name, 1)[:, PAPER.n_conditioning :] - truth).square().mean().sqrt()
+        error = (sample(name, 1)[:, PAPER.n_conditioning :] - reference).square().mean().sqrt()
         result[name] = {
             "ms": 1e3 * statistics.median(s[name] for s in seconds),
             "ratio": [ratios[0], statistics.median(ratios), ratios[-1]],
             # Clean conditioning is another function of the same tensors: nothing to compare.
-            "relative_error": None if "clean" in name else float(error / truth.square().mean().sqrt()),
+            "relative_error": None if "clean" in name else float(error / reference.square().mean().sqrt()),
         }
     return result
 

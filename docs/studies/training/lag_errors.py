@@ -5,7 +5,8 @@
 One model is trained on alanine dipeptide (or another peptide with phi and psi) for all spacings of frames up to
 `--longest-lag-ps`. At each of some lags it is started from frames of a trajectory that it never saw, which are in
 equilibrium, so that all it makes should be, too, and should forget where it started as fast as MD does. Beside it: MD
-itself, continued from the same frames, which is the floor of every figure, and the model told the shortest lag whatever
+itself, continued from the same frames, which is the replicate baseline of every figure, and the model told the
+shortest lag whatever
 is asked, which shows what the lag is worth to it. What is finished in FOLDER is not done again.
 """
 
@@ -120,7 +121,7 @@ def _correlation(x: FloatArray, y: FloatArray) -> float:
 
 def joint_distance(x: FloatArray, y: FloatArray) -> float:
     """Return the Jensen-Shannon distance of two sets of (phi, psi), each `(n, 2)` rad."""
-    from surrogate.judge.measure.distributions import distance
+    from surrogate.comparison.measure.distributions import distance
 
     edges = np.linspace(-np.pi, np.pi, _BINS + 1)
     counts = [np.histogram2d(a[:, 0], a[:, 1], bins=(edges, edges))[0].ravel() for a in (x, y)]

@@ -24,20 +24,20 @@ from surrogate.models.peptides.chains import ChainFeatures
 from surrogate.models.peptides.layout import chain_features
 from surrogate.models.peptides.model import PeptideFlow, PeptideSlide
 from surrogate.models.peptides.subjects import PeptideSubject
-from surrogate.models.peptides.torsion_states import told_states
+from surrogate.models.peptides.torsion_states import conditioning_states
 from surrogate.models.peptides.trainer import PeptideTraining, by_kind, disturbed
 from surrogate.models.weights import Weights, load_weights, provenance_of, save_weights
 from surrogate.training.loop import Stage, StageConfig, train_stages
 from systems.units import parse_wall_s
 
-# A flow of peptides that arrives in very few evaluations: taught where its teacher arrives in many.
+# A flow of peptides that arrives in very few evaluations: taught where its labeller arrives in many.
 # The state of every torsion is drawn before, so what is left to a flow is one basin, and where its solver ends is a
-# smooth map of the noise. A copy of the flow is trained through all steps of its own solver to end where the teacher
+# smooth map of the noise. A copy of the flow is trained through all steps of its own solver to end where the labeller
 # ends from the same noise (as in progressive distillation, Salimans and Ho, arXiv:2202.00512, but in one round, since
-# so few steps can be differentiated as one). The odds of states are the teacher's.
+# so few steps can be differentiated as one). The probabilities of states are the labeller's.
 
-# Evaluations of the teacher: more of them end in the same distribution.
-_TEACHER_STEPS = 6
+# Evaluations of the labeller: more of them end in the same distribution.
+_LABELLER_STEPS = 6
 # Two of its steps leave bonds and angles as wide as they are. By `gaussian` a copy had to make up for half of the
 # variance, and left them cold.
 _SOLVER = "angular"
@@ -59,7 +59,7 @@ def distil(
     torch.manual_seed(training.seed)
     assert isinstance(start.model, PeptideSlide)
     device = torch.device(training.device)
-    teacher = start.model.to(device).flow
+    labeller = start.model.to(device).flow
     config = replace(start.model.config, usual_steps=steps, usual_solver=_SOLVER)
     model = PeptideSlide(config).to(device)
     model.load_state_dict(start.model.state_dict())
@@ -71,7 +71,7 @@ def distil(
     ]
 
     def apart(subject: PeptideSubject, idx: Tensor, times: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        return arrival_loss(model, teacher, subject.chain, *subject.seen(model, idx), times.to(device), generator)
+        return arrival_loss(model, labeller, subject.chain, *subject.seen(model, idx), times.to(device), generator)
 
     def loss(generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         subject = subjects[pick(subjects, generator)]
@@ -98,27 +98,27 @@ def distil(
 
 
 def arrival_loss(
-    model: PeptideSlide, teacher: PeptideFlow, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
+    model: PeptideSlide, labeller: PeptideFlow, chain: ChainFeatures, numbers: Tensor, states: Tensor, times_ps: Tensor,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Return the mean square of how far from the teacher's the model's innovations end from the same noise, `apart`,
+    """Return the mean square of how far from the labeller's the model's innovations end from the same noise, `apart`,
     and its parts: of torsions' numbers, of stiff ones. `numbers` and `states` of windows as `peptide_loss` takes them,
     of which only the first frame's numbers are used."""
     filled = chain.code.filled
     known = disturbed(numbers[:, 0], chain, model.config, generator)
     noise = torch.randn(numbers[:, 1:].shape, generator=generator).to(numbers.device) * filled
-    of_states = told_states(states, chain.stated.counts)
+    of_states = conditioning_states(states, chain.stated.counts)
 
     def arrived(by: PeptideFlow, n_steps: int) -> Tensor:
-        told = by.told(known, times_ps, chain.places, of_states)
+        conditioning = by.conditioning(known, times_ps, chain.places, of_states)
 
         def predict(o: Tensor, tau: Tensor) -> Tensor:
-            return torch.where(filled, by(o, tau, told), 0.0)
+            return torch.where(filled, by(o, tau, conditioning), 0.0)
 
         return flow.SOLVERS[_SOLVER](predict, noise, n_steps, "linear")
 
     with torch.no_grad():
-        target = arrived(teacher, _TEACHER_STEPS)
+        target = arrived(labeller, _LABELLER_STEPS)
     error = (arrived(model.flow, model.config.usual_steps) - target).square()
     return dict(zip(("apart", "turning", "stiff"), by_kind(error, chain, model.config), strict=True))
 
@@ -129,7 +129,7 @@ _LEARNING_RATE, _VALIDATE_S = 3e-4, 300.0
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--weights", type=Path, required=True, help="of the teacher")
+    parser.add_argument("--weights", type=Path, required=True, help="of the labeller")
     parser.add_argument("--train", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=2, help="evaluations of a rollout")
     parser.add_argument("--budget", required=True, help="wall time, as 40min")

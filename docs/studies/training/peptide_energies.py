@@ -39,7 +39,7 @@ _KELVIN, _TIMESTEP_PS = 300.0, 0.004
 # 18 degrees apart, and within its window phi scatters by 9. Less stiff ones slip from the barrier.
 _FIRST_RAD, _LAST_RAD = math.radians(82.0), math.radians(-185.0)
 _STIFFNESS_KJ_MOL = 100.0
-_PULLED_PS, _SETTLED_PS, _SAVE_PS = 100.0, 200.0, 0.4
+_PULLED_PS, _RESOLVED_PS, _SAVE_PS = 100.0, 200.0, 0.4
 _BINS = 72
 _SWEEPS = 20_000
 _CONVERGED_KT = 1e-6
@@ -69,7 +69,7 @@ def population_of_phi(scene: Scene, *, time_ps: float, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     held = np.arange(run.n_replicas)  # which centre each copy has
     angles = np.empty((run.n_replicas, round(time_ps / _SAVE_PS)))
-    for k in range(-round(_SETTLED_PS / _SAVE_PS), angles.shape[1]):
+    for k in range(-round(_RESOLVED_PS / _SAVE_PS), angles.shape[1]):
         run.step(round(_SAVE_PS / _TIMESTEP_PS))
         phi = torsion(run.positions_nm, quad[None])[:, 0]
         if k >= 0:
@@ -91,11 +91,11 @@ def exchanged(
     `first` (0 or 1) around the circle, by Metropolis' rule. `held` and `angles` (n_copies,)."""
     copy_at = np.argsort(held)
     left, right = copy_at[first:-1:2], copy_at[first + 1 :: 2]
-    gain = stiffness_kt * (
+    speed_up = stiffness_kt * (
         np.cos(angles[left] - centres[held[right]]) + np.cos(angles[right] - centres[held[left]])
         - np.cos(angles[left] - centres[held[left]]) - np.cos(angles[right] - centres[held[right]])
     )  # fmt: skip
-    swapped = np.log(rng.random(len(gain))) < gain
+    swapped = np.log(rng.random(len(speed_up))) < speed_up
     found = held.copy()
     found[left[swapped]], found[right[swapped]] = held[right[swapped]], held[left[swapped]]
     return found

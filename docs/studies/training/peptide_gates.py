@@ -154,14 +154,14 @@ def seeds_gate(a: argparse.Namespace) -> None:
     if runs:
         models["seeds"] = a.folder / "seeds.safetensors"
         train(runs, models["seeds"], steps=a.steps, innovation=True, positive_phi_kt=known_energies(a.folder))
-    scene, truth, time_ps = thinned(a.test)
-    angles = [torsions(scene, x) for x in truth]
+    scene, reference, time_ps = thinned(a.test)
+    angles = [torsions(scene, x) for x in reference]
     md = crossings([x[:, 0] for x in angles], FRAMES_PS)
     record: dict[str, Any] = {"MD": {"distance": [joint_distance(x, y) for x, y in combinations(angles, 2)],
                                      **free_energy([float((x[:, 0] > 0).mean()) for x in angles]), **md}}  # fmt: skip
     for name, path in models.items():
         weights, folder = load_weights(path), a.folder / f"{name}-rollouts"
-        same = rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(truth))], time_ps)
+        same = rolled(weights, scene, [folder / f"same_{k}.h5" for k in range(len(reference))], time_ps)
         found = [joint_distance(torsions(scene, x), y) for x in same for y in angles]
         many = [folder / f"long_{k:02d}.h5" for k in range(REPLICAS)]
         phi = [torsions(scene, x)[:, 0] for x in rolled(weights, scene, many, REPLICA_PS, REPLICA_LAG_PS)]

@@ -85,15 +85,16 @@ def molecule_scores(
 
     from surrogate.sampling.domain import fit_weights
 
-    scene, truth, time_ps = thinned(runs)
+    scene, reference, time_ps = thinned(runs)
     turns = turns_of(scene)
     model = rolled(weights, scene, [folder / f"{runs[0].stem}-{k}.h5" for k in range(len(runs))], time_ps)
     fitted, _ = fit_weights(scene, weights, lag_ps=FRAMES_PS, force=True)
     geometry = Geometry.from_dict(fitted.domain.geometry)
     valid = [
-        float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some])) for some in (truth, model)
+        float(np.mean([((check_frames(x, geometry) & INVALID) == 0).mean() for x in some]))
+        for some in (reference, model)
     ]
-    truth, model = ([angles(turns, x) for x in some] for some in (truth, model))
+    reference, model = ([angles(turns, x) for x in some] for some in (reference, model))
     names = [name for name in scene.residue_names if name not in ("ACE", "NME")]
     alone = [thinned(sorted((monomers / name).glob("run_*.h5"))) for name in names]
     own = [turns_of(of) for of, _, _ in alone]
@@ -102,14 +103,14 @@ def molecule_scores(
     likely = [frame_weights(x, k, positive_kt.get(name)) for x, k, name in zip(values, phi, names, strict=True)]
     rng = np.random.default_rng(0)
     drawn = [
-        library(turns, [np.concatenate(x) for x in values], likely, own, len(truth[0]), rng) for _ in runs
+        library(turns, [np.concatenate(x) for x in values], likely, own, len(reference[0]), rng) for _ in runs
     ]  # fmt: skip
-    rare = rarely_positive(turns, truth)
-    truth, model, drawn = (without(x, rare) for x in (truth, model, drawn))
+    rare = rarely_positive(turns, reference)
+    reference, model, drawn = (without(x, rare) for x in (reference, model, drawn))
     return [
-        replace(floor(turns, truth), valid=valid[0]),
-        replace(score(turns, truth, model, "model"), valid=valid[1]),
-        score(turns, truth, drawn, "library"),
+        replace(floor(turns, reference), valid=valid[0]),
+        replace(score(turns, reference, model, "model"), valid=valid[1]),
+        score(turns, reference, drawn, "library"),
     ]
 
 
@@ -139,7 +140,7 @@ def pairs_gate(a: argparse.Namespace) -> None:
 def pairs_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the rows as Markdown, distances as multiples of MD's own."""
     lines = [
-        "| pairs | molecule | source | torsions | over floor | joint maps | over floor | valid, % |",
+        "| pairs | molecule | source | torsions | over MD's own | joint maps | over MD's own | valid, % |",
         "|---|---|---|---|---|---|---|---|",
     ]
     least: dict[str, Any] = {}

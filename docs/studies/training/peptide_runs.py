@@ -126,7 +126,7 @@ def _make(task: tuple[Peptide, bool], deadline: float, folder: str) -> None:
     simulate_peptide(place, peptide, deadline, seeded=training)
 
 
-def account(folder: Path) -> dict[str, Any]:
+def summary(folder: Path) -> dict[str, Any]:
     """Return what is there: runs and simulated ns of each molecule, and in all."""
     rows = {}
     for peptide, training in _order():
@@ -153,13 +153,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--budget", default="3h", help="wall time after which no further run is begun")
     parser.add_argument("--workers", type=int, default=available_cores())
-    parser.add_argument("--account", action="store_true", help="say what is there and check it; simulate nothing")
+    parser.add_argument("--summary", action="store_true", help="say what is there and check it; simulate nothing")
     chosen = parser.parse_args(arguments)
-    if chosen.account:
-        print(json.dumps({**account(chosen.folder), "wrong": check(chosen.folder)}, indent=1))  # noqa: T201
+    if chosen.summary:
+        print(json.dumps({**summary(chosen.folder), "wrong": check(chosen.folder)}, indent=1))  # noqa: T201
         return
     in_order(_order, _make, parse_wall_s(chosen.budget, "--budget"), chosen.workers, str(chosen.folder))
-    print(json.dumps(account(chosen.folder)["ns"]))  # noqa: T201
+    print(json.dumps(summary(chosen.folder)["ns"]))  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """How near rollouts of a peptide come to MD of it, beside MD's own scatter and a library of monomers' torsions.
 
 Figures are Jensen-Shannon distances of 50 bins (36 x 36 of joint maps), means over all torsions of a peptide: phi, psi
-and chi, each folded by its symmetry. The floor is the mean over pairs of independent MD runs; a source's figure is the
+and chi, each folded by its symmetry. The replicate baseline is the mean over pairs of independent MD runs; a source's
+figure is the
 mean over each of its runs against each of MD's, of equal length and as many frames. The library draws each residue's
 torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat on joint maps
 of neighbours, or it has learned nothing of pairs. A phi > 0 that MD enters fewer than ten times in all leaves the maps
@@ -18,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.distributions import distance
-from surrogate.judge.measure.torsions import find_torsions
+from surrogate.comparison.measure.distributions import distance
+from surrogate.comparison.measure.torsions import find_torsions
 from surrogate.models.peptides.torsion_states import NEGATIVE_CORE_DEG, POSITIVE_CORE_DEG, POSITIVE_PHI_DEG
 from systems.chemistry.geometry import superpose, torsion
 from systems.chemistry.graph import backbone_torsions
@@ -100,10 +101,10 @@ def library(
     return out
 
 
-def rarely_positive(turns: Sequence[Turn], truth: Sequence[FloatArray]) -> list[int]:
+def rarely_positive(turns: Sequence[Turn], reference: Sequence[FloatArray]) -> list[int]:
     """Return the places of phi in `turns` that enter the left-handed side fewer than ten times in all of MD."""
     phi = [k for k, t in enumerate(turns) if t.kind == "phi"]
-    return [k for k in phi if crossings([x[:, k] for x in truth], 1.0)["entries"] < _LEAST_ENTRIES]
+    return [k for k in phi if crossings([x[:, k] for x in reference], 1.0)["entries"] < _LEAST_ENTRIES]
 
 
 def without(runs: Sequence[FloatArray], rare: Sequence[int]) -> list[FloatArray]:
@@ -114,15 +115,15 @@ def without(runs: Sequence[FloatArray], rare: Sequence[int]) -> list[FloatArray]
     return [x for x, whole in zip(kept, runs, strict=True) if len(x) >= len(whole) / 2]
 
 
-def score(turns: Sequence[Turn], truth: Sequence[FloatArray], source: Sequence[FloatArray], name: str) -> Scores:
-    """Return a source's distances to MD; `truth` and `source` are runs of torsions `(n_frames, n_turns)` of one
+def score(turns: Sequence[Turn], reference: Sequence[FloatArray], source: Sequence[FloatArray], name: str) -> Scores:
+    """Return a source's distances to MD; `reference` and `source` are runs of torsions `(n_frames, n_turns)` of one
     length."""
-    return _scores(turns, [(i, a, b) for i, a in enumerate(source) for b in truth], name)
+    return _scores(turns, [(i, a, b) for i, a in enumerate(source) for b in reference], name)
 
 
-def floor(turns: Sequence[Turn], truth: Sequence[FloatArray]) -> Scores:
+def floor(turns: Sequence[Turn], reference: Sequence[FloatArray]) -> Scores:
     """Return the distances between independent MD runs."""
-    return _scores(turns, [(k, a, b) for k, (a, b) in enumerate(combinations(truth, 2))], "MD")
+    return _scores(turns, [(k, a, b) for k, (a, b) in enumerate(combinations(reference, 2))], "MD")
 
 
 def _scores(turns: Sequence[Turn], pairs: list[tuple[int, FloatArray, FloatArray]], name: str) -> Scores:

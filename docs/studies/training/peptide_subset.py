@@ -76,8 +76,8 @@ def _drawn(subject: PeptideSubject, ranges: Ranges, n: int, rng: np.random.Gener
     """Draw at most `n` of the ranges, those with rare states of torsions more often."""
     stated = subject.chain.stated
     states = subject.states(torch.arange(subject.frames.n_frames))[:, stated.residue.cpu(), stated.slot.cpu()]
-    odds = balanced_starts(states).amax(dim=1).numpy() if states.shape[1] else np.ones(len(states))
-    share: npt.NDArray[np.float64] = np.array([odds[low:high].mean() for low, high in ranges])
+    probabilities = balanced_starts(states).amax(dim=1).numpy() if states.shape[1] else np.ones(len(states))
+    share: npt.NDArray[np.float64] = np.array([probabilities[low:high].mean() for low, high in ranges])
     drawn = rng.choice(len(ranges), size=min(n, len(ranges)), replace=False, p=share / share.sum())
     return [ranges[k] for k in drawn]
 

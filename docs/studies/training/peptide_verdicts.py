@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from systems.errors import InputError
 
 if TYPE_CHECKING:
-    from surrogate.judge.comparison import Judgement
+    from surrogate.comparison.comparison import Evaluation
 
 # Rows of the comparison that the table shows, by their keys, in their units.
 ROWS = {
@@ -23,21 +23,26 @@ ROWS = {
 }
 
 
-def verdict_row(judged: Judgement) -> dict[str, Any]:
+def verdict_row(evaluated: Evaluation) -> dict[str, Any]:
     """Return a molecule's verdict: each of ROWS for MD, the model and the replicate with their 95 % intervals, and by
     each measure how many ns of MD the rollouts are worth."""
-    found: dict[str, Any] = {"status": judged.status, "verdict": judged.verdict, "compared_ps": judged.compared_ps}
+    found: dict[str, Any] = {
+        "status": evaluated.status,
+        "verdict": evaluated.verdict,
+        "compared_ps": evaluated.compared_ps,
+    }
     for key in ROWS:
         try:
-            row = judged.row(key)
+            row = evaluated.row(key)
         except InputError:
             continue
         found[key] = {
             source: None if value is None else [value.value, value.low, value.high]
             for source, value in (("MD", row.reference), ("model", row.candidate), ("replicate", row.replicate))
         }
-    found["worth_ns"] = {
-        w.measure: [None if x is None else x / 1000.0 for x in (w.worth_ps, w.low_ps, w.high_ps)] for w in judged.worth
+    found["equivalent_ns"] = {
+        w.measure: [None if x is None else x / 1000.0 for x in (w.equivalent_ps, w.low_ps, w.high_ps)]
+        for w in evaluated.equivalent_time
     }
     return found
 
@@ -56,7 +61,7 @@ def verdicts_gate(a: argparse.Namespace) -> None:
             compared = compare(
                 runs[:half], [rollouts[:half]], folder / "report.html", replicate=runs[half:], overwrite=True
             )
-            record[folder.name] = verdict_row(compared.judgements[0])
+            record[folder.name] = verdict_row(compared.evaluations[0])
             sys.stderr.write(f"{folder.name}: {record[folder.name]['verdict']}\n")
     (a.folder / "verdicts.json").write_text(json.dumps(record, indent=1))
     sys.stdout.write(verdicts_table(record) + "\n")
@@ -64,11 +69,14 @@ def verdicts_gate(a: argparse.Namespace) -> None:
 
 def verdicts_table(record: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the record as Markdown: of each row the model's value beside MD's interval."""
-    lines = ["| molecule | " + " | ".join(ROWS.values()) + " | worth, ns |", "|" + "---|" * (len(ROWS) + 2)]
+    lines = [
+        "| molecule | " + " | ".join(ROWS.values()) + " | equivalent MD time, ns |",
+        "|" + "---|" * (len(ROWS) + 2),
+    ]
     for molecule, found in record.items():
         cells = [_cell(found[key]) if key in found else "-" for key in ROWS]
-        worth = [value for value in found["worth_ns"].values() if value[0] is not None]
-        least = min(worth, key=lambda value: value[0]) if worth else None
+        equivalent_time = [value for value in found["equivalent_ns"].values() if value[0] is not None]
+        least = min(equivalent_time, key=lambda value: value[0]) if equivalent_time else None
         lines.append(f"| {molecule} | " + " | ".join([*cells, _interval(least)]) + " |")
     return "\n".join(lines)
 

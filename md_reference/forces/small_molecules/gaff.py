@@ -147,7 +147,7 @@ _PARMCHK2_RUNS = 100
 # processor seconds on a core of an AMD EPYC, ten molecules of 21 to 72 atoms, none off by more than a factor of 2.3.
 SECONDS_AT_30_ATOMS = 7.3
 POWER = 3.3
-_WORTH_SAYING_S = 2.0
+_EQUIVALENT_TIME_SAYING_S = 2.0
 _log = logging.getLogger("surromd.charges")
 
 
@@ -409,7 +409,7 @@ def announced(scene: Scene) -> Iterator[Callable[[float], None] | None]:
     lines are warnings of the logger 'surromd.charges': on stderr unless a program that uses this package decides else.
     """
     expected = expected_s(scene.n_atoms)
-    if expected < _WORTH_SAYING_S:
+    if expected < _EQUIVALENT_TIME_SAYING_S:
         yield None
         return
     about = format_wall(float(f"{expected:.1g}"))

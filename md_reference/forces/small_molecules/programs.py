@@ -192,9 +192,9 @@ def run(
 def complaint(printed: str) -> str:
     """Return the lines of an output that say what is wrong, in one line."""
     lines = [" ".join(line.split()) for line in printed.splitlines()]
-    telling = [line for line in lines if _COMPLAINT.search(line) and not line.endswith("Fatal Error!")]
-    telling = [line for line in telling if "Errors = " not in line]
-    chosen = list(dict.fromkeys(telling))[:3] or [line for line in lines if line][-1:]
+    messages = [line for line in lines if _COMPLAINT.search(line) and not line.endswith("Fatal Error!")]
+    messages = [line for line in messages if "Errors = " not in line]
+    chosen = list(dict.fromkeys(messages))[:3] or [line for line in lines if line][-1:]
     return "; ".join(line.rstrip(".") for line in chosen) or "it said nothing"
 
 

@@ -63,10 +63,12 @@ def markdown(result: dict[str, Any]) -> str:
         *table([_row(row, _varies(result["rows"]), md["errors"][0]) for row in result["rows"]]),
         "",
         "JSD: Jensen-Shannon distance of the joint φ/ψ map (50 x 50) to the held-out runs, root mean square; "
-        f"{md['floor']:.3f} is what these have between them, and nothing below is claimed. MD, same seconds: the JSD "
-        "of as many processor seconds of OpenMM at 4 fs. Worth: how much MD is as far from the truth; faster: what "
-        "that MD takes, over what the rollout took. C1: autocorrelation of cos ψ after one frame (reference "
-        f"{_mean(md['correlation']):.3f}), τ: its relaxation time (reference {_mean(md['relaxation_ps']):.1f} ps). "
+        f"{md['replicate_baseline']:.3f} is what these have between them, and nothing below is claimed. MD, "
+        "same seconds: the JSD of as many processor seconds of OpenMM at 4 fs. Equivalent MD time: how much MD "
+        "is as far from the "
+        "reference; faster: what that MD takes, over what the rollout took. C1: autocorrelation of cos ψ after one "
+        f"frame (reference {_mean(md['correlation']):.3f}), τ: its relaxation time (reference "
+        f"{_mean(md['relaxation_ps']):.1f} ps). "
         "Bond variance: of bonds that vibrate, in per cent of the reference's. (timed): not rolled on, as replicas do "
         "not depend on those beside them.",
         "",
@@ -79,14 +81,14 @@ def markdown(result: dict[str, Any]) -> str:
 def crossings(result: dict[str, Any]) -> list[str]:
     """Return in words where each setting's point lies beside MD's curve; nothing of settings that break molecules."""
     lines = []
-    for row in _judged(result):
+    for row in _evaluated(result):
         if row["valid_half_angstrom_%"]["value"] < SOUND_PERCENT:
             continue
-        md_s = row["md_s_per_ns"]["mean"] * 1e-3 * row["worth"]["worth_ps"]
-        words = {"at least": "at least ", "less than": "less than "}.get(row["worth"]["bound"], "")
+        md_s = row["md_s_per_ns"]["mean"] * 1e-3 * row["equivalent_time"]["equivalent_ps"]
+        words = {"at least": "at least ", "less than": "less than "}.get(row["equivalent_time"]["bound"], "")
         lines.append(
             f"- {_name(row, result['rows'])}: after {row['spent_s']:.3g} s at {row['jsd']['value']:.3f}; OpenMM (4 fs) "
-            f"is there after {words}{md_s:.3g} s ({row['worth']['words']})."
+            f"is there after {words}{md_s:.3g} s ({row['equivalent_time']['words']})."
         )
     return ["Where MD's curve crosses:", "", *lines, ""] if lines else []
 
@@ -109,10 +111,10 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
     axes.axhline(md["floor"], color="black", lw=0.8, alpha=0.5)
     axes.annotate(f"two runs of {1e-3 * md['length_ps']:g} ns", (0.01, md["floor"]), xycoords=("axes fraction", "data"),
                   va="bottom", fontsize=8)  # fmt: skip
-    judged = _judged(result)
-    for solver in dict.fromkeys(row["solver"] for row in judged):
+    evaluated = _evaluated(result)
+    for solver in dict.fromkeys(row["solver"] for row in evaluated):
         axes.plot([], [], "o", color=_colour(solver), label=solver or "surrogate")
-    for row in judged:
+    for row in evaluated:
         colour = _colour(row["solver"])
         sound = row["valid_half_angstrom_%"]["value"] >= SOUND_PERCENT
         plain = "," not in row["label"]
@@ -138,7 +140,7 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
     figure.savefig(path, format=form, dpi=140)
 
 
-def _judged(result: dict[str, Any]) -> list[dict[str, Any]]:
+def _evaluated(result: dict[str, Any]) -> list[dict[str, Any]]:
     return [row for row in result["rows"] if "jsd" in row]
 
 
@@ -170,9 +172,9 @@ def _row(row: dict[str, Any], varies: list[str], shortest: float) -> dict[str, A
     }
     if "jsd" not in row:
         return out | {"JSD": "(timed)"}
-    worth = row["worth"]
+    equivalent_time = row["equivalent_time"]
     faster = [row[f"times_faster{end}"] for end in ("", "_low", "_high")]
-    bound = {"at least": "≥ ", "less than": "< "}.get(worth["bound"], "")
+    bound = {"at least": "≥ ", "less than": "< "}.get(equivalent_time["bound"], "")
     ends = "" if bound else f" [{_short(faster[1])}, {_short(faster[2])}]"
     same = row["md_of_same_seconds"]
     return out | {
@@ -180,7 +182,7 @@ def _row(row: dict[str, Any], varies: list[str], shortest: float) -> dict[str, A
         "20 % %": f"{row['bonds_20_percent_%']['value']:.2f}",
         "JSD": _interval(row["jsd"], 3),
         "MD, same seconds": f"> {shortest:.3f}" if same is None else f"{same:.3f}",
-        "worth": worth["words"],
+        "equivalent_time": equivalent_time["words"],
         "faster": f"{bound}{faster[0]:.2g}{ends}",
         "C1": _number(row["correlation"]["value"], 3),
         "τ / ps": _interval(row["relaxation_ps"], 1),
@@ -193,7 +195,7 @@ def _md_row(row: dict[str, Any], md: dict[str, Any]) -> dict[str, Any]:
         "time step": row["label"].removeprefix("OpenMM, "),
         "s/ns": _range(row["cpu_s_per_ns"]),
         "wall s/ns": f"{row['wall_s_per_ns']['mean']:.3g}",
-        f"s to {md['floor']:.3f}": f"{1e-3 * md['length_ps'] * row['cpu_s_per_ns']['mean']:.3g}",
+        f"s to {md['replicate_baseline']:.3f}": f"{1e-3 * md['length_ps'] * row['cpu_s_per_ns']['mean']:.3g}",
     }
 
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from surrogate.bench.cost_error.sweep_settings import SIMD
-from surrogate.judge.rows.relaxation_rows import relaxation_of, turning
+from surrogate.comparison.rows.relaxation_rows import relaxation_of, turning
 
 if TYPE_CHECKING:
-    from surrogate.judge.rows.rows import Sample
+    from surrogate.comparison.rows.rows import Sample
     from surrogate.models.weights import Weights
 
 # Below so many effective samples of MD, nobody knows its relaxation time.

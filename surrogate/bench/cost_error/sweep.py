@@ -3,7 +3,8 @@
 `surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of the φ/ψ map against two held-
 out runs, its cost the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so
 that the ratio of the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out
-run against the whole of the other (`judge.worth`): it is taken to be the same at each time step, by simulated time.
+run against the whole of the other (`comparison.worth`): it is taken to be the same at each time step, by simulated
+time.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ import numpy as np
 
 from surrogate.bench.cost_error.cost_page import write_cost_error
 from surrogate.bench.cost_error.effective_samples import effective_row, training_cost
-from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
+from surrogate.bench.cost_error.errors_beside_md import (
+    ReferenceForces,
+    compare_frames,
+    compare_reference,
+    equivalent_time_row,
+    read_reference,
+)
 from surrogate.bench.cost_error.paired_timing import chunk_ps, md_costs, roll_in_turns
 from surrogate.bench.cost_error.sweep_settings import (
     SIMD,
@@ -91,16 +98,16 @@ def run_cost_error(
     scene = fitted[0].domain.scene
     scenes = {w.domain.scene.topology_hash: w.domain.scene for w in fitted}  # atoms may stand in another order
     report("reading the references")
-    truths = {hashed: read_truth(of, reference, replicate, config.lag_ps) for hashed, of in scenes.items()}
-    truth = truths[scene.topology_hash]
+    references = {hashed: read_reference(of, reference, replicate, config.lag_ps) for hashed, of in scenes.items()}
+    ref = references[scene.topology_hash]
     result |= {"machine": machine_facts(), "scene": scene.name, "files": [p.name for p in (*reference, *replicate)]}
     try:
         with torch_threads(config.threads):
             if "slowest" not in result.get("md", {}):  # an earlier version's did not say
                 report("OpenMM")
-                result["md"] = judge_truth(truth, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
+                result["md"] = compare_reference(ref, seed=config.seed) | {"cost": md_costs(fitted[0], config)}
             for (one, settings), as_rolled in zip(chosen, fitted, strict=True):
-                of_these = truths[as_rolled.domain.scene.topology_hash]
+                of_these = references[as_rolled.domain.scene.topology_hash]
                 for setting in settings:
                     if not any(row["weights_hash"] == one.hash and _is(row, setting) for row in result["rows"]):
                         report(f"{one.path.stem}: {setting.label}")
@@ -134,9 +141,14 @@ def _earned(row: dict[str, Any], weights: Weights, md: dict[str, Any]) -> dict[s
 
 
 def measure_setting(
-    weights: Weights, setting: Setting, truth: Truth, config: CostErrorConfig, slowest: dict[str, Any] | None = None
+    weights: Weights,
+    setting: Setting,
+    ref: ReferenceForces,
+    config: CostErrorConfig,
+    slowest: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Roll one setting in parts, by turns with OpenMM; return its cost, its errors and its worth, JSON-able.
+    """Roll one setting in parts, by turns with OpenMM; return its cost, its errors and its equivalent MD time,
+    JSON-able.
     `slowest`: the torsion that effective samples are counted by (effective_samples.slowest_torsion).
 
     A batch smaller than the usual one is only timed, over a few chunks: replicas do not depend on those beside them.
@@ -153,9 +165,9 @@ def measure_setting(
         sampler = ChunkSampler(weights, solver=setting.solver, solver_steps=setting.steps, precision=setting.precision,
                                compile=setting.compile)  # fmt: skip
         roller = Roller(weights, sampler, rows=setting.batch, seed=config.seed)
-        settled = -(-config.settle_ps // (sampler.n_new * weights.domain.lag_ps))
+        resolved = -(-config.discarded_ps // (sampler.n_new * weights.domain.lag_ps))
         started = time.process_time()
-        roller.advance(max(1, int(settled)) * sampler.n_new)
+        roller.advance(max(1, int(resolved)) * sampler.n_new)
         row["first_chunks_s"] = time.process_time() - started
         only_timed = setting.batch < USUAL_BATCH
         total_ps = min(config.time_ps, chunk_ps(weights, sampler, setting) * config.rounds * 2) if only_timed \
@@ -168,12 +180,12 @@ def measure_setting(
     row |= {"bf16": sampler.precision.bf16, "evaluations": sampler.evaluations_per_chunk, "ns": ns, **costs}
     if only_timed:
         return row | {"timed_only": True}
-    every = max(1, round(truth.reference.lag_ps / weights.domain.lag_ps))
-    errors, worth = judge_frames(
-        frames[:, every - 1 :: every], truth, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
+    every = max(1, round(ref.reference.lag_ps / weights.domain.lag_ps))
+    errors, equivalent_time = compare_frames(
+        frames[:, every - 1 :: every], ref, seed=config.seed, slowest=None if slowest is None else slowest["torsion"]
     )
     spent = ns * row["cpu_s_per_ns"]["mean"]
-    return row | errors | {"spent_s": spent} | worth_row(worth, spent, row["md_s_per_ns"]["mean"])
+    return row | errors | {"spent_s": spent} | equivalent_time_row(equivalent_time, spent, row["md_s_per_ns"]["mean"])
 
 
 def _is(row: dict[str, Any], setting: Setting) -> bool:

@@ -41,10 +41,10 @@ class Setting:
 @dataclass(frozen=True, kw_only=True)
 class CostErrorConfig:
     """What is the same for all settings. Rolled are `time_ps` in all replicas together, in `rounds` parts, after
-    `settle_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
+    `discarded_ps` of each replica that count in neither cost nor error; MD runs `slice_ps` before each part."""
 
     time_ps: float = option("Rollout time per setting, all replicas together.", 20_000.0)
-    settle_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
+    discarded_ps: float = option("Of each replica, before anything counts.", 100.0, words=None)
     rounds: int = option("Number of blocks, alternating with OpenMM.", 4, within=(1, None))
     slice_ps: float = option("Of MD before each part.", 40.0, words=None)
     lag_ps: float | None = option("Interval between compared frames.", None, unset="as in the references")
@@ -53,7 +53,7 @@ class CostErrorConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.time_ps <= 0 or self.slice_ps <= 0 or self.settle_ps < 0 or (self.lag_ps or 1.0) <= 0:
+        if self.time_ps <= 0 or self.slice_ps <= 0 or self.discarded_ps < 0 or (self.lag_ps or 1.0) <= 0:
             raise InputError("times must be positive.")
 
 

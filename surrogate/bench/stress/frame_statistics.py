@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surrogate.judge.measure.distributions import distance
+from surrogate.comparison.measure.distributions import distance
 from systems.chemistry.geometry import torsion
 from systems.chemistry.graph import rotatable_torsions
 from systems.chemistry.validity import BOND_HALF_ANGSTROM, INVALID, NOT_FINITE, Geometry, check_frames

@@ -29,7 +29,7 @@ SOLVER_STEPS = (2, 5, 10, 20, 40)
 BATCHES = (1, 8, 64, 512)
 TIMESTEPS_PS = (0.001, 0.002, 0.004, 0.005)
 # Before anything is counted OpenMM leaves the minimum that it starts from.
-SETTLE_PS = 10.0
+DISCARDED_PS = 10.0
 _ROWS = 8
 Frames = npt.NDArray[np.float64]
 
@@ -43,8 +43,8 @@ def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> lis
     geometry = Geometry.from_dict(weights.domain.geometry)
     rows: list[dict[str, Any]] = []
     with _in_double():
-        truth = inputs.chunk(copy.deepcopy(weights.model).double(), torch.float64)
-        rows.append({"arithmetic": "fp64", **_valid(truth, geometry)})
+        reference = inputs.chunk(copy.deepcopy(weights.model).double(), torch.float64)
+        rows.append({"arithmetic": "fp64", **_valid(reference, geometry)})
 
     def add(name: str, draw: Callable[[], Frames]) -> None:
         try:
@@ -55,7 +55,7 @@ def measure_precision(weights: Weights, *, compiled: bool, seed: int = 0) -> lis
             rows.append({"arithmetic": name, "outcome": f"not run: {first_line(error)[:120]}"})
             return
         spent = max(time.process_time() - started, 1e-9)
-        gap = np.abs(frames - truth)
+        gap = np.abs(frames - reference)
         rows.append(
             {
                 "arithmetic": name,
@@ -175,7 +175,7 @@ def measure_openmm(weights: Weights, *, n_frames: int, seed: int = 0) -> list[di
         energies, temperatures = np.empty(n_frames), np.empty(n_frames)
         try:
             with openmm_of(domain, timestep_ps, seed) as engine:
-                engine.step(round(SETTLE_PS / timestep_ps))
+                engine.step(round(DISCARDED_PS / timestep_ps))
                 started = time.process_time()
                 # Of a model with shorter frames than this step, every step is one.
                 steps = max(1, round(lag_ps / timestep_ps))

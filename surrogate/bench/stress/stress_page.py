@@ -74,8 +74,10 @@ def _flat(row: dict[str, Any]) -> dict[str, Any]:
         if key in drift.get("first", {}) and key in drift.get("last", {}):
             out[title] = f"{drift['first'][key]:.3g} → {drift['last'][key]:.3g}"
     if "torsion_jsd" in drift:
-        floor = drift.get("torsion_jsd_floor")
-        out["torsion distance"] = f"{drift['torsion_jsd']:.3f}" + (f" (by chance {floor:.3f})" if floor else "")
+        replicate_baseline = drift.get("torsion_jsd_floor")
+        out["torsion distance"] = f"{drift['torsion_jsd']:.3f}" + (
+            f" (by chance {replicate_baseline:.3f})" if replicate_baseline else ""
+        )
     if "energy_first_kj_mol" in drift and "energy_last_kj_mol" in drift:
         parts = [
             f"{drift[f'energy_{k}_kj_mol']:.1f} ± {drift[f'energy_{k}_error_kj_mol']:.1f}" for k in ("first", "last")

@@ -164,7 +164,7 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
     row: dict[str, Any] = {"guard": guard, "asked": n_frames, "replicas": config.replicas}
     try:
         rollout(scene, weights, outs, RolloutConfig(time_ps=each * lag_ps, seed=config.seed, guard=guard), resume=True)
-    except SimulationError as error:  # stopped by the guards: what came before is judged
+    except SimulationError as error:  # stopped by the guards: what came before is evaluated
         row["outcome"] = str(error)
         if not all(path.exists() for path in outs):
             return row
@@ -178,12 +178,12 @@ def _one_length(weights: Weights, folder: Path, config: StressConfig, n_frames: 
         with open_trajectory(path) as reader:
             frames = reader.read()
             flags = reader.flags
-            account, cost = reader.record["interventions"], reader.record.get("cost", {})
+            summary, cost = reader.record["interventions"], reader.record.get("cost", {})
         replicas.append(frames)
         bad = (check_frames(frames, geometry) & np.uint16(INVALID)) != 0
         unmarked += int(np.count_nonzero(bad & ((flags & np.uint16(INVALID)) == 0))) if flags is not None else len(bad)
-        chunks, caught = chunks + account["chunks"], caught + account["chunks_caught"]
-        seconds = account["seconds"]
+        chunks, caught = chunks + summary["chunks"], caught + summary["chunks_caught"]
+        seconds = summary["seconds"]
         draw_s, check_s = seconds.get("draw", 0.0), seconds.get("check", 0.0)
         help_s = sum(spent for of, spent in seconds.items() if of not in ("draw", "check"))
         row["wall_s"] = cost.get("batch_wall_s")

@@ -290,7 +290,7 @@ def train_lam_slide(
     Raises InputError when the frames do not suit the configuration, SimulationError when training diverges.
     """
     out = Path(out)
-    model_config = _settle(frames, model_config, config)
+    model_config = _resolve(frames, model_config, config)
     strides = _strides(frames, model_config)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
@@ -320,7 +320,7 @@ def train_lam_slide(
     return out
 
 
-def _settle(frames: TrainingFrames, model_config: LamSlideConfig, config: TrainingConfig) -> LamSlideConfig:
+def _resolve(frames: TrainingFrames, model_config: LamSlideConfig, config: TrainingConfig) -> LamSlideConfig:
     """Return the configuration with what the frames decide. Raises InputError where the two do not fit."""
     if frames.canonical != model_config.canonical:
         raise InputError("frames and model disagree on canonical frames; make the windows with the same setting.")
@@ -457,7 +457,7 @@ def _check_start(start: Weights, frames: TrainingFrames, model_config: LamSlideC
 
 # LaM-SLidE behind the verb `train`: choices for the references, settings, and the start of the training.
 
-_SETTLED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
+_RESOLVED = frozenset({"budget_s", "stage_one_steps", "stage_two_steps", "seed", "device"})
 
 
 class LamSlideTrainer(Trainer):
@@ -502,7 +502,7 @@ class LamSlideTrainer(Trainer):
         }
         if request.longest_lag_ps is not None:
             asked["longest_lag_ps"] = request.longest_lag_ps
-        return Settings(model, request.settings(TrainingConfig, asked), _SETTLED)
+        return Settings(model, request.settings(TrainingConfig, asked), _RESOLVED)
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         """See `Trainer.prepare`."""

@@ -24,7 +24,8 @@ class PainetTraining:
     """The optimisation. `noise`: standard deviation of what is added to the state a training window starts from, as a
     share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
     errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after
-    one chunk from the truth, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
+    one chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the
+    last
     frame's velocity beside the positions, each in units of its own change over a chunk.
 
     `every_frame`: velocities of all predicted frames count, not the last's alone, and each frame is measured by itself:
@@ -116,7 +117,8 @@ def train_painet(
 
 
 class StateWindows:
-    """States and their futures, cut from frames: two chunks long, so that a pushforward has a truth to compare with.
+    """States and their futures, cut from frames: two chunks long, so that a pushforward has a reference to compare
+    with.
 
     `position_scale_nm`, `change_scale_nm_ps`: root mean square displacement and change of velocity over a chunk, what
     errors are measured in; `velocity_scale_nm_ps`: root mean square velocity. `frame_scales` (2, n_new, 1, 1): root
@@ -211,8 +213,8 @@ class PainetTrainer(Trainer):
         """See `Trainer.settings`. Frame spacing and bath are the reference's (`for_frames`)."""
         asked = {"budget_s": request.budget_s, "steps": request.steps, "seed": request.seed, "device": request.device}
         training = request.settings(PainetTraining, asked)
-        settled = frozenset({*asked, "lag_ps", "temperature_k", "friction_per_ps"})
-        return Settings(PainetConfig.from_dict(request.model), training, settled)
+        resolved = frozenset({*asked, "lag_ps", "temperature_k", "friction_per_ps"})
+        return Settings(PainetConfig.from_dict(request.model), training, resolved)
 
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         """See `Trainer.prepare`. Raises InputError for references without velocities."""

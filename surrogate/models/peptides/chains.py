@@ -299,7 +299,7 @@ _ROOM = 1.03
 _TURNED_AT_ONCE = 1024
 
 
-def settle(tokens: Tensor, states: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor, Tensor]:
+def resolve_settings(tokens: Tensor, states: Tensor, chain: ChainFeatures) -> tuple[Tensor, Tensor, Tensor]:
     """Tokens `(n, n_residues, n_slots)` of frames that should be in `states` (n, n_residues, MOST_TORSIONS) -> frames
     `(n, n_atoms, 3)` nm, in the pose that the root has; and which of them `(n,)` could not be set right: those with a
     torsion that is in another state, and those in which atoms overlap."""

@@ -331,7 +331,7 @@ def chain_features(scene: Scene, config: PeptideConfig) -> ChainFeatures:
     """Return what a model of peptides is told of one. Raises InputError as `chain_layout` and `settled` do."""
     if config.scale is None:
         raise InputError("these weights do not say how peptides' coordinates are scaled.")
-    layout = settled(chain_layout(scene), config.scale)
+    layout = resolved(chain_layout(scene), config.scale)
     fitted = fitted_atoms(scene)
     template_nm = scene.positions_nm - scene.positions_nm[fitted].mean(axis=0)
     return ChainFeatures(
@@ -450,7 +450,7 @@ def unknown_coordinates(layout: ChainLayout, scale: ChainScale) -> list[str]:
     ]
 
 
-def settled(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
+def resolved(layout: ChainLayout, scale: ChainScale) -> ChainLayout:
     """Return a layout that calls rigid what the data hold rigid. Raises InputError for coordinates no data tell of."""
     if unknown := unknown_coordinates(layout, scale):
         raise InputError(

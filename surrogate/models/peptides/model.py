@@ -23,9 +23,15 @@ from torch.nn import functional as F
 
 from surrogate.models.lam_slide import flow
 from surrogate.models.layers import ParallelBlock, TimeEmbedding, rotary_angles
-from surrogate.models.peptides.chains import ChainFeatures, settle
+from surrogate.models.peptides.chains import ChainFeatures, resolve_settings
 from surrogate.models.peptides.layout import ENDS, PeptideConfig, chain_features
-from surrogate.models.peptides.torsion_states import MOST_STATES, MOST_TORSIONS, StateJumps, times_apart, told_states
+from surrogate.models.peptides.torsion_states import (
+    MOST_STATES,
+    MOST_TORSIONS,
+    StateJumps,
+    conditioning_states,
+    times_apart,
+)
 from surrogate.models.propagator import Chunk, Molecule, Propagator
 from systems.chemistry.geometry import superpose
 from systems.errors import InputError
@@ -77,7 +83,7 @@ class TypedLinear(nn.Module):
         return self.shared(x) + own
 
 
-class Told(NamedTuple):
+class Conditioning(NamedTuple):
     """What the evaluations of a chunk have in common: `types` (r,), `of_type` (r, width), `given` (b, 1, r, width) the
     embedded frame, `of_frames` (b, t, r, width) the frames' times and states, `rope` of the frames, and of each layer
     the `biases` between residues.
@@ -132,21 +138,22 @@ class PeptideFlow(nn.Module):
             nn.init.zeros_(module.weight)
             nn.init.zeros_(module.bias)
 
-    def forward(self, o: Tensor, tau: Tensor, told: Told) -> Tensor:
+    def forward(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
         """`o` (b, t, r, slots), `tau` (b,), or (1,) of all, `told` what the method of that name returns -> like `o`."""
         skip, out, scale_in = (flow.expand(v, o) for v in flow.preconditioning(tau, "linear"))
-        return skip * o + out * self._network(o * scale_in, tau, told)
+        return skip * o + out * self._network(o * scale_in, tau, conditioning)
 
-    def told(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Told:
+    def conditioning(self, known: Tensor, times_ps: Tensor, places: Tensor, states: Tensor) -> Conditioning:
         """Return what all evaluations of a chunk have in common, of the given frame `known` (b, r, slots), `times_ps`
-        (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others (`told_states`)."""
+        (b, t), `places` (r, 3), and `states` (b, 1 + t, r, n) of the given frame and the others
+        (`conditioning_states`)."""
         types = places[:, 0]
         of_states = self.of_states(states, types)
         of_type: Tensor = sum((table(places[:, k]) for k, table in enumerate(self.of_type)), torch.zeros(()))
         angles = rotary_angles(times_ps.shape[1] + 1, self.config.width // self.config.n_heads).to(known.device)
         place = torch.arange(len(types), device=known.device)
         apart = (place[:, None] - place).clamp(-_FAR, _FAR) + _FAR
-        return Told(
+        return Conditioning(
             types,
             of_type,
             self.of_known(known[:, None], types) + of_states[:, :1] + self.of_given,
@@ -155,16 +162,19 @@ class PeptideFlow(nn.Module):
             [cast(PeptideLayer, layer).of_distance(apart).permute(2, 0, 1) for layer in self.layers],
         )
 
-    def _network(self, o: Tensor, tau: Tensor, told: Told) -> Tensor:
-        h = torch.cat([told.given, self.of_noisy(o, told.types) + told.of_frames], dim=1) + told.of_type
+    def _network(self, o: Tensor, tau: Tensor, conditioning: Conditioning) -> Tensor:
+        h = (
+            torch.cat([conditioning.given, self.of_noisy(o, conditioning.types) + conditioning.of_frames], dim=1)
+            + conditioning.of_type
+        )
         time = F.silu(self.embed_tau(tau))
         modulation = self.modulation(time).unflatten(-1, (6, -1))
         h = h.transpose(1, 2)
-        for layer, bias in zip(self.layers, told.biases, strict=True):
-            h = layer(h, modulation, told.rope, bias)
+        for layer, bias in zip(self.layers, conditioning.biases, strict=True):
+            h = layer(h, modulation, conditioning.rope, bias)
         shift, scale = self.final_modulation(time)[:, None, None, :].chunk(2, dim=-1)
         h = F.layer_norm(h.transpose(1, 2)[:, 1:], h.shape[-1:]) * (1.0 + scale) + shift
-        found: Tensor = self.final(h, told.types)
+        found: Tensor = self.final(h, conditioning.types)
         return found.float()
 
     def _of_times(self, times_ps: Tensor) -> Tensor:
@@ -313,18 +323,18 @@ class PeptideSlide(Propagator):
 
         def solve(rows: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """Return frames, and in which rows some disobey their states and some overlap, all that could be done."""
-            of_states = told_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
-            told = self.flow.told(known[rows], times[rows], chain.places, of_states)
+            of_states = conditioning_states(torch.cat([now[rows, None], states[rows]], dim=1), counts)
+            conditioning = self.flow.conditioning(known[rows], times[rows], chain.places, of_states)
 
             def predict(o: Tensor, tau: Tensor) -> Tensor:
                 nonlocal evaluations
                 evaluations += len(rows) / len(known)
-                return torch.where(filled, self.flow(o, tau, told), 0.0)
+                return torch.where(filled, self.flow(o, tau, conditioning), 0.0)
 
             y = flow.SOLVERS[solver or self.solvers[0]](predict, drawn, solver_steps, "linear")
             tokens = self._tokens(self.from_innovations(y, known[rows], times[rows], types), states[rows], chain)
-            settled = settle(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
-            frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in settled)
+            resolved = resolve_settings(tokens.flatten(0, 1), states[rows].flatten(0, 1), chain)
+            frames, astray, crowded = (x.unflatten(0, tokens.shape[:2]) for x in resolved)
             return self._laid(frames, chain), astray.any(-1), crowded.any(-1)
 
         frames, astray, crowded = solve(rows, drawn)

@@ -35,7 +35,8 @@ _CLUSTERED_FRAMES = 20_000
 _DIMENSIONS = 6
 # No frame counts more than so many average ones: a cell hardly visited would otherwise be drawn over and over.
 _LARGEST = 20.0
-# How many jumps between any two frames each run stands for, its beginning and its end; a frame's odds to take part grow
+# How many jumps between any two frames each run stands for, its beginning and its end; a frame's probabilities to take
+# part grow
 # with this power of its place in its run.
 _JUMPS_A_RUN, _LATE = 2.0, 2
 _CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
@@ -171,8 +172,8 @@ class PeptideSubject:
             name = self.frames.scene.residue_names[residue]
             if name in positive_phi_kt and types[residue + 1] != "PRO":
                 states = states + len(shares) * self._states[kept, residue, 0]
-                odds = float(np.exp(-positive_phi_kt[name]))
-                shares = np.concatenate([shares, shares * odds])
+                probabilities = float(np.exp(-positive_phi_kt[name]))
+                shares = np.concatenate([shares, shares * probabilities])
         return states, shares
 
     @cached_property
@@ -395,8 +396,10 @@ def _distinct(ahead: Tensor, longest: int) -> Tensor:
     return torch.minimum(found, top)
 
 
-# Windows from which the odds of changes of states are learned: what is rare is drawn more often than it occurs.
-# What a torsion in a rare state does next may be learned from as many windows as there are: its odds are conditional on
+# Windows from which the probabilities of changes of states are learned: what is rare is drawn more often than it
+# occurs.
+# What a torsion in a rare state does next may be learned from as many windows as there are: its probabilities are
+# conditional on
 # the state that it starts from, however often windows start there. Changes that are rare themselves may be drawn more
 # often, too, if each then counts less in the loss, in proportion, and so may windows chosen for another torsion's sake:
 # the loss stays what it was, but no longer rests on the few batches that happen to hold such a change.
@@ -421,16 +424,18 @@ class StateWindows:
 
     @staticmethod
     def of(subject: PeptideSubject, config: PeptideConfig) -> StateWindows:
-        """Return windows drawn as `PeptideSubject.windows` does, and their odds."""
+        """Return windows drawn as `PeptideSubject.windows` does, and their probabilities."""
         idx, times = subject.windows(_POOL, config, torch.Generator().manual_seed(_POOL_SEED))
         stated = subject.chain.stated
         states = subject.states(idx)[..., stated.residue.cpu(), stated.slot.cpu()]
         started = balanced_starts(states[:, 0])
-        odds = rare_changes(states) * started.max(dim=1).values
-        odds = 1.0 - _FOR_RARE + _FOR_RARE * odds / odds.mean()
+        probabilities = rare_changes(states) * started.max(dim=1).values
+        probabilities = 1.0 - _FOR_RARE + _FOR_RARE * probabilities / probabilities.mean()
         share = torch.zeros(len(idx), stated.n_residues, MOST_TORSIONS)
-        share[:, stated.residue, stated.slot] = (odds.sum() / started.sum(0) * started / odds[:, None]).float()
-        return StateWindows(idx, times, odds.cumsum(0), share)
+        share[:, stated.residue, stated.slot] = (
+            probabilities.sum() / started.sum(0) * started / probabilities[:, None]
+        ).float()
+        return StateWindows(idx, times, probabilities.cumsum(0), share)
 
     def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return frames `(n, 1 + t)`, times `(n, t)` ps and what each counts `(n, n_residues, MOST_TORSIONS)`."""
@@ -442,11 +447,11 @@ class StateWindows:
 def balanced_starts(first: Tensor) -> Tensor:
     """States `(n, torsions)` that windows start from -> how much more often `(n, torsions)`, float64, each should be
     drawn for the rarer states of a torsion to be as frequent as its others."""
-    odds = torch.ones(first.shape, dtype=torch.float64)
+    probabilities = torch.ones(first.shape, dtype=torch.float64)
     for k in range(first.shape[1]):
         _, which, counts = first[:, k].unique(return_inverse=True, return_counts=True)
-        odds[:, k] = (len(first) / (len(counts) * counts.double()))[which]
-    return odds.clamp(1.0, _MOST)
+        probabilities[:, k] = (len(first) / (len(counts) * counts.double()))[which]
+    return probabilities.clamp(1.0, _MOST)
 
 
 def rare_changes(states: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ _WIDTH = 96
 _WAVES = 8
 # Before training, a torsion changes to another state once in so many frames (in logits).
 _RARELY = -5.0
-# A step of training moves the odds by so many times as much as another parameter.
+# A step of training moves the probabilities by so many times as much as another parameter.
 _FAST = 10.0
 
 
@@ -94,14 +94,14 @@ class StatedTorsions:
         return found
 
 
-def told_states(states: Tensor, counts: Tensor) -> Tensor:
+def conditioning_states(states: Tensor, counts: Tensor) -> Tensor:
     """States `(..., r, MOST_TORSIONS)` -> numbers `(..., r, MOST_TORSIONS * MOST_STATES)`, 1 for the state that each
     torsion is in, 0 for others and where `counts` (r, MOST_TORSIONS) says that there is none."""
     return (F.one_hot(states, MOST_STATES) * (counts > 0)[..., None]).flatten(-2).float()
 
 
 class StateJumps(nn.Module):
-    """The odds that torsions change their states between a frame and the next.
+    """The probabilities that torsions change their states between a frame and the next.
 
     They follow from the residue's type, its numbers in the given frame, its states and its two neighbours' in that and
     in the frame before, its own in the one before that, the new states of its torsions before this one (side chains
@@ -136,7 +136,7 @@ class StateJumps(nn.Module):
     def of_known(self, known: Tensor, states: Tensor, places: Tensor, counts: Tensor) -> Tensor:
         """What all frames of a chunk have in common: `known` (b, r, slots), its `states` (b, r, MOST_TORSIONS),
         `places` (r, 3) -> (b, r, width)."""
-        beside = _beside(told_states(states, counts))
+        beside = _beside(conditioning_states(states, counts))
         h: Tensor = sum((of(x) for of, x in zip(self.of_given, beside, strict=True)), self.of_numbers(known.float()))
         return h + self.of_type(places[:, 0])
 
@@ -144,7 +144,7 @@ class StateJumps(nn.Module):
         self, times_ps: Tensor, apart_ps: Tensor, places: Tensor, counts: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return what follows from frames' `times_ps` and `apart_ps` (b, t), after the given frame and after the one
-        before: `(b, t, width)`, and the levels of the odds `(b, t, MOST_TORSIONS, r, from, to)`."""
+        before: `(b, t, width)`, and the levels of the probabilities `(b, t, MOST_TORSIONS, r, from, to)`."""
         logs = torch.stack([times_ps, apart_ps], dim=-1).float().clamp(min=1e-3).log10()
         angles = logs[..., None] * self.waves
         waves = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
@@ -155,22 +155,22 @@ class StateJumps(nn.Module):
         levels = (level + slope * logs[..., 1, None, None, None, None]).masked_fill(absent, -torch.inf)
         return self.of_times(torch.cat([waves, logs], dim=-1)), levels
 
-    def of_frames(self, told: Tensor, earlier: Tensor) -> Tensor:
-        """What `told_states` returns of the frame before each, `told` (b, t, r, n), and of the one before that,
+    def of_frames(self, conditioning: Tensor, earlier: Tensor) -> Tensor:
+        """What `conditioning_states` returns of the frame before each, `told` (b, t, r, n), and of the one before that,
         `earlier` -> (b, t, r, width)."""
         of_all = torch.cat([of.weight for of in (*self.of_before, self.of_earlier)], dim=1)
-        return F.linear(torch.cat([*_beside(told), earlier], dim=-1), of_all)
+        return F.linear(torch.cat([*_beside(conditioning), earlier], dim=-1), of_all)
 
-    def odds(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, told: Tensor) -> Tensor:
+    def probabilities(self, torsion: int, h: Tensor, levels: Tensor, now: Tensor, conditioning: Tensor) -> Tensor:
         """Return the logits `(b, t, r, MOST_STATES)` of the new state of one torsion of each residue.
 
         `h` (b, t, r, width) is what `of_known`, `of_times_alone` and `of_frames` add up to, `levels` what
         `of_times_alone` returns; `now` (b, t, r) the torsion's state in the frame before, `told` (b, t, r, n) what
-        `told_states` returns of the new frame, of which torsions before this one count.
+        `conditioning_states` returns of the new frame, of which torsions before this one count.
         """
         n = torsion * MOST_STATES
         of_new = cast(nn.Linear, self.of_new[torsion]).weight
-        h = F.silu(h + F.linear(told[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
+        h = F.silu(h + F.linear(conditioning[..., :n], of_new[:, :n], self.of_torsion.weight[torsion]))
         at = now[..., None, None].expand(*now.shape, 1, MOST_STATES)
         level = levels[:, :, torsion].expand(*now.shape, -1, -1).gather(-2, at)[..., 0, :]
         # To stay has the logit zero.
@@ -196,13 +196,16 @@ class StateJumps(nn.Module):
             before, new = states[:, :-1], states[:, 1:]
             earlier = torch.cat([before[:, :1], before[:, :-1]], dim=1)
             of_times, levels = self.of_times_alone(times_ps, apart_ps, places, counts)
-            h = self.of_frames(told_states(before, counts), told_states(earlier, counts)) + of_times[:, :, None]
+            h = (
+                self.of_frames(conditioning_states(before, counts), conditioning_states(earlier, counts))
+                + of_times[:, :, None]
+            )
             h = h + self.of_known(known, states[:, 0], places, counts)[:, None]
-            told = told_states(new, counts)
+            conditioning = conditioning_states(new, counts)
             total = known.new_zeros(())
             for torsion in torch.nonzero((counts > 0).any(0))[:, 0].tolist():
                 has = counts[:, torsion] > 0
-                logits = self.odds(torsion, h, levels, before[..., torsion], told)[:, :, has]
+                logits = self.probabilities(torsion, h, levels, before[..., torsion], conditioning)[:, :, has]
                 chosen = new[..., has, torsion]
                 each = F.cross_entropy(logits.flatten(0, -2), chosen.flatten(), reduction="none").reshape(chosen.shape)
                 total = total + (each if share is None else share[:, None, has, torsion] * each).sum()
@@ -222,17 +225,23 @@ class StateJumps(nn.Module):
             residues, most = torch.arange(len(counts), device=known.device), (counts - 1).clamp(min=0)
             torsions = torch.nonzero((counts > 0).any(0))[:, 0].tolist()
             now, found = states[:, None], []
-            before = told = told_states(now, counts)
+            before = conditioning = conditioning_states(now, counts)
             for k in range(times_ps.shape[1]):
                 at = slice(k, k + 1)
-                h = self.of_frames(told, before) + common[:, at]
-                new, before, told = torch.zeros_like(now), told, torch.zeros_like(told)
+                h = self.of_frames(conditioning, before) + common[:, at]
+                new, before, conditioning = torch.zeros_like(now), conditioning, torch.zeros_like(conditioning)
                 for torsion in torsions:
-                    share = self.odds(torsion, h, levels[:, at], now[..., torsion], told).softmax(-1).cumsum(-1)
+                    share = (
+                        self.probabilities(torsion, h, levels[:, at], now[..., torsion], conditioning)
+                        .softmax(-1)
+                        .cumsum(-1)
+                    )
                     # Shares may end below one by rounding.
                     drawn = (uniform[:, at, :, torsion, None] >= share[..., :-1]).sum(-1).minimum(most[:, torsion])
                     new[..., torsion] = drawn
-                    told[..., torsion * MOST_STATES : (torsion + 1) * MOST_STATES] = ones[residues, torsion, drawn]
+                    conditioning[..., torsion * MOST_STATES : (torsion + 1) * MOST_STATES] = ones[
+                        residues, torsion, drawn
+                    ]
                 found.append(new)
                 now = new
             return torch.cat(found, dim=1)

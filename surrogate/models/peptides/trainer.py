@@ -44,21 +44,23 @@ from surrogate.models.peptides.torsion_states import (
     MOST_STATES,
     NEGATIVE_CORE_DEG,
     POSITIVE_CORE_DEG,
+    conditioning_states,
     times_apart,
-    told_states,
 )
 from surrogate.models.weights import Weights, load_weights, provenance_of, read_header, save_weights, training_domain
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
-# The odds of entering phi > 0, set to those of leaving it and to how likely it is.
+# The probabilities of entering phi > 0, set to those of leaving it and to how likely it is.
 # Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries,
 # but only as well weighted as a few frames are, and a rate that is three times too high shows in no loss: nearly every
-# window holds no entry. What is known well are the odds of leaving and the free energy of phi > 0 (umbrella sampling),
-# and in equilibrium as many frames enter as leave. So after training the odds of entering are moved, by a level of each
+# window holds no entry. What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella
+# sampling),
+# and in equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a
+# level of each
 # residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
 
-# Frames of either side by which odds are told, drawn anew by this seed, and how long after them.
+# Frames of either side by which probabilities are told, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
 _TIMES_PS = (3.0, 10.0, 30.0, 100.0)
 # Of a side that fewer frames show, nothing is said.
@@ -88,20 +90,21 @@ class Phi:
 
 @torch.no_grad()
 def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
-    """Move the odds of entering phi > 0 of `model` to where detailed balance holds in the mean over `subjects`, whose
+    """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
+    `subjects`, whose
     weights say how likely phi > 0 is; those without weights play no part."""
     n_types = len(model.token_mean)
     phis = [phi for subject in subjects for phi in told_phis(model, subject)]
     if not phis:
         return
-    told = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
+    conditioning = torch.zeros(len(phis), 3 * n_types, dtype=torch.float64)
     for k, phi in enumerate(phis):
         for which, place in enumerate(phi.places):
-            told[k, which * n_types + place] = 1.0
-    held = told.T @ told + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
+            conditioning[k, which * n_types + place] = 1.0
+    held = conditioning.T @ conditioning + _RIDGE * torch.eye(3 * n_types, dtype=torch.float64)
     for _ in range(_PASSES):
         lacking = torch.tensor([lacking_entries(model, phi) for phi in phis], dtype=torch.float64)
-        levels = torch.linalg.solve(held, told.T @ lacking.clamp(-_MOST, _MOST))
+        levels = torch.linalg.solve(held, conditioning.T @ lacking.clamp(-_MOST, _MOST))
         model.jumps.raise_entries(*levels.float().to(model.token_mean.device).chunk(3))
 
 
@@ -125,8 +128,9 @@ def told_phis(model: PeptideSlide, subject: PeptideSubject) -> list[Phi]:
 
 
 def lacking_entries(model: PeptideSlide, phi: Phi) -> float:
-    """Return the logarithm of how many times too low the odds of entering phi > 0 are, in the mean over times."""
-    enter, leave = (_log_odds(model, phi, state) for state in (0, 1))
+    """Return the logarithm of how many times too low the probabilities of entering phi > 0 are, in the mean over
+    times."""
+    enter, leave = (_log_probabilities(model, phi, state) for state in (0, 1))
     return float((leave - enter).mean()) + math.log(phi.positive)
 
 
@@ -139,8 +143,10 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     total = float(weights.sum())
     if total == 0.0:
         return idx[:0], total
-    odds = weights if state == 0 else (weights > 0).double()
-    drawn = torch.multinomial(odds, _SIDE_FRAMES, replacement=True, generator=torch.Generator().manual_seed(_SIDE_SEED))
+    probabilities = weights if state == 0 else (weights > 0).double()
+    drawn = torch.multinomial(
+        probabilities, _SIDE_FRAMES, replacement=True, generator=torch.Generator().manual_seed(_SIDE_SEED)
+    )
     stated = subject.chain.stated.to(torch.device("cpu"))
     quad = stated.quads[(stated.residue == residue) & (stated.slot == 0)][0]
     x = torch.from_numpy(subject.frames.positions_nm(drawn.numpy()))
@@ -149,18 +155,20 @@ def _side(subject: PeptideSubject, residue: int, state: int) -> tuple[Tensor, fl
     return drawn[(phi > low) & (phi < high)], total
 
 
-def _log_odds(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
+def _log_probabilities(model: PeptideSlide, phi: Phi, state: int) -> Tensor:
     """Return the logarithm of how likely, in the mean over frames of one side, a phi is on the other `_TIMES_PS`
     later."""
     known, now, chain = phi.known[state], phi.states[state], phi.chain
     counts, before, found = chain.stated.counts, now[:, None], []
-    told = told_states(before, counts)
-    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(told, told)
+    conditioning = conditioning_states(before, counts)
+    common = model.jumps.of_known(known, now, chain.places, counts)[:, None] + model.jumps.of_frames(
+        conditioning, conditioning
+    )
     for time_ps in _TIMES_PS:
         times = torch.full((len(known), 1), time_ps, device=known.device)
         apart = times_apart(times, model.config.forgotten_ps)
         of_times, levels = model.jumps.of_times_alone(times, apart, chain.places, counts)
-        logits = model.jumps.odds(0, common + of_times[:, :, None], levels, before[..., 0], told)
+        logits = model.jumps.probabilities(0, common + of_times[:, :, None], levels, before[..., 0], conditioning)
         found.append(logits.softmax(-1)[:, 0, phi.residue, 1 - state].double().mean().log())
     return torch.stack(found)
 
@@ -172,7 +180,8 @@ _LEAST_MEASURED = 300
 _HELD_WINDOWS, _LEAST_HELD, _HELD_IN_ALL = 128, 16, 1024
 # Flow times and noise of validation are the same each time.
 _HELD_SEED = 0
-# Of the budget, for the odds that torsions change their states: a small network, of which a step costs a tenth.
+# Of the budget, for the probabilities that torsions change their states: a small network, of which a step costs a
+# tenth.
 JUMPS_SHARE = 0.2
 _JUMPS_BATCH = 128
 # Torsions' numbers vary by at least this: omega's cosine is all but constant, and nothing is learned of its rounding.
@@ -214,7 +223,8 @@ def train_peptides(
 ) -> Path:
     """Train on frames of several sequences and write `out` (.safetensors); beside it a CSV of the curves.
 
-    First the flow, told what states torsions are in, then the odds of these states, which share nothing with it.
+    First the flow, told what states torsions are in, then the probabilities of these states, which share nothing with
+    it.
 
     `unseen`: sequences held out whole, whose loss the curves show. `start`: weights to go on from, with their scales.
     Every frame of `sets` outside the split is trained on; windows start anywhere. Raises InputError for scenes that are
@@ -447,8 +457,10 @@ def peptide_loss(
     tau = torch.sigmoid(draws).clamp(max=TAU_MAX).to(numbers.device)
     noise = torch.randn(target.shape, generator=generator).to(numbers.device) * filled
     alpha, sigma, _, _ = (flow.expand(v, target) for v in flow.coefficients(tau, "linear"))
-    told = model.flow.told(known, times_ps, chain.places, told_states(states, chain.stated.counts))
-    found = model.flow(alpha * target + sigma * noise, tau, told)
+    conditioning = model.flow.conditioning(
+        known, times_ps, chain.places, conditioning_states(states, chain.stated.counts)
+    )
+    found = model.flow(alpha * target + sigma * noise, tau, conditioning)
     weight = flow.expand(flow.preconditioning(tau, "linear")[1].square().reciprocal(), target)
     loss, turning, stiff = by_kind((found - target).square() * weight, chain, c)
     return loss, {"flow": loss.detach(), "turning": turning.detach(), "stiff": stiff.detach()}

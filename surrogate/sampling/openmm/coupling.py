@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.floating[Any]]
 
 # The reference that energies are measured against: long enough for fast motion, short enough to be made on the spot.
-_SETTLE_PS = 10.0
+_DISCARDED_PS = 10.0
 _SAMPLE_PS = 0.5
 _SAMPLES = 150
 
@@ -98,7 +98,7 @@ class Coupling:
         with self._engine(seed=0) as engine:
             engine.set_positions(self.relax(self._scene.positions_nm).positions_nm)
             engine.thermalise()
-            engine.step(round(_SETTLE_PS / self._conditions["timestep_ps"]))
+            engine.step(round(_DISCARDED_PS / self._conditions["timestep_ps"]))
             energies = np.empty(_SAMPLES)
             for k in range(_SAMPLES):
                 engine.step(round(_SAMPLE_PS / self._conditions["timestep_ps"]))
@@ -155,7 +155,8 @@ def _cannot(weights: Weights) -> str:
     return f"{weights.path.name} cannot be coupled to OpenMM (`guard='flag'` and resample need no coupling)"
 
 
-# Whether a frame's energy is one that the truth has: against MD's energies for models of frames, against the truth's
+# Whether a frame's energy is one that the reference has: against MD's energies for models of frames, against the
+# reference's
 # own energy of the same frame for a learned potential.
 
 
@@ -202,8 +203,9 @@ class RelaxedEnergy:
         return value > self.limit
 
 
-class TruthDifference:
-    """U_truth - U_model in kJ/mol of a frame as it is, for a learned potential; by this column the judge reweights."""
+class ReferenceDifference:
+    """U_truth - U_model in kJ/mol of a frame as it is, for a learned potential; by this column the comparison
+    reweights."""
 
     column = DIFFERENCE_COLUMN
 
@@ -214,7 +216,7 @@ class TruthDifference:
         self.limit = WRONG_TIMES * _measured(weights, "energy_mae")
 
     def value(self, frame_nm: FloatArray) -> float:
-        """Return the difference at a frame `(n_atoms, 3)` nm, infinity where the truth has no answer."""
+        """Return the difference at a frame `(n_atoms, 3)` nm, infinity where the reference has no answer."""
         frame = np.asarray(frame_nm, dtype=np.float64)
         learned = self._model.evaluate(torch.from_numpy(frame)[None], self._molecule).energy_kj_mol
         try:

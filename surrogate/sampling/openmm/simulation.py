@@ -23,7 +23,7 @@ from surrogate.sampling.domain import fit_weights, match_scene
 from systems.errors import InputError, SimulationError
 from systems.files.outside import UNREADABLE, arrays_in
 from systems.files.schema import parsed
-from systems.options import from_field, takes
+from systems.options import from_field, options_as_keywords
 from systems.scene import Scene
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class Simulation:
     Raises OutOfDomainError, InputError, WeightsError.
     """
 
-    @takes(SimulationOptions)
+    @options_as_keywords(SimulationOptions)
     def __init__(
         self,
         scene: str | Path | Scene,

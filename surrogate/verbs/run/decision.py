@@ -22,7 +22,7 @@ class Plan(NamedTuple):
     shares: dict[Stage, float]
 
 
-# MD that judges itself is split by replicas, or by stages if there is one replica.
+# MD that evaluates itself is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget, from many starts", {"md": 1.0}),
     "rollout": Plan(
@@ -86,23 +86,23 @@ def decide(
     `whole_s`: the budget that was asked for, of which measuring has taken some seconds already; it decides whether a
     potential has time to learn, so that the least budget that is named is enough when it is given.
 
-    Raises InputError for a budget in which nothing can be judged.
+    Raises InputError for a budget in which nothing can be evaluated.
     """
     chosen, why = _choose(rates, max(budget_s, whole_s), way)
     least_s = least_budget_s(rates)
     if budget_s < least_s:
         raise InputError(
-            f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and judge anything on this machine, as "
-            f"busy as it is: {format_wall(least_s)} it takes. Use a longer `budget_s`."
+            f"{format_wall(max(budget_s, 0.0))} are left, too few to simulate and evaluate anything on this machine, "
+            f"as busy as it is: {format_wall(least_s)} it takes. Use a longer `budget_s`."
         )
     budget_s *= _AIM
     at_all_s, of_frame_s = _report_s(rates)
-    judge_s = min(0.5 * budget_s, max(_REPORT_SHARE * budget_s, at_all_s + _LEAST_FRAMES * of_frame_s))
-    most = int(min(_MOST_FRAMES, max(_LEAST_FRAMES, (judge_s - at_all_s) / of_frame_s)))
-    left_s = budget_s - judge_s
+    comparison_s = min(0.5 * budget_s, max(_REPORT_SHARE * budget_s, at_all_s + _LEAST_FRAMES * of_frame_s))
+    most = int(min(_MOST_FRAMES, max(_LEAST_FRAMES, (comparison_s - at_all_s) / of_frame_s)))
+    left_s = budget_s - comparison_s
     shares = _BY_STAGES if chosen == "md" and rates.replicas == 1 else PLANS[chosen].shares
     stages = [PlannedStage(name, left_s * share) for name, share in shares.items()]
-    found = Decision(chosen, why, (*stages, PlannedStage("report", judge_s)), 0.0, 0.0, 0.0, 0.0)
+    found = Decision(chosen, why, (*stages, PlannedStage("report", comparison_s)), 0.0, 0.0, 0.0, 0.0)
     md = [md_ps(rates, found, name) for name in shares if name in MD_STAGES]
     rolled_ps = found.seconds("rollout") * (rates.rolls.ps_per_s if rates.rolls else 0.0)
     return replace(
@@ -147,14 +147,14 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
         why = (rates.coverage, f"{errors_in_words(errors)}, with {rates.relaxation_words}")
         return "rollout" if pays or way == "surrogate" else "md", why
     none = f"no weights: {rates.coverage}"
-    if rates.dear and rates.in_water:
+    if rates.expensive and rates.in_water:
         if way == "surrogate":
             raise InputError("a potential learns forces in vacuum; leave `solvent` out, or take `way='md'`.")
         return "md", ("a potential learns forces in vacuum: MD for a molecule in ALPB water", none)
-    if rates.dear:
+    if rates.expensive:
         if budget_s >= LEAST_TRAINING_S or way == "surrogate":
             force_ms = 1e3 * rates.step_s
-            return "potential", (f"a force of the truth takes {force_ms:.3g} ms; a potential learns it", none)
+            return "potential", (f"a force of the reference takes {force_ms:.3g} ms; a potential learns it", none)
         least = format_wall(LEAST_TRAINING_S)
         return "md", (f"a potential needs a budget of {least} or more to learn in: MD, however little", none)
     if way == "surrogate":
@@ -166,7 +166,7 @@ def _choose(rates: Rates, budget_s: float, way: str) -> tuple[Way, tuple[str, ..
 
 def _interval(rates: Rates, way: Way, least_ps: float) -> float:
     """Return the interval between saved frames: a round multiple of what the surrogate, or else MD, steps by."""
-    base_ps = rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.dear else 1.0
+    base_ps = rates.rolls.lag_ps if rates.rolls and way != "md" else 0.1 if rates.expensive else 1.0
     return base_ps * next((n for n in _NICE if n * base_ps >= least_ps), _NICE[-1])
 
 

@@ -22,13 +22,13 @@ from md_reference.campaign.campaign_file import (
 )
 from md_reference.campaign.cluster import guarded, open_client, poll, result_of, stop
 from surrogate.progress import progress_bar
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import LEAST_BUDGET_S
 from surrogate.verbs.run.one_scene import run_scene
 from surrogate.verbs.run.results_page import write_results
 from surrogate.verbs.run.run_record import RUN_NAME, read_run
 from surrogate.verbs.run.run_result import RunResult
-from surrogate.verbs.telling import tell
 from systems.errors import InputError, PreparationError, SimulationError
 from systems.files.outside import content
 from systems.files.whole_file import create_whole
@@ -130,7 +130,8 @@ def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[st
     """Run every molecule within `options.budget_s` in all and return the results (JSON-able), failures among them.
 
     Each gets an equal share of the workers' time and one core. Molecules that are done are not run again. Raises
-    InputError for a folder that is not ours or a budget too short to judge each, KeyboardInterrupt with what is kept.
+    InputError for a folder that is not ours or a budget too short to evaluate each, KeyboardInterrupt with what is
+    kept.
     """
     _open_folder(molecules, folder, options)
     failed = dict(molecules.unreadable)
@@ -150,7 +151,7 @@ def run_many(molecules: Molecules, folder: Path, options: RunOptions) -> dict[st
     return {
         "file": str(folder),
         "type": "runs",
-        "summary": f"{n_done} of {len(results)} molecules judged",
+        "summary": f"{n_done} of {len(results)} molecules evaluated",
         "molecules": results,
         "failed": {result["name"]: result["failed"] for result in results if result["failed"]} or None,
     }
@@ -179,7 +180,7 @@ def _share_s(n: int, client: Any, cluster: ClusterSpec | None, budget_s: float) 
     each_s = budget_s / math.ceil(n / max(1, width))
     if each_s < LEAST_BUDGET_S:
         raise InputError(
-            f"{n} molecules on {width} workers have {format_wall(each_s)} each, too short to judge anything; use a "
+            f"{n} molecules on {width} workers have {format_wall(each_s)} each, too short to evaluate anything; use a "
             f"`budget_s` of {format_wall(math.ceil(n / width) * LEAST_BUDGET_S)} or more."
         )
     return each_s

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from surrogate.progress import progress_bar
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import RunOptions
-from surrogate.verbs.reference import settle_run
+from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.decision import (
     LEAST_MD_S,
     MD_STAGES,
@@ -38,9 +39,8 @@ from surrogate.verbs.run.run_record import (
 from surrogate.verbs.run.stage_clock import Clock
 from surrogate.verbs.run.stages import STAGES, Site, md_options
 from surrogate.verbs.scene_listing import prepare_scene
-from surrogate.verbs.telling import tell
 from systems.errors import InputError, SimulationError, SurromdError
-from systems.files.whole_file import Claim
+from systems.files.whole_file import OutputLock
 
 if TYPE_CHECKING:
     from md_reference.run.config import MDConfig
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOG_NAME = "log.txt"
-# Without these there is nothing to judge; a run that lost them to a fault of the surrogate goes on by MD.
+# Without these there is nothing to evaluate; a run that lost them to a fault of the surrogate goes on by MD.
 _OF_SURROGATE = ("train", "rollout")
 _GOES_ON = "the same again with `resume=True` goes on"
 
@@ -70,7 +70,7 @@ def run_scene(
     """
     before = _open_folder(folder, options)
     try:
-        with Claim(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
+        with OutputLock(folder / RUN_NAME), progress_bar(f"run {_named(scene)}", quiet=options.quiet) as advance:
             kept = _Kept(folder, before)
             named, log = _named(scene), folder / LOG_NAME
             clock = Clock(
@@ -166,7 +166,7 @@ class _Run:
         left_s = self.clock.budget_s - self.clock.spent_s
         there = stage.found(self.site, record) if name in (*MD_STAGES, "rollout") else None
         may_take_s = seconds_of_first(self._pending, left_s)
-        if name in MD_STAGES and there is None:  # without MD to judge by all else was in vain
+        if name in MD_STAGES and there is None:  # without MD to compare with all else was in vain
             may_take_s = max(may_take_s, LEAST_MD_S * max(1.0, 0.5 * record.rates.stretch))
         if name == "report":  # it is made however long it takes, for the same reason
             may_take_s = math.inf
@@ -213,7 +213,7 @@ class _Run:
         rates = by_openmm(record.rates, self.site.scene, self.site.config, why)
         self.keep(replace(record, rates=rates, simd_failed=record.rates.replicas))
         self.say(f"{why}: {name} by OpenMM")
-        if self.decision.way == "md":  # an only replica cannot judge itself
+        if self.decision.way == "md":  # an only replica cannot evaluate itself
             self._by_md(why)
 
     def _by_md(self, why: str) -> None:
@@ -273,7 +273,7 @@ def _decide(
 def _prepared(scene: str | Path | Scene, options: RunOptions) -> tuple[Scene, MDConfig]:
     """Return the scene and the settings of its MD."""
     molecule = prepare_scene(scene, options, quiet=options.quiet)
-    return settle_run(molecule, md_options(options), {"time_ps": 0.0}, quiet=options.quiet)[:2]
+    return resolve_run(molecule, md_options(options), {"time_ps": 0.0}, quiet=options.quiet)[:2]
 
 
 def _new_record(scene: str | Path | Scene, molecule: Scene, options: RunOptions) -> RunRecord:

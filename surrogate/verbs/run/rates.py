@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from systems.scene import Scene
 
 # Rollouts side by side: one batch, which costs little more than one of them. Of a potential's, sixteen run at once on
-# each core; by torch a step of 32 is half as dear for each as of 8.
+# each core; by torch a step of 32 is half as expensive for each as of 8.
 REPLICAS, _POTENTIAL_REPLICAS, _REPLICAS_A_CORE = 8, 32, 16
 # Weights for several lags step so far, or as near to it as they can; while they are measured so many times as far, as
 # far as they go, which costs the same and shows how slowly the molecule relaxes.
@@ -51,7 +51,7 @@ class Rates:
     """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
     other work shares them. `step_s`: processor seconds
     of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
-    on this `platform`, `at_once` replicas on each core; `md`: in words; `dear`: it is quantum mechanics. `rolls`: of
+    on this `platform`, `at_once` replicas on each core; `md`: in words; `expensive`: it is quantum mechanics. `rolls`: of
     weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run
     by SIMD, where it might have been; `in_water`: in ALPB water, in which no potential learns.
     """
@@ -59,7 +59,7 @@ class Rates:
     n_atoms: int
     cores: int
     stretch: float
-    dear: bool
+    expensive: bool
     md: str
     step_s: float
     timestep_ps: float
@@ -114,7 +114,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         n_atoms=scene.n_atoms,
         cores=cores,
         stretch=stretch,
-        dear=config.force.force_field == QUANTUM,
+        expensive=config.force.force_field == QUANTUM,
         in_water=config.force.solvent in QUANTUM_SOLVENTS,
         md=plan.line,
         step_s=plan.us_per_step * 1e-6,
@@ -125,7 +125,7 @@ def measure(scene: Scene, config: MDConfig, named: str | Path | None, cores: int
         platform=by_openmm.platform,
     )
     rates = replace(rates, md_ps_per_s=rates.openmm_ps_per_s)
-    return rates if rates.dear or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)
+    return rates if rates.expensive or config.platform not in ("auto", SIMD) else _by_simd(rates, scene, config)
 
 
 def _by_simd(rates: Rates, scene: Scene, config: MDConfig) -> Rates:
@@ -205,12 +205,12 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
 
 def _slowest_ps(files: list[Path]) -> float:
     """Return the longest integrated correlation time in trajectories, about the mean of all."""
-    from surrogate.judge.measure.slow_motion import longest_correlation
-    from surrogate.judge.measure.structure import Yardstick
-    from surrogate.judge.read.ensemble import load_ensemble
+    from surrogate.comparison.measure.slow_motion import longest_correlation
+    from surrogate.comparison.measure.structure import Baseline
+    from surrogate.comparison.read.ensemble import load_ensemble
 
     rolled = load_ensemble(files)
-    measured = Yardstick.of(rolled, parent=rolled.scene, kept=rolled.kept).measure(rolled)
+    measured = Baseline.of(rolled, parent=rolled.scene, kept=rolled.kept).measure(rolled)
     return round(longest_correlation(measured) * rolled.lag_ps, 3)
 
 

@@ -13,13 +13,13 @@ from systems.files.whole_file import create_whole
 from systems.units import format_time_ps, format_wall
 
 PAGE_NAME, RESULTS_NAME = "index.html", "results.json"
-_HEADS = ("Molecule", "Way", "Judged", "Held-out MD", "Worth", "Gain at least", "Verdict", "Wall time")
+_HEADS = ("Molecule", "Way", "Evaluated", "Held-out MD", "EquivalentTime", "Speed-up at least", "Verdict", "Wall time")
 
 
 def write_results(folder: Path, results: list[dict[str, Any]]) -> None:
     """Write the table of results into a folder whose subfolders hold the runs, those that failed with their reasons."""
     create_whole(folder / RESULTS_NAME, json.dumps(results, indent=1) + "\n")
-    style = files("surrogate.judge.report").joinpath("report.css").read_text("utf-8")
+    style = files("surrogate.comparison.report").joinpath("report.css").read_text("utf-8")
     heads = "".join(f"<th>{head}</th>" for head in _HEADS)
     rows = "\n".join(_row(result) for result in results)
     n_failed = sum(bool(result["failed"]) for result in results)
@@ -55,13 +55,13 @@ def _row(result: dict[str, Any]) -> str:
         reason = f'<td colspan="{len(_HEADS) - 1}">failed: {escape(result["failed"])}</td>'
         return f'<tr><th scope="row">{name}</th>{reason}</tr>'
     link = f'<a href="{quote(result["name"])}/report.html">{name}</a>'
-    gain = "" if result["gain"] is None else f"{result['gain']:.2g}"
+    speed_up = "" if result["speed_up"] is None else f"{result['speed_up']:.2g}"
     cells = (
         result["way"],
         format_time_ps(result["rolled_ps"], 2),
         format_time_ps(result["held_out_ps"], 2),
-        result["worth"] or "not told",
-        gain,
+        result["equivalent_time"] or "not told",
+        speed_up,
         result["verdict"],
         format_wall(result["wall_s"]),
     )

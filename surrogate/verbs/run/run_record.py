@@ -37,7 +37,8 @@ class Outcome:
     """What came of a run. `in_short`: use MD's answer or not, for what, why, `headline`: the same in one line;
     `details`: what the surrogate is worth, and what would tell more; `on_surrogate`: what MD's answer says
     of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of
-    MD that judged, `rolled_ps` that was judged, replicas together; `worth` in words, `gain` over as much wall time of
+    MD that evaluated, `rolled_ps` that was evaluated, replicas together; `worth` in words, `gain` over as much wall
+    time of
     the fastest MD here as a lower bound, None where it cannot be told."""
 
     headline: str
@@ -45,8 +46,8 @@ class Outcome:
     verdict: str
     held_out_ps: float
     rolled_ps: float
-    worth: str = ""
-    gain: float | None = None
+    equivalent_time: str = ""
+    speed_up: float | None = None
     on_surrogate: str = ""
     converged: bool = False
     notes: tuple[str, ...] = ()

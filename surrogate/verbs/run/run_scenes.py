@@ -1,27 +1,28 @@
-"""The verb `run`: a scene and a budget in, a judged trajectory out, by whatever way pays best on this machine."""
+"""The verb `run`: a scene and a budget in, a evaluated trajectory out, by whatever way pays best on this machine."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from surrogate.verbs.messages import tell
 from surrogate.verbs.options import PathLike, RunOptions
 from surrogate.verbs.run.decision import table
 from surrogate.verbs.run.many_scenes import molecules_in, run_many
 from surrogate.verbs.run.one_scene import plan_scene, run_scene
 from surrogate.verbs.run.run_record import RunRecord
 from surrogate.verbs.run.run_result import RunResult
-from surrogate.verbs.telling import tell
 from systems.errors import InputError
-from systems.options import takes
+from systems.options import options_as_keywords
 
 if TYPE_CHECKING:
     from systems.scene import Scene
 
 
-@takes(RunOptions)
+@options_as_keywords(RunOptions)
 def run(scene: PathLike | Scene, out: PathLike | None = None, *, options: RunOptions) -> dict[str, Any]:
-    """Simulate a molecule in `budget_s` of wall time by whatever way pays best here, judge it, and return the record.
+    """Simulate a molecule in `budget_s` of wall time by whatever way pays best here, evaluate it, and return the
+    record.
 
     What MD and the weights that cover the scene simulate is measured in the first seconds, and decides: weights that
     cover it and outrun MD are rolled for a short while to find the states, and MD runs from their frames; where nothing

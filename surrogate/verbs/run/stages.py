@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from surrogate.verbs.compare import compare
 from surrogate.verbs.options import MDSettings, ReferenceOptions, RolloutOptions, RunOptions, TrainOptions
-from surrogate.verbs.outputs import accounted_outputs
+from surrogate.verbs.outputs import summarised_outputs
 from surrogate.verbs.rollout import rollout
 from surrogate.verbs.run.decision import Decision, Stage, errors_in_words, expected_errors, md_ps, table
 from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from md_reference.run.config import MDConfig
-    from surrogate.judge.comparison import Comparison
-    from surrogate.judge.md_answer import Answer
+    from surrogate.comparison.comparison import Comparison
+    from surrogate.comparison.md_answer import Answer
     from systems.scene import Scene
 
 # A run may turn out faster than measured, and have the machine for itself: the clock, not its length, ends it.
@@ -116,12 +116,12 @@ def _md_stage(name: Stage, place: str, seed: int) -> StageOf:
             if isinstance(said, SimulationError) and rates.at_once > 1:  # nothing to wait for
                 raise said
 
-        with accounted_outputs(files):
+        with summarised_outputs(files):
             starts, config = _starts(site, record, config, files)
             simulate_replicas(starts, config, files, resume=True, announce=heard)
         done = found(site, record)
         if done is None:
-            raise InputError("MD wrote fewer than two frames, too few to judge.")
+            raise InputError("MD wrote fewer than two frames, too few to evaluate.")
         return done
 
     def found(site: Site, record: RunRecord) -> RunRecord | None:
@@ -144,8 +144,8 @@ def _starts(site: Site, record: RunRecord, config: MDConfig, files: list[Path]) 
     """Return where replicas of MD begin, and their settings: at frames of the rollout, drawn over all its states, where
     there is one, else at states of hot MD, which takes a small part of their time."""
     from md_reference.run.starts import HOT_PS, frames_as_starts, many_starts
-    from surrogate.judge.md_answer import frames_over_states
-    from surrogate.judge.read.ensemble import load_ensemble
+    from surrogate.comparison.md_answer import frames_over_states
+    from surrogate.comparison.read.ensemble import load_ensemble
     from systems.trajectory.checkpoint import checkpoint_path
 
     rates, decision = _rates_and_decision(record)
@@ -187,7 +187,7 @@ def md_options(options: RunOptions, **more: Any) -> ReferenceOptions:
 
 
 def _with_frames(folder: Path, paths: list[Path]) -> tuple[str, ...]:
-    """Return the files that can be judged: one frame tells no interval."""
+    """Return the files that can be evaluated: one frame tells no interval."""
     from systems.trajectory.checkpoint import frames_in
 
     return tuple(str(path.relative_to(folder)) for path in paths if frames_in(path) > 1)
@@ -253,9 +253,9 @@ def _roll(site: Site, record: RunRecord) -> RunRecord:
             temperature_k=site.config.temperature_k,
             seed=site.options.seed,
             replicas=rates.rolls.replicas,
-            anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.dear else 0.0,
-            # Of a potential only the truth could mend frames; a replica that flies apart must not end the others.
-            guard="resample" if rates.dear else "repair",
+            anneal_ps=min(_ANNEAL_PS, _ANNEAL * expected_ps) if rates.expensive else 0.0,
+            # Of a potential only the reference could mend frames; a replica that flies apart must not end the others.
+            guard="resample" if rates.expensive else "repair",
             resume=True,
             quiet=True,
         ),
@@ -272,21 +272,22 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
 
 
 def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs:
-    """Return what the trajectory that a comparison judges has cost, beside what `held_ps` of the run's own held-out MD
+    """Return what the trajectory that a comparison evaluates has cost, beside what `held_ps` of the run's own held-out
+    MD
     did."""
     spent, rates = record.spent_in, _rates_and_decision(record)[0]
     # The faster of what was measured before and what it came to: the gain is a lower bound.
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
     training_s = spent.get("train", 0.0)
     # What reading weights takes is no part of it: a longer rollout does it once, too.
-    rolling_s = comparison.judgements[0].account.wall_s or spent.get("rollout", 0.0)
+    rolling_s = comparison.evaluations[0].summary.wall_s or spent.get("rollout", 0.0)
     by = "SIMD" if rates.at_once > 1 else "OpenMM"
     return Costs(rolling_s, training_s, md_ps_per_s, record.settings["budget_s"], rates.replicas, by)
 
 
-def worth_saying(notes: tuple[str, ...]) -> tuple[str, ...]:
+def notable(notes: tuple[str, ...]) -> tuple[str, ...]:
     """Return a comparison's notes without the one that files were stopped: the clock ends a stage, as is planned."""
-    from surrogate.judge.read.ensemble import STOPPED
+    from surrogate.comparison.read.ensemble import STOPPED
 
     return tuple(note for note in notes if not note.startswith(STOPPED))
 
@@ -294,8 +295,8 @@ def worth_saying(notes: tuple[str, ...]) -> tuple[str, ...]:
 def answer_of(site: Site, record: RunRecord) -> Answer | None:
     """Return what all MD of a run says of equilibrium, written into its folder, each frame's weight into its file; None
     where it tells nothing."""
-    from surrogate.judge.md_answer import md_answer
-    from surrogate.judge.read.ensemble import load_ensemble
+    from surrogate.comparison.md_answer import md_answer
+    from surrogate.comparison.read.ensemble import load_ensemble
     from systems.trajectory.codec import write_weights
 
     is_md = _rates_and_decision(record)[1].way == "md"
@@ -314,25 +315,25 @@ def answer_of(site: Site, record: RunRecord) -> Answer | None:
 
 
 def _report(site: Site, record: RunRecord) -> RunRecord:
-    from surrogate.judge.report.overview import weighted_maps
-    from surrogate.judge.report.report import Foreword, write_report
+    from surrogate.comparison.report.overview import weighted_maps
+    from surrogate.comparison.report.report import Foreword, write_report
 
     rates, decision = _rates_and_decision(record)
     if not record.held_out or not record.trajectory:
-        lacking = "the trajectory" if record.held_out else "MD to judge it by"
+        lacking = "the trajectory" if record.held_out else "MD to compare it with"
         raise InputError(f"{lacking} came to nothing in its time; `resume=True` with a longer `budget_s` goes on.")
     answer = answer_of(site, record)
     held = [site.folder / file for file in record.held_out]
-    truth, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
+    ref, other = (held, None) if len(held) < 2 else (held[: len(held) // 2], held[len(held) // 2 :])
     label = "MD" if decision.way == "md" else "surrogate"
-    comparison = compare(truth, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
+    comparison = compare(ref, [[site.folder / file for file in record.trajectory]], replicate=other, labels=[label])
     held_ps = comparison.reference.total_ps + (comparison.replicate.total_ps if comparison.replicate else 0.0)
     notes = tuple(f"{entry.name}: {entry.note}" for entry in record.stages if entry.note)
     found = outcome(decision.way, comparison, costs_of(record, comparison, held_ps), answer, notes)
-    judged = comparison.judgements[0]
-    judged = replace(judged, in_short=lines_of(decision.way, judged, answer))
-    said = (*(() if answer is None else (UNWEIGHTED,)), *worth_saying(comparison.notes))
-    comparison = replace(comparison, notes=said, judgements=(judged,))
+    evaluated = comparison.evaluations[0]
+    evaluated = replace(evaluated, in_short=lines_of(decision.way, evaluated, answer))
+    said = (*(() if answer is None else (UNWEIGHTED,)), *notable(comparison.notes))
+    comparison = replace(comparison, notes=said, evaluations=(evaluated,))
     lines = [*(answer.table() if answer else ()), *table(rates, decision, site.options.budget_s)]
     if answer is not None and answer.timescales_ps:
         errors = expected_errors(rates, record.settings["budget_s"], answer.timescales_ps[0], answer.model_error)
@@ -345,7 +346,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         foreword=Foreword(
             "\n".join(found.in_short),
             "States by MD, what the trajectory is worth, and how the budget was spent",
-            [("worth", found.details), *lines, *(("note", note) for note in notes)],
+            [("equivalent_time", found.details), *lines, *(("note", note) for note in notes)],
             [] if answer is None else weighted_maps(answer.maps),
         ),
     )

@@ -29,7 +29,7 @@ def read_molecule(path: Path, notes: list[str]) -> Any:
         molecule = Chem.MolFromMolBlock(_first_mol_block(text, notes), sanitize=False, removeHs=False)
     if molecule is None:
         raise InputError(f"{path} holds no molecule that can be read as {suffix_of(path)[1:].upper()}; write it again.")
-    return settle_molecule(main_molecule(molecule, notes), notes)
+    return resolve_molecule(main_molecule(molecule, notes), notes)
 
 
 def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
@@ -41,7 +41,7 @@ def _read_mol2(text: str, path: Path, notes: list[str]) -> Any:
         molecule = _by_types(found) or molecule_of(found, notes)
     if molecule is None:
         raise missing_hydrogens(found)
-    return settle_molecule(main_molecule(molecule, notes), notes)
+    return resolve_molecule(main_molecule(molecule, notes), notes)
 
 
 def _by_types(found: Mol2) -> Any | None:
@@ -78,7 +78,7 @@ def _draw_nitro(molecule: Any) -> None:
             one.SetFormalCharge(charge)
 
 
-def settle_molecule(molecule: Any, notes: list[str]) -> Any:
+def resolve_molecule(molecule: Any, notes: list[str]) -> Any:
     """Return an unsanitised molecule with all hydrogens, at its own positions if it has three-dimensional ones.
 
     Valences that are impossible as written are perceived anew, and said. Raises PreparationError for what is no

@@ -114,7 +114,7 @@ class Residue:
 
 @dataclass
 class Bonding:
-    """Bonds `(n_bonds, 2)`, the residues in the order of the file, and an account of where bonds came from.
+    """Bonds `(n_bonds, 2)`, the residues in the order of the file, and a summary of where bonds came from.
 
     `peptide_bonds` are the pairs (C, N) that join standard residues, `unmade` the bonds that the file states and that
     are none.

@@ -250,7 +250,7 @@ _SAME_ANGSTROM = 0.0015
 _TELLING_NAMES = {"CA", "CH3", "CAY"}
 
 
-def settle(found: StructureFile, path: Path) -> StructureFile:
+def resolve_settings(found: StructureFile, path: Path) -> StructureFile:
     """Return the file without atoms written twice, Drude particles and virtual sites, each said; residues that repeat
     under one number are told apart by their chains.
 
@@ -412,7 +412,7 @@ def read_structure(path: Path) -> StructureFile:
                 f"{path}: atom {atom.serial} ({atom.name}) lies beyond {_FARTHEST_ANGSTROM:,.0f} Å; "
                 "centre the structure, or correct the coordinate."
             )
-    return settle(found, path)
+    return resolve_settings(found, path)
 
 
 def is_mmcif(path: Path) -> bool:

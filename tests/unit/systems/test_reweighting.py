@@ -10,7 +10,7 @@ from systems.trajectory.codec import reweighting
 
 def test_frames_of_a_wrong_spring_are_reweighted_to_the_right_one() -> None:
     rng, kt = np.random.default_rng(0), 8.31446261815324e-3 * 300.0
-    x = rng.normal(size=20_000) * np.sqrt(kt / 100.0)  # in a spring of 100 kJ/mol/nm^2, the truth's is 150
+    x = rng.normal(size=20_000) * np.sqrt(kt / 100.0)  # in a spring of 100 kJ/mol/nm^2, the reference's is 150
     difference = 0.5 * 50.0 * x**2
     weight, effective = reweighting(difference, 300.0)
     assert weight.sum() == pytest.approx(1.0)

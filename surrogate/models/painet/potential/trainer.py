@@ -1,7 +1,7 @@
-"""Training of PAINET as a potential: it asks a dear truth about the states it is least sure of, and learns.
+"""Training of PAINET as a potential: it asks an expensive reference about the states it is least sure of, and learns.
 
-States come from hot MD and turned torsions (the teacher's `explore`), then from the model's own rollouts. Members of
-the potential learn from different samples; where their forces spread most, the truth is asked next.
+States come from hot MD and turned torsions (the labeller's `explore`), then from the model's own rollouts. Members of
+the potential learn from different samples; where their forces spread most, the reference is asked next.
 """
 
 from __future__ import annotations
@@ -116,11 +116,12 @@ class Samples:
         return Samples(empty, np.zeros(0), empty, np.zeros(0, dtype=bool))
 
 
-# What weights of a potential cover: how frames look at its truth, and how far they move from one to the next.
+# What weights of a potential cover: how frames look at its reference, and how far they move from one to the next.
 
 
 def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
-    """Return what the weights cover: the truth's quieter samples say what frames look like; runs of cheap MD, `moving`
+    """Return what the weights cover: the reference's quieter samples say what frames look like; runs of cheap MD,
+    `moving`
     (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own rate."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
@@ -164,7 +165,7 @@ _MOVING_FRAMES = 200
 
 
 class Answers(Protocol):
-    """States with energies and forces, without those at which the truth finds no answer."""
+    """States with energies and forces, without those at which the reference finds no answer."""
 
     @property
     def positions_nm(self) -> Any: ...
@@ -174,8 +175,8 @@ class Answers(Protocol):
     def forces_kj_mol_nm(self) -> Any: ...
 
 
-class Truth(Protocol):
-    """A dear truth about one molecule (md_reference.run.teacher.Teacher is one)."""
+class ReferenceForces(Protocol):
+    """An expensive reference about one molecule (md_reference.run.labeller.Teacher is one)."""
 
     @property
     def scene(self) -> Scene: ...
@@ -223,17 +224,17 @@ class PotentialTraining:
 
 
 class Learner:
-    """A potential, its samples and its teacher: `loss` learns and asks, `errors` measures on held-out states."""
+    """A potential, its samples and its labeller: `loss` learns and asks, `errors` measures on held-out states."""
 
     def __init__(
-        self, model: PainetPotential, truth: Truth, config: PotentialTraining, out: Path, *, resume: bool
+        self, model: PainetPotential, reference: ReferenceForces, config: PotentialTraining, out: Path, *, resume: bool
     ) -> None:
-        self.model, self.truth, self.config = model, truth, config
-        self.molecule = Molecule.of(truth.scene)
+        self.model, self.reference, self.config = model, reference, config
+        self.molecule = Molecule.of(reference.scene)
         self.fabric = model.fabric(self.molecule)
         self.path, self.rounds_path = samples_path(out), out.with_name(f"{out.stem}.rounds.csv")
-        self.key = truth.scene.topology_hash
-        self.samples = Samples.none(truth.scene.n_atoms)
+        self.key = reference.scene.topology_hash
+        self.samples = Samples.none(reference.scene.n_atoms)
         self.error_kj_mol_nm = np.inf
         # A budget is of wall time; so many steps are the same steps everywhere.
         self._threads = StepThreads(1 if config.budget_s is None else torch.get_num_threads())
@@ -252,7 +253,9 @@ class Learner:
             self._take()
         else:
             began = time.monotonic()
-            self._learn(truth.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share)
+            self._learn(
+                reference.explore(config.first, config.temperatures_k, seed=config.seed), held=config.held_share
+            )
             self._asking_s, self._asked = time.monotonic() - began, config.first
         # Samples may be all that an interrupted training left; a state that it left brings its own.
         _, energies, forces = self.samples.tensors()
@@ -341,7 +344,7 @@ class Learner:
         began = time.monotonic()
         seed = int(torch.randint(2**31, (), generator=generator))
         own = self._own_states(max(_REPLICAS, n // _OWN_FRAMES), seed)
-        hot = self.truth.explore(max(n // 4, 8), self.config.temperatures_k, seed=seed)
+        hot = self.reference.explore(max(n // 4, 8), self.config.temperatures_k, seed=seed)
         pool = np.concatenate([own, hot])
         order = np.random.default_rng(seed).permutation(len(pool))
         any_ = pool[order[: n // 2]]
@@ -364,7 +367,7 @@ class Learner:
         rng, model = np.random.default_rng(seed), self.model
         start = self.samples.positions_nm[rng.integers(len(self.samples), size=replicas)]
         # Barriers are seldom crossed.
-        turn_torsions(self.truth.scene, start, _TURN_EVERY, rng)
+        turn_torsions(self.reference.scene, start, _TURN_EVERY, rng)
         temperatures = torch.from_numpy(rng.choice(self.config.temperatures_k, size=replicas))
         masses = self.molecule.masses_da.double()[:, None]
         thermal = (GAS_CONSTANT_KJ_MOL_K * temperatures[:, None, None] / masses).sqrt()
@@ -383,11 +386,11 @@ class Learner:
 
     def _learn(self, states: Any, *, held: float, measured: bool = False) -> None:
         """Ask about states and take the answers; `measured`: note the error before they are learned."""
-        answers = self.truth.label(states)
+        answers = self.reference.label(states)
         n = len(answers.energies_kj_mol)
         if not n:
             if not len(self.samples):
-                raise SimulationError(f"the truth finds no answer for any state of {self.truth.scene.name!r}.")
+                raise SimulationError(f"the reference finds no answer for any state of {self.reference.scene.name!r}.")
             return
         kept = np.arange(n) < round(held * n)
         new = Samples(answers.positions_nm, answers.energies_kj_mol, answers.forces_kj_mol_nm, kept)
@@ -401,7 +404,7 @@ class Learner:
     def _take(self) -> None:
         learned = self.samples.where(~self.samples.held)
         if len(learned) < 2 or not self.samples.held.any():
-            raise SimulationError(f"too few states of {self.truth.scene.name!r} have an answer to learn from.")
+            raise SimulationError(f"too few states of {self.reference.scene.name!r} have an answer to learn from.")
         self._tensors = learned.tensors()
         members = self.model.config.n_members
         draw = torch.rand(len(learned), members, generator=torch.Generator().manual_seed(1))
@@ -416,8 +419,8 @@ def samples_path(out: Path) -> Path:
 
 
 def learn_potential(
-    truth: Truth, out: Path, model_config: PotentialConfig, config: PotentialTraining, *, resume: bool = False,
-    progress: ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
+    reference: ReferenceForces, out: Path, model_config: PotentialConfig, config: PotentialTraining, *,
+    resume: bool = False, progress: ProgressFn | None = None, before_s: float = 0.0, after_s: float = 0.0,
 ) -> Path:  # fmt: skip
     """Learn a molecule's energies and forces and write weights `out`; beside them stay the samples, the curves (.csv)
     and the error of forces against evaluations, round by round (NAME.rounds.csv).
@@ -431,11 +434,11 @@ def learn_potential(
         samples_path(out).unlink(missing_ok=True)
     # Frames change least in the own bath, with bonds as rigid as rollouts have them, and most when hot.
     moving = [
-        truth.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed, constrain_hydrogens=rigid)
+        reference.motion(_MOVING_FRAMES, model_config.lag_ps, kelvin, seed=config.seed, constrain_hydrogens=rigid)
         for kelvin, rigid in ((model_config.temperature_k, model_config.constrain_hydrogens),
                               (max(config.temperatures_k), False))
     ]  # fmt: skip
-    learner = Learner(model, truth, config, out, resume=resume)
+    learner = Learner(model, reference, config, out, resume=resume)
     budget_s = config.budget_s
     if budget_s is not None:
         left_s = budget_s - (time.monotonic() - began) - after_s
@@ -449,8 +452,8 @@ def learn_potential(
             progress(_line(learner), share, metrics)
 
     def write(spent_s: list[float]) -> None:
-        domain = domain_of(truth.scene, learner.samples, moving, model_config)
-        # No MD of the truth was made: what it answered is the reference.
+        domain = domain_of(reference.scene, learner.samples, moving, model_config)
+        # No MD of the reference was made: what it answered is the reference.
         origin = {"reference_ns": 0.0, "sources": [{"file": learner.path.name, "n_frames": len(learner.samples)}]}
         found = {k.removeprefix("validation_"): float(f"{v:.6g}") for k, v in learner.errors().items()}
         settings = {"seed": config.seed, "training_s": round(sum(spent_s), 1), **found}
@@ -471,7 +474,7 @@ def _line(learner: Learner) -> str:
 
 
 class PotentialTrainer(Trainer):
-    """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its truth."""
+    """Refuses trajectories, which say too little about forces; `learn` takes a molecule and its reference."""
 
     def check(self, request: TrainingRequest) -> None:
         raise _no_trajectories(request)
@@ -485,12 +488,12 @@ class PotentialTrainer(Trainer):
     def prepare(self, references: References, request: TrainingRequest) -> Prepared:
         raise _no_trajectories(request)
 
-    def learn(self, truth: Truth, request: TrainingRequest, advance: Callable[[str, float], None], *,
+    def learn(self, reference: ReferenceForces, request: TrainingRequest, advance: Callable[[str, float], None], *,
               before_s: float = 0.0, after_s: float = 0.0) -> Path:  # fmt: skip
-        """Learn a molecule from its truth, as the request has it, and return the weights; see `learn_potential`."""
+        """Learn a molecule from its reference, as the request has it, and return the weights; see `learn_potential`."""
         settings = self.settings(request)
         return learn_potential(
-            truth, request.out, settings.model, settings.training, resume=request.resume,
+            reference, request.out, settings.model, settings.training, resume=request.resume,
             progress=lambda stage, share, metrics: advance(stage, share), before_s=before_s, after_s=after_s,
         )  # fmt: skip
 

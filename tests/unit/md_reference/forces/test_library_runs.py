@@ -14,7 +14,7 @@ from library_runs import run_scene
 from md_reference.forces.forcefield import build_system, resolve
 from md_reference.forces.small_molecules import gaff
 from md_reference.forces.spec import ForceFieldSpec
-from md_reference.run.config import Conditions, defaults, settle, to_config
+from md_reference.run.config import Conditions, defaults, resolve_settings, to_config
 from md_reference.run.engine import Engine
 from systems.chemistry.graph import molecule_key
 from systems.chemistry.validity import check_frames, geometry_from_scene
@@ -103,7 +103,7 @@ def test_one_molecule_has_one_default_under_all_its_names(names: tuple[str, ...]
     assert len({molecule_key(scene) for scene in scenes}) == 1
     found = []
     for scene in scenes:
-        settings, said = settle(scene, {})
+        settings, said = resolve_settings(scene, {})
         assert said == ""
         config = to_config(settings | {"time_ps": 1.0}, seed=0)
         found.append(replace(config, force=resolve(scene, config.force)))
@@ -115,11 +115,11 @@ def test_a_protocol_is_asked_for_by_name_and_outweighed_by_what_is_given() -> No
     md17 = find_protocol("md17").settings
     for name in ("aspirin", "smiles:CCO"):
         scene = prepare(name)
-        settings, said = settle(scene, {}, "md17")
+        settings, said = resolve_settings(scene, {}, "md17")
         assert {key: settings[key] for key in md17} == md17
         for word in ("by protocol md17", "500 K", "0.5 fs", "5 fs", "gaff2", "GAFF2 for their PBE"):
             assert word in said
-        warmer, said = settle(scene, {"temperature_k": 600.0, "save_every_ps": 0.01}, "md17")
+        warmer, said = resolve_settings(scene, {"temperature_k": 600.0, "save_every_ps": 0.01}, "md17")
         assert (warmer["temperature_k"], warmer["save_every_ps"], warmer["timestep_ps"]) == (600.0, 0.01, 0.0005)
         assert "temperature" not in said
         assert "saved" not in said
@@ -127,31 +127,31 @@ def test_a_protocol_is_asked_for_by_name_and_outweighed_by_what_is_given() -> No
 
 def test_without_a_protocol_the_defaults_hold_and_nothing_is_said() -> None:
     scene = named_scenes.load("aspirin")
-    assert settle(scene, {}) == (defaults(), "")
-    assert settle(scene, {"temperature_k": 310.0})[0] == defaults() | {"temperature_k": 310.0}
+    assert resolve_settings(scene, {}) == (defaults(), "")
+    assert resolve_settings(scene, {"temperature_k": 310.0})[0] == defaults() | {"temperature_k": 310.0}
 
 
 def test_model_systems_have_settings_of_their_own_and_take_no_protocol() -> None:
     scene = named_scenes.load("double-well")
-    settings, said = settle(scene, {})
+    settings, said = resolve_settings(scene, {})
     assert (settings["timestep_ps"], settings["save_every_ps"]) == (0.01, 0.1)
     assert "this program's own" in said
     with pytest.raises(InputError, match="leave `protocol` out"):
-        settle(scene, {}, "md17")
+        resolve_settings(scene, {}, "md17")
 
 
 def test_flexible_bonds_end_above_one_femtosecond() -> None:
     scene = named_scenes.load("ethanol")
-    assert settle(scene, {"timestep_ps": 0.001}, "md17")[0]["constrain_hydrogens"] is False
-    assert settle(scene, {"timestep_ps": 0.002}, "md17")[0]["constrain_hydrogens"] is True
+    assert resolve_settings(scene, {"timestep_ps": 0.001}, "md17")[0]["constrain_hydrogens"] is False
+    assert resolve_settings(scene, {"timestep_ps": 0.002}, "md17")[0]["constrain_hydrogens"] is True
     given = {"timestep_ps": 0.002, "constrain_hydrogens": False}
-    assert settle(scene, given, "md17")[0]["constrain_hydrogens"] is False
+    assert resolve_settings(scene, given, "md17")[0]["constrain_hydrogens"] is False
 
 
 def test_another_force_field_leaves_the_protocol_s_solvent() -> None:
     scene = named_scenes.load("chignolin")
-    assert settle(scene, {"force_field": "gfn2-xtb"}, "fast-folders")[0]["solvent"] == "auto"
-    assert settle(scene, {"solvent": "vacuum"}, "fast-folders")[0]["force_field"] == "ff14SB"
+    assert resolve_settings(scene, {"force_field": "gfn2-xtb"}, "fast-folders")[0]["solvent"] == "auto"
+    assert resolve_settings(scene, {"solvent": "vacuum"}, "fast-folders")[0]["force_field"] == "ff14SB"
 
 
 # ---- runs ----------------------------------------------------------------------------------------------------------

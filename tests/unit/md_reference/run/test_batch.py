@@ -88,7 +88,7 @@ def test_a_replica_that_blows_up_leaves_the_frames_before(tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize("change", [{"ensemble": "nve"}, {"save_velocities": True}])
-def test_what_lanes_cannot_do_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
+def test_what_simd_cannot_do_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     with pytest.raises(InputError, match="platform simd"):
         simulate_batch(SCENE, replace(CONFIG, **change), [tmp_path / "x.h5"])
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,5 @@
-"""Run time against error: errors of rollouts whose worth is known, what it refuses, the whole on tiny weights."""
+"""Run time against error: errors of rollouts whose equivalent MD time is known, what it refuses, the whole on tiny
+weights."""
 
 from __future__ import annotations
 
@@ -15,7 +16,13 @@ from compare_speed import pose, torsion_path
 from typer.testing import CliRunner
 
 from surrogate.bench.cost_error.cost_page import crossings, markdown
-from surrogate.bench.cost_error.errors_beside_md import Truth, judge_frames, judge_truth, read_truth, worth_row
+from surrogate.bench.cost_error.errors_beside_md import (
+    ReferenceForces,
+    compare_frames,
+    compare_reference,
+    equivalent_time_row,
+    read_reference,
+)
 from surrogate.bench.cost_error.sweep import run_cost_error
 from surrogate.bench.cost_error.sweep_settings import CostErrorConfig, Setting, Sweep, choose_settings
 from surrogate.bench.held_out import refuse_trained_on
@@ -51,8 +58,8 @@ def held(tmp_path_factory: pytest.TempPathFactory, alanine_dipeptide: Scene) -> 
 
 
 @pytest.fixture(scope="module")
-def truth(held: tuple[Path, Path], alanine_dipeptide: Scene) -> Truth:
-    return read_truth(alanine_dipeptide, held[:1], held[1:])
+def reference(held: tuple[Path, Path], alanine_dipeptide: Scene) -> ReferenceForces:
+    return read_reference(alanine_dipeptide, held[:1], held[1:])
 
 
 @pytest.fixture(scope="module")
@@ -64,45 +71,51 @@ def weights(tmp_path_factory: pytest.TempPathFactory, small_weights: Weights) ->
     return load_weights(out)
 
 
-def test_a_true_rollout_is_worth_its_length_and_a_wrong_one_little(truth: Truth, alanine_dipeptide: Scene) -> None:
+def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
+    reference: ReferenceForces, alanine_dipeptide: Scene
+) -> None:
     frames = toy_frames(alanine_dipeptide, 9, 3_000).astype(np.float64)
-    right, worth = judge_frames(frames.reshape(3, 1_000, 22, 3), truth)
-    assert worth.worth_ps == pytest.approx(3_000, rel=0.4)
+    right, equivalent_time = compare_frames(frames.reshape(3, 1_000, 22, 3), reference)
+    assert equivalent_time.equivalent_ps == pytest.approx(3_000, rel=0.4)
     assert right["jsd"]["low"] < right["jsd"]["value"] < right["jsd"]["high"]
     assert right["jsd"]["value"] == pytest.approx(right["curve"][-1][1], rel=1e-9)
     assert [ps for ps, _ in right["curve"]][-1] == 3_000 and right["curve"][0][1] > 1.5 * right["curve"][-1][1]
     assert right["valid_half_angstrom_%"]["value"] == 100.0
-    of_md = judge_truth(truth)
+    of_md = compare_reference(reference)
     for key in ("correlation", "relaxation_ps"):
         assert right[key]["value"] == pytest.approx(of_md[key][0]["value"], rel=0.15), key
     assert of_md["floor"] == of_md["errors"][-1] < of_md["errors"][0] and of_md["lengths_ps"][-1] == N_FRAMES
     # Negative controls: one state alone; frames in another order; a tenth of the frames torn.
-    stuck, worth = judge_frames(np.repeat(frames[None, :10], 300, axis=1), truth)
-    assert stuck["jsd"]["value"] > 3 * right["jsd"]["value"] and worth.bound == "less than"
-    shuffled, _ = judge_frames(np.random.default_rng(0).permutation(frames)[None], truth)
+    stuck, equivalent_time = compare_frames(np.repeat(frames[None, :10], 300, axis=1), reference)
+    assert stuck["jsd"]["value"] > 3 * right["jsd"]["value"] and equivalent_time.bound == "less than"
+    shuffled, _ = compare_frames(np.random.default_rng(0).permutation(frames)[None], reference)
     assert shuffled["jsd"]["value"] == pytest.approx(right["jsd"]["value"], abs=1e-9)
     assert shuffled["relaxation_ps"]["value"] < 0.2 * right["relaxation_ps"]["value"]
     torn = frames.copy()
     torn[::10, 0] += 0.2
-    lost, worth = judge_frames(np.full_like(frames[None], np.nan), truth)
-    assert worth.bound == "less than" and lost["correlation"]["value"] is None
+    lost, equivalent_time = compare_frames(np.full_like(frames[None], np.nan), reference)
+    assert equivalent_time.bound == "less than" and lost["correlation"]["value"] is None
     assert lost["jsd"]["value"] == pytest.approx(math.sqrt(math.log(2)), abs=1e-6)
-    broken, _ = judge_frames(torn[None], truth)
+    broken, _ = compare_frames(torn[None], reference)
     assert broken["valid_half_angstrom_%"]["value"] == pytest.approx(90.0)
     assert broken["bond_variance_%"] > 2 * right["bond_variance_%"]
 
 
-def test_worth_is_turned_into_seconds_and_never_beyond_the_floor(truth: Truth, alanine_dipeptide: Scene) -> None:
-    _, worth = judge_frames(toy_frames(alanine_dipeptide, 5, 3_000)[None].astype(np.float64), truth)
-    row = worth_row(worth, spent_s=2.0, md_s_per_ns=8.0)
-    assert row["times_faster"] == pytest.approx(1e-3 * worth.worth_ps * 8.0 / 2.0)
+def test_equivalent_time_is_turned_into_seconds_and_never_beyond_the_floor(
+    reference: ReferenceForces, alanine_dipeptide: Scene
+) -> None:
+    _, equivalent_time = compare_frames(toy_frames(alanine_dipeptide, 5, 3_000)[None].astype(np.float64), reference)
+    row = equivalent_time_row(equivalent_time, spent_s=2.0, md_s_per_ns=8.0)
+    assert row["times_faster"] == pytest.approx(1e-3 * equivalent_time.equivalent_ps * 8.0 / 2.0)
     # 2 s are a quarter of a ns of MD.
-    assert row["md_of_same_seconds"] == pytest.approx(worth.error_at(250 / N_FRAMES))
-    assert worth_row(worth, 2e-4, 8.0)["md_of_same_seconds"] is None
-    perfect = replace(worth, worth_ps=worth.lengths_ps[-1], bound="at least", low_ps=None, high_ps=None)
-    row = worth_row(perfect, 2.0, 8.0)
+    assert row["md_of_same_seconds"] == pytest.approx(equivalent_time.error_at(250 / N_FRAMES))
+    assert equivalent_time_row(equivalent_time, 2e-4, 8.0)["md_of_same_seconds"] is None
+    perfect = replace(
+        equivalent_time, equivalent_ps=equivalent_time.lengths_ps[-1], bound="at least", low_ps=None, high_ps=None
+    )
+    row = equivalent_time_row(perfect, 2.0, 8.0)
     assert row["times_faster"] == pytest.approx(1e-3 * N_FRAMES * 8.0 / 2.0) and row["times_faster_high"] is None
-    assert row["worth"]["words"].startswith("at least")
+    assert row["equivalent_time"]["words"].startswith("at least")
 
 
 def test_runs_that_were_trained_on_are_refused(
@@ -160,7 +173,7 @@ def test_settings_are_combinations_of_what_is_asked(weights: Weights) -> None:
 def test_a_whole_benchmark_is_written_and_gone_on_with(
     tmp_path: Path, held: tuple[Path, Path], weights: Weights
 ) -> None:
-    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1)
+    config = CostErrorConfig(time_ps=900.0, discarded_ps=7.0, rounds=2, slice_ps=0.1)
     told: list[str] = []
 
     def run(*settings: Setting) -> dict[str, Any]:
@@ -207,7 +220,7 @@ def test_a_whole_benchmark_is_written_and_gone_on_with(
 
 
 def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
-    tmp_path: Path, truth: Truth, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
+    tmp_path: Path, reference: ReferenceForces, held: tuple[Path, Path], weights: Weights, alanine_dipeptide: Scene
 ) -> None:
     runs = [
         write(
@@ -217,14 +230,14 @@ def test_weights_that_know_lags_are_held_against_frames_as_far_apart(
     ]
     peptides = load_weights(weights_path("peptides"))
     chosen, told = [(peptides, [Setting("gaussian", 2, "fp32")])], Setting("gaussian", 2, "fp32").label
-    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
+    config = CostErrorConfig(time_ps=900.0, discarded_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
     lines: list[str] = []
     found = run_cost_error(chosen, runs[:1], runs[1:], tmp_path / "a", config, report=lines.append)
     assert lines[-1] == f"peptides: {told}"
     (row,) = found["rows"]
     assert row["curve"][-1][0] == pytest.approx(1e3 * row["ns"])
     assert row["ns"] >= 5.0, "a chunk of 32 replicas has 16 frames 10 ps apart"
-    of_neighbours = judge_truth(truth)["correlation"][0]["value"]
+    of_neighbours = compare_reference(reference)["correlation"][0]["value"]
     assert found["md"]["correlation"][0]["value"] < of_neighbours - 0.1, "cos psi 10 ps later, not 1 ps"
     source_ns = 1e-3 * sum(source["n_frames"] for source in peptides.provenance["sources"])
     assert row["before"]["reference_ns"] >= source_ns > 4000.0, "training saw frames 1 ps apart"
@@ -248,7 +261,7 @@ def test_weights_whose_atoms_stand_in_another_order_are_measured_beside_others(
     tiny = tmp_path / "tiny.safetensors"
     domain = replace(weights.domain, conditions={**CONDITIONS, "timestep_ps": 0.004})
     save_weights(tiny, weights.model, domain, weights.provenance)
-    config = CostErrorConfig(time_ps=900.0, settle_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
+    config = CostErrorConfig(time_ps=900.0, discarded_ps=7.0, rounds=2, slice_ps=0.1, lag_ps=10.0)
     chosen = [(load_weights(weights_path("peptides")), [Setting("gaussian", 2, "fp32")]),
               (load_weights(tiny), [Setting("fitted", 2, "fp32")])]  # fmt: skip
     beside = run_cost_error(chosen, runs[:1], runs[1:], tmp_path / "both", config)["rows"]

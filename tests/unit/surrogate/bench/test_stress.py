@@ -157,7 +157,7 @@ def test_openmm_moves_in_every_frame_under_the_constraints_of_the_reference(
         usual(engine, n_steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surrogate.bench.stress.other_arithmetic.SETTLE_PS", 0.05)
+        patch.setattr("surrogate.bench.stress.other_arithmetic.DISCARDED_PS", 0.05)
         patch.setattr(Engine, "step", step)
         assert measure_openmm(replace(small_weights, domain=domain), n_frames=4)[0]["timestep_fs"] == 1.0
     assert taken[:5] == [50, 1, 1, 1, 1] and min(taken) == 1

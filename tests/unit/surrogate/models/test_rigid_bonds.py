@@ -106,8 +106,8 @@ def test_energy_is_kept_at_4_fs_without_a_bath(paracetamol: tuple[PainetPotentia
             found.append(kinetic + free.evaluate(x[:, -1].double(), molecule).energy_kj_mol[0])
         return torch.stack(found)
 
-    settled = totals(molecule, 80)[20:]
+    resolved = totals(molecule, 80)[20:]
     # Of the thermal kinetic energy of all atoms.
     bound = 0.02 * 0.5 * GAS_CONSTANT_KJ_MOL_K * 300.0 * 3 * scene.n_atoms
-    assert float(settled.std()) < bound and abs(float(settled[-20:].mean() - settled[:20].mean())) < 1.0
+    assert float(resolved.std()) < bound and abs(float(resolved[-20:].mean() - resolved[:20].mean())) < 1.0
     assert float(totals(replace(molecule, own=None), 40).std()) > bound, "with bonds that vibrate it is not"

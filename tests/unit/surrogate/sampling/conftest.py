@@ -56,5 +56,5 @@ def short_energy_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the MD that energies are otherwise measured against."""
     from surrogate.sampling.openmm import coupling
 
-    monkeypatch.setattr(coupling, "_SETTLE_PS", 2.0)
+    monkeypatch.setattr(coupling, "_DISCARDED_PS", 2.0)
     monkeypatch.setattr(coupling, "_SAMPLES", 30)

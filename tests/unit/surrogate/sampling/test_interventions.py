@@ -46,7 +46,7 @@ def test_a_sound_model_is_left_alone_under_every_guard(tmp_path: Path, scene: Sc
     frames = []
     for guard in ("off", "flag", "resample", "repair", "fallback"):
         found = roll(tmp_path / f"{guard}.h5", scene, weights_of(domain), guard)
-        assert not found.marks.any() and found.account["chunks"] == 4 and found.account["chunks_caught"] == 0
+        assert not found.marks.any() and found.summary["chunks"] == 4 and found.summary["chunks_caught"] == 0
         assert not (found.flags & np.uint16(CAUGHT)).any()
         frames.append(found.frames)
     assert all(np.array_equal(frames[0], other) for other in frames[1:])
@@ -57,9 +57,9 @@ def test_flag_marks_the_frame_and_changes_nothing(tmp_path: Path, scene: Scene, 
     bad = np.flatnonzero(found.flags & np.uint16(INVALID))
     assert len(bad) and (bad % N_NEW == 5).all(), "the frames that the script breaks, and no other"
     assert not found.marks.any()
-    assert found.account["chunks_caught"] == len(bad)
-    assert found.account["reasons"]["bond more than 0.5 Å off"] == len(bad)
-    assert found.account["bias"] == []
+    assert found.summary["chunks_caught"] == len(bad)
+    assert found.summary["reasons"]["bond more than 0.5 Å off"] == len(bad)
+    assert found.summary["bias"] == []
 
 
 def test_resample_draws_again_from_the_last_valid_frame(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
@@ -70,12 +70,12 @@ def test_resample_draws_again_from_the_last_valid_frame(tmp_path: Path, scene: S
     assert np.array_equal(found.frames[:5], flagged.frames[:5]), "what was valid stays"
     assert found.marks[:N_NEW].tolist() == [0] * 5 + [DRAWN_AGAIN] * 3
     assert np.abs(found.frames[5] - found.frames[4]).max() < 0.02, "and the new frames follow from it"
-    account = found.account
-    assert account["draws"] >= account["chunks_caught"] >= 1
-    assert account["frames"] == {"drawn again": int((found.marks == DRAWN_AGAIN).sum())}
-    assert account["log"][0] == {"chunk": 0, "step": 6, "reasons": account["log"][0]["reasons"]}
-    assert len(account["bias"]) == 1 and "visited less" in account["bias"][0]
-    assert found.record["cost"]["network_evaluations"] == account["chunks"] + account["draws"]
+    summary = found.summary
+    assert summary["draws"] >= summary["chunks_caught"] >= 1
+    assert summary["frames"] == {"drawn again": int((found.marks == DRAWN_AGAIN).sum())}
+    assert summary["log"][0] == {"chunk": 0, "step": 6, "reasons": summary["log"][0]["reasons"]}
+    assert len(summary["bias"]) == 1 and "visited less" in summary["bias"][0]
+    assert found.record["cost"]["network_evaluations"] == summary["chunks"] + summary["draws"]
 
 
 def test_repair_restores_the_bond_and_leaves_the_other_frames(
@@ -91,7 +91,7 @@ def test_repair_restores_the_bond_and_leaves_the_other_frames(
     length = np.linalg.norm(found.frames[bad, 5] - found.frames[bad, 4], axis=1)
     assert np.abs(length - 0.1229).max() < 0.004, "C=O of ff14SB"
     assert np.linalg.norm(found.frames[bad] - flagged.frames[bad], axis=2).max() < 0.12
-    assert found.account["seconds"]["relax"] > 0 and found.account["draws"] == 0
+    assert found.summary["seconds"]["relax"] > 0 and found.summary["draws"] == 0
 
 
 def test_what_cannot_be_repaired_is_drawn_again(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
@@ -99,7 +99,7 @@ def test_what_cannot_be_repaired_is_drawn_again(tmp_path: Path, scene: Scene, do
     assert (flagged.flags & np.uint16(CHIRALITY)).any()
     found = roll(tmp_path / "a.h5", scene, weights_of(domain, invert), "repair")
     assert not (found.flags & np.uint16(CAUGHT)).any()
-    assert found.account["draws"] > 0
+    assert found.summary["draws"] > 0
     assert set(found.marks.tolist()) <= {0, DRAWN_AGAIN, REPAIRED} and DRAWN_AGAIN in found.marks
 
 
@@ -189,7 +189,7 @@ def test_a_proven_model_is_helped_through_a_chunk_without_a_valid_frame(
     found = roll(tmp_path / "a.h5", scene, weights_of(domain, scatter_some), guard)
     assert not (found.flags & np.uint16(INVALID)).any()
     assert found.marks.tolist() == [0] * N_NEW + [mark] * N_NEW + [0] * 2 * N_NEW
-    assert found.account["chunks_caught"] == 1 and found.account["draws"] == (2 if guard == "resample" else 1)
+    assert found.summary["chunks_caught"] == 1 and found.summary["draws"] == (2 if guard == "resample" else 1)
     drawn, first = 0, 1
     with pytest.raises(SimulationError, match=r"in its first chunk: two draws gave no frame that passes"):
         roll(tmp_path / "b.h5", scene, weights_of(domain, scatter_some), guard)
@@ -237,7 +237,7 @@ def test_a_rollout_with_interventions_resumes_bit_for_bit(tmp_path: Path, scene:
             assert np.array_equal(whole.frames, resumed.frames)
             assert np.array_equal(whole.marks, resumed.marks) and whole.marks.any()
             for key in ("chunks", "chunks_caught", "frames", "reasons", "draws", "log"):
-                assert whole.account[key] == resumed.account[key]
+                assert whole.summary[key] == resumed.summary[key]
 
 
 def test_a_batch_that_memory_does_not_hold_is_halved(tmp_path: Path, scene: Scene, domain: TrainingDomain) -> None:
@@ -266,7 +266,7 @@ def test_chunks_of_one_frame_end_a_rollout_only_when_several_in_a_row_are_invali
     failed = []
     for invalid in (1, 1, 1, 0, 1, 1, 1, 1):
         flags[:] = CLASH if invalid else 0
-        _Advance.judge(cast(_Advance, helper))
+        _Advance.compare(cast(_Advance, helper))
         failed.append(helper.chunk.failure is not None)
     assert failed == [False] * 7 + [True]
     assert helper.chunk.failure == (0, "4 frames and no valid one (clash)")

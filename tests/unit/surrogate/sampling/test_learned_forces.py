@@ -1,4 +1,4 @@
-"""A learned potential behind OpenMM's and ASE's faces, and the weights that make its frames those of the truth."""
+"""A learned potential behind OpenMM's and ASE's faces, and the weights that make its frames those of the reference."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from md_reference.forces.quantum import Potential
+from surrogate.comparison.read.ensemble import load_ensemble
 from surrogate.data.shipped import weights_path
-from surrogate.judge.read.ensemble import load_ensemble
 from surrogate.models.painet.model import Painet, PainetConfig
 from surrogate.models.painet.potential.energy import PotentialConfig
 from surrogate.models.painet.potential.model import PainetPotential
@@ -165,7 +165,7 @@ def test_models_of_frames_take_no_other_bath() -> None:
         in_bath(weights(), {"timestep_ps": 0.003})
 
 
-def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(tmp_path: Path) -> None:
+def test_a_rollout_asks_the_reference_about_its_frames_and_the_comparison_reweights_them(tmp_path: Path) -> None:
     """A model that knows nothing: every difference is large, and its members differ from each other."""
     pytest.importorskip("tblite")
     torch.manual_seed(0)
@@ -183,9 +183,9 @@ def test_a_rollout_asks_the_truth_about_its_frames_and_the_judge_reweights_them(
             differences = reader.scalars[DIFFERENCE_COLUMN]
     np.testing.assert_array_equal(*frames.values())
     assert np.isfinite(differences).all()
-    truth, learned = Potential(domain.scene), LearnedForces(domain.scene, given)
+    reference, learned = Potential(domain.scene), LearnedForces(domain.scene, given)
     x = frames[1e9][1].astype(np.float64)
-    assert differences[1] == pytest.approx(truth(x)[0] - learned(x)[0], abs=0.05)
+    assert differences[1] == pytest.approx(reference(x)[0] - learned(x)[0], abs=0.05)
     poor, fine = flags.values()
     assert (poor & np.uint16(UNSURE)).all() and not (fine & np.uint16(UNSURE | ENERGY)).any()
     # A frame that is caught already is not asked about.

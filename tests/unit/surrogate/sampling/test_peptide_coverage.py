@@ -71,13 +71,13 @@ def test_an_unseen_sequence_is_covered_under_any_names(weights: Weights) -> None
     i, j = built.bonds.T
     ours, theirs = scene.positions_nm[found.order], built.positions_nm
     assert np.allclose(np.linalg.norm(ours[i] - ours[j], axis=1), np.linalg.norm(theirs[i] - theirs[j], axis=1))
-    remark = found.remarks("small")[0]
+    remark = found.input_notes("small")[0]
     assert "SER-ALA" in remark and "ALA-NME" not in remark
 
 
 def test_a_peptide_that_was_trained_on_is_seen(weights: Weights) -> None:
     found = match_domain(as_another_program(build_peptide("ACE-ALA-SER-NME")), weights)
-    assert found.seen and found.remarks("small") == ()
+    assert found.seen and found.input_notes("small") == ()
 
 
 @pytest.mark.parametrize("sequence", ["ACE-GLY-NME", "ALA-SER"])

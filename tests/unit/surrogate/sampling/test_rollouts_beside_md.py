@@ -30,8 +30,8 @@ def test_md_between_chunks_is_marked_and_takes_its_time(tmp_path: Path, scene: S
     assert np.allclose(found.times, LAG_PS * np.arange(1, 41))
     assert found.marks.tolist() == ([0] * 8 + [MD_BETWEEN] * 2) * 4
     assert not (found.flags & np.uint16(CAUGHT)).any()
-    assert found.account["seconds"]["md"] > 0
-    assert "mixture" in found.account["bias"][0]
+    assert found.summary["seconds"]["md"] > 0
+    assert "mixture" in found.summary["bias"][0]
 
 
 def test_energies_of_every_kth_frame_catch_what_geometry_does_not(
@@ -41,11 +41,11 @@ def test_energies_of_every_kth_frame_catch_what_geometry_does_not(
     energies = found.scalars["relaxed_energy_kj_mol"]
     assert np.array_equal(np.flatnonzero(np.isfinite(energies)), [2, 5, 8, 11, 14])
     assert not (found.flags & np.uint16(ENERGY)).any()
-    assert found.account["seconds"]["energy limit"] > found.account["seconds"]["energy"] > 0
+    assert found.summary["seconds"]["energy limit"] > found.summary["seconds"]["energy"] > 0
     # A twisted peptide bond breaks no rule of geometry, once there are no limits; its energy shows it.
     loose = weights_of(replace(domain, limits=None), twist)
     twisted = roll(tmp_path / "b.h5", scene, loose, "flag", n_chunks=1, energy_every=3)
-    assert twisted.account["unchecked"] == [Guard(loose.domain).unchecked[0]]
+    assert twisted.summary["unchecked"] == [Guard(loose.domain).unchecked[0]]
     assert twisted.flags.tolist() == [0, 0, ENERGY, 0, 0, 0, 0, 0]
     drawn = [roll(tmp_path / f"{k}.h5", scene, loose, "flag", n_chunks=1, energy_every=k).flags[2] for k in (2, 4)]
     assert drawn == [0, 0], "only every k-th frame is looked at"

@@ -44,7 +44,7 @@ class Answers:
 
 
 class Springs:
-    """A truth that is quickly told: springs between all atoms at most two bonds apart."""
+    """A reference that is quickly told: springs between all atoms at most two bonds apart."""
 
     def __init__(self, *, silent: bool = False) -> None:
         self.scene: Scene = scene_from_smiles("O")
@@ -75,29 +75,29 @@ class Springs:
 
 
 def test_it_learns_forces_and_asks_about_more_states(tmp_path: Path) -> None:
-    truth, out = Springs(), tmp_path / "w.safetensors"
+    reference, out = Springs(), tmp_path / "w.safetensors"
     config = replace(QUICK, steps=100, learning_rate=5e-3, matrix_rate=0.05)
-    learn_potential(truth, out, SMALL, config)
+    learn_potential(reference, out, SMALL, config)
     weights = load_weights(out)
     found = weights.provenance
     assert found["force_rms"] < 0.4 * found["mean_force"]
     assert found["evaluations"] > QUICK.first
-    samples = Samples.load(samples_path(out), truth.scene.topology_hash)
-    assert len(samples) == found["evaluations"] <= truth.asked
+    samples = Samples.load(samples_path(out), reference.scene.topology_hash)
+    assert len(samples) == found["evaluations"] <= reference.asked
     assert 0 < samples.held.sum() < 0.3 * len(samples)
     with out.with_name("w.rounds.csv").open() as handle:
         rounds = list(csv.DictReader(handle))
     assert [int(r["evaluations"]) for r in rounds] == sorted(int(r["evaluations"]) for r in rounds)
     # The file gives back the potential: its forces at held-out states, and a rollout that stays whole.
-    model, molecule = weights.model, Molecule.of(truth.scene)
+    model, molecule = weights.model, Molecule.of(reference.scene)
     held = samples.where(samples.held)
     forces = model.forces(torch.from_numpy(held.positions_nm), molecule).numpy()
     error = np.sqrt(np.mean((forces - held.forces_kj_mol_nm) ** 2))
     assert error == pytest.approx(found["force_rms"], rel=0.01)
     noise = draw_noise(model, 3, [torch.Generator().manual_seed(0)])
-    chunk = model.next_chunk(torch.tensor(truth.scene.positions_nm[None, None]).float(), molecule, noise)
+    chunk = model.next_chunk(torch.tensor(reference.scene.positions_nm[None, None]).float(), molecule, noise)
     lengths = (chunk.frames_nm[..., 0, :] - chunk.frames_nm[..., 1, :]).norm(dim=-1)
-    assert ((lengths - truth.pairs[0][2]).abs() < 0.05).all()
+    assert ((lengths - reference.pairs[0][2]).abs() < 0.05).all()
 
 
 def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,11 +128,11 @@ def test_a_budget_is_for_all_that_a_training_takes(tmp_path: Path, monkeypatch: 
 
 
 def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> None:
-    truth = Springs()
+    reference = Springs()
     from surrogate.models.painet.potential.model import PainetPotential
 
     torch.manual_seed(0)
-    learner = Learner(PainetPotential(SMALL), truth, QUICK, tmp_path / "w.safetensors", resume=False)
+    learner = Learner(PainetPotential(SMALL), reference, QUICK, tmp_path / "w.safetensors", resume=False)
     optimiser = torch.optim.Adam(learner.model.parameters(), 5e-3)
     generator = torch.Generator().manual_seed(0)
     for _ in range(300):
@@ -140,13 +140,13 @@ def test_where_members_differ_is_where_the_model_knows_least(tmp_path: Path) -> 
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    near = torch.from_numpy(truth.explore(20, (300.0,), seed=9))
+    near = torch.from_numpy(reference.explore(20, (300.0,), seed=9))
     far = near + 0.03 * torch.randn(near.shape, generator=generator, dtype=near.dtype)
     assert np.median(learner.spread(far)) > 1.3 * np.median(learner.spread(near))
 
 
 def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
-    truth, out = Springs(), tmp_path / "w.safetensors"
+    reference, out = Springs(), tmp_path / "w.safetensors"
 
     class Stopped(Exception):
         pass
@@ -157,13 +157,13 @@ def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
 
     config = replace(QUICK, validate_every_s=0.0)
     with pytest.raises(Stopped):
-        learn_potential(truth, out, SMALL, config, progress=stop)
+        learn_potential(reference, out, SMALL, config, progress=stop)
     assert not out.exists() and samples_path(out).exists()
-    first = Samples.load(samples_path(out), truth.scene.topology_hash)
-    learn_potential(truth, out, SMALL, config, resume=True)
+    first = Samples.load(samples_path(out), reference.scene.topology_hash)
+    learn_potential(reference, out, SMALL, config, resume=True)
     assert out.exists()
     # What was answered is not asked again.
-    samples = Samples.load(samples_path(out), truth.scene.topology_hash)
+    samples = Samples.load(samples_path(out), reference.scene.topology_hash)
     np.testing.assert_array_equal(samples.positions_nm[: len(first)], first.positions_nm)
     assert not list(tmp_path.glob("*.train.safetensors"))
 
@@ -171,16 +171,16 @@ def test_an_interrupted_training_goes_on(tmp_path: Path) -> None:
 def test_samples_alone_are_enough_to_go_on_from(tmp_path: Path) -> None:
     from surrogate.models.painet.potential.model import PainetPotential
 
-    truth, models = Springs(), [PainetPotential(SMALL) for _ in range(2)]
+    reference, models = Springs(), [PainetPotential(SMALL) for _ in range(2)]
     for model, resume in zip(models, (False, True), strict=True):
-        Learner(model, truth, QUICK, tmp_path / "w.safetensors", resume=resume)
-    assert truth.asked == QUICK.first
+        Learner(model, reference, QUICK, tmp_path / "w.safetensors", resume=resume)
+    assert reference.asked == QUICK.first
     scales = [float(model.energy_scale_kj_mol) for model in models]
     assert scales[0] == scales[1] and scales[0] != float(PainetPotential(SMALL).energy_scale_kj_mol)
     assert float(models[0].energy_offset_kj_mol) == float(models[1].energy_offset_kj_mol)
 
 
-def test_a_truth_without_answers_and_foreign_samples_are_refused(tmp_path: Path) -> None:
+def test_a_reference_without_answers_and_foreign_samples_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="no answer"):
         learn_potential(Springs(silent=True), tmp_path / "w.safetensors", SMALL, QUICK)
     Samples.none(3).save(tmp_path / "s.safetensors", "mine")
@@ -238,8 +238,8 @@ def test_states_that_a_pause_let_miss_their_time_are_asked_for_once(
 ) -> None:
     from surrogate.models.painet.potential.model import PainetPotential
 
-    truth = Springs()
-    learner = Learner(PainetPotential(SMALL), truth, QUICK, tmp_path / "w.safetensors", resume=False)
+    reference = Springs()
+    learner = Learner(PainetPotential(SMALL), reference, QUICK, tmp_path / "w.safetensors", resume=False)
     monkeypatch.setattr(Learner, "share", property(lambda self: share))
     generator = torch.Generator().manual_seed(0)
     for _ in range(3):

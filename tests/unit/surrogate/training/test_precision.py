@@ -105,7 +105,7 @@ def test_the_record_says_which_and_why_and_resume_keeps_it(
     with open_trajectory(fresh) as reader:
         assert reader.record["precision"] == "bf16"
         assert "4 times as fast" in reader.record["precision_reason"]
-    assert "network in bf16: products in bf16 through avx512_bf16" in describe_file(fresh)["account"][0]
+    assert "network in bf16: products in bf16 through avx512_bf16" in describe_file(fresh)["details"][0]
 
 
 def test_measuring_leaves_random_numbers_alone() -> None:

@@ -83,10 +83,10 @@ def test_a_single_path_is_one_candidate_and_no_other_file_is_read(
     # "." of out.dcd is the current folder, whose trajectories are others.
     _write(here / "other.h5", alanine_dipeptide, 2)
     result = sm.compare(as_path("ref.h5"), as_path("out.dcd"), labels="mine", dt_ps="1ps")
-    assert [judgement.account.sources for judgement in result.judgements] == [("out.dcd",)]
-    assert [judgement.account.label for judgement in result.judgements] == ["mine"]
+    assert [evaluation.summary.sources for evaluation in result.evaluations] == [("out.dcd",)]
+    assert [evaluation.summary.label for evaluation in result.evaluations] == ["mine"]
     several = sm.compare("ref.h5", ["out.dcd", "other.h5"])
-    assert [judgement.account.sources for judgement in several.judgements] == [("out.dcd",), ("other.h5",)]
+    assert [evaluation.summary.sources for evaluation in several.evaluations] == [("out.dcd",), ("other.h5",)]
     with pytest.raises(InputError, match=r"nothing\.dcd: no such file"):
         sm.compare("ref.h5", "nothing.dcd")
 

@@ -99,4 +99,4 @@ def test_a_surrogate_that_is_wrong_leaves_the_answer_md_s(
         assert outcome["in_short"][0] != "Use MD's answer."
         assert found.answer["missing"] or "not converged" in outcome["in_short"][2]
     top = (tmp_path / "run" / "report.md").read_text("utf-8")
-    assert "Use the surrogate" not in top and not outcome["worth"], "no speed-up is told of a wrong surrogate"
+    assert "Use the surrogate" not in top and not outcome["equivalent_time"], "no speed-up is told of a wrong surrogate"

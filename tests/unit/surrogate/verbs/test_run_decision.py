@@ -25,7 +25,7 @@ from systems.errors import InputError
 FAST = Rolls("alanine-dipeptide", 1.0, 1600.0, 8, 2000.0)
 COVERED = Rates(22, 2, 1.0, False, "OBC2; about 1", 25e-6, 0.004, 320.0, "trained on it", FAST)
 UNCOVERED = replace(COVERED, rolls=None, coverage="elements: S not seen")
-DEAR = replace(UNCOVERED, dear=True, step_s=16e-3, timestep_ps=0.0005, md_ps_per_s=0.0625)
+EXPENSIVE = replace(UNCOVERED, expensive=True, step_s=16e-3, timestep_ps=0.0005, md_ps_per_s=0.0625)
 
 
 def named(decision: Decision) -> list[str]:
@@ -47,9 +47,9 @@ def test_where_md_forgets_its_start_too_slowly_a_rollout_finds_the_states() -> N
     assert decide(lame, 60.0, "surrogate").way == "rollout", "but by request"
 
 
-def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
+def test_cheap_reference_that_nothing_covers_is_md_with_half_held_out() -> None:
     found = decide(UNCOVERED, 600.0)
-    assert found.way == "md" and named(found) == ["md", "report"], "replicas judge each other"
+    assert found.way == "md" and named(found) == ["md", "report"], "replicas evaluate each other"
     alone = decide(replace(UNCOVERED, cores=1), 600.0)
     assert named(alone) == ["md", "held-out md", "report"] and alone.seconds("md") == alone.seconds("held-out md")
     assert "S not seen" in found.why[1]
@@ -58,13 +58,13 @@ def test_cheap_truth_that_nothing_covers_is_md_with_half_held_out() -> None:
 
 
 def test_no_potential_learns_in_alpb_water() -> None:
-    """It would learn the forces of the vacuum and be judged by MD in water."""
-    dear = replace(UNCOVERED, dear=True)
-    assert decide(dear, 3600.0).way == "potential"
-    found = decide(replace(dear, in_water=True), 3600.0)
+    """It would learn the forces of the vacuum and be evaluated by MD in water."""
+    expensive = replace(UNCOVERED, expensive=True)
+    assert decide(expensive, 3600.0).way == "potential"
+    found = decide(replace(expensive, in_water=True), 3600.0)
     assert found.way == "md" and "learns forces in vacuum" in found.why[0]
     with pytest.raises(InputError, match="leave `solvent` out"):
-        decide(replace(dear, in_water=True), 3600.0, "surrogate")
+        decide(replace(expensive, in_water=True), 3600.0, "surrogate")
 
 
 def test_simd_replicas_are_a_rival_of_the_surrogate() -> None:
@@ -76,7 +76,7 @@ def test_simd_replicas_are_a_rival_of_the_surrogate() -> None:
     assert lines["by rollout"] == "138 us a day, 8 replicas of alanine-dipeptide"
     assert simd.replicas == 32 and found.equilibrate_ps == pytest.approx(0.1 * found.expected_md_ps / 32)
     one_core = decide(replace(simd, cores=1), 600.0)
-    assert named(one_core) == ["md", "report"], "sixteen replicas of one core judge each other"
+    assert named(one_core) == ["md", "report"], "sixteen replicas of one core evaluate each other"
     without = replace(COVERED, without_simd="no C++ compiler")
     assert dict(table(without, decide(without, 600.0), 600.0))["by SIMD"] == "no C++ compiler"
 
@@ -122,19 +122,19 @@ def test_each_way_is_expected_to_err_by_what_it_forgets_and_what_it_samples() ->
     assert errors_in_words({"MD": 0.0512}) == "error to expect of a population: 5.1 % by MD"
 
 
-def test_dear_truth_is_learned_where_there_is_time_to() -> None:
-    assert decide(DEAR, 3600.0).way == "potential"
-    short = decide(DEAR, 60.0)
+def test_dear_reference_is_learned_where_there_is_time_to() -> None:
+    assert decide(EXPENSIVE, 3600.0).way == "potential"
+    short = decide(EXPENSIVE, 60.0)
     assert short.way == "md" and "needs a budget of 4 min" in short.why[0]
-    assert decide(DEAR, 3600.0, "md").way == "md"
+    assert decide(EXPENSIVE, 3600.0, "md").way == "md"
 
 
 def test_the_least_budget_that_is_named_is_enough_although_measuring_took_some_of_it() -> None:
-    assert decide(DEAR, 230.0, whole_s=240.0).way == "potential"
-    assert decide(DEAR, 230.0, whole_s=239.0).way == "md", "control"
+    assert decide(EXPENSIVE, 230.0, whole_s=240.0).way == "potential"
+    assert decide(EXPENSIVE, 230.0, whole_s=239.0).way == "md", "control"
 
 
-@pytest.mark.parametrize("rates", [COVERED, UNCOVERED, DEAR])
+@pytest.mark.parametrize("rates", [COVERED, UNCOVERED, EXPENSIVE])
 @pytest.mark.parametrize("way", ["auto", "md", "surrogate"])
 @pytest.mark.parametrize("budget_s", [30.0, 60.0, 600.0, 36_000.0])
 def test_stages_fill_the_budget(rates: Rates, way: str, budget_s: float) -> None:
@@ -146,7 +146,7 @@ def test_stages_fill_the_budget(rates: Rates, way: str, budget_s: float) -> None
     assert table(rates, found, budget_s)[-1][0] == "in all"
 
 
-def test_frames_are_saved_no_more_often_than_the_judge_can_read() -> None:
+def test_frames_are_saved_no_more_often_than_the_comparison_can_read() -> None:
     short, long = (decide(COVERED, budget_s, "surrogate") for budget_s in (60.0, 36_000.0))
     assert short.save_every_ps < long.save_every_ps
     for found in (short, long):
@@ -160,7 +160,7 @@ def test_work_beside_us_stretches_time() -> None:
     assert measured_stretch(4 * available_cores(), 0.2) > 2.0, "four threads on each core"
 
 
-def test_a_budget_in_which_nothing_can_be_judged_is_refused() -> None:
+def test_a_budget_in_which_nothing_can_be_evaluated_is_refused() -> None:
     with pytest.raises(InputError, match="20 s it takes"):
         decide(COVERED, 5.0)
     with pytest.raises(InputError, match="busy"):

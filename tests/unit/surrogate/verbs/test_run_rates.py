@@ -17,8 +17,8 @@ from md_reference.run import plan
 from md_reference.run.config import MDConfig
 from md_reference.simd import force_field
 from md_reference.simd.system_terms import SimdUnavailableError
+from surrogate.comparison.read.ensemble import Ensemble
 from surrogate.data.shipped import weights_path
-from surrogate.judge.read.ensemble import Ensemble
 from surrogate.models.weights import load_weights
 from surrogate.verbs.run import rates as measuring
 from surrogate.verbs.run.rates import Rates, measure, rollout_rate
@@ -48,7 +48,7 @@ def found(config: MDConfig = CONFIG) -> Rates:
     return measure(SCENE, config, None, cores=1)
 
 
-def test_lanes_are_taken_where_they_are_faster() -> None:
+def test_simd_are_taken_where_they_are_faster() -> None:
     rates = found()
     assert (rates.platform, rates.at_once, rates.replicas, rates.md) == ("simd", 16, 16, "simd")
     assert rates.md_ps_per_s == pytest.approx(0.004 / 2e-6 / 2.0), "half of the core is others'"
@@ -72,7 +72,7 @@ def refuses(error: Exception) -> Callable[..., Any]:
         (SimulationError("a copy of the molecule blew up"), "blew up"),
     ],
 )
-def test_where_lanes_cannot_openmm_runs_and_one_line_says_why(
+def test_where_simd_cannot_openmm_runs_and_one_line_says_why(
     error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan, "make_plan", refuses(error))
@@ -89,7 +89,7 @@ def test_what_is_no_rival_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "bath" in found(replace(CONFIG, ensemble="nve")).without_simd
     asked = found(replace(CONFIG, platform="CPU"))
     assert (asked.platform, asked.without_simd) == ("CPU", "")
-    assert found(replace(CONFIG, force=ForceFieldSpec("gfn2-xtb", "vacuum"))).dear
+    assert found(replace(CONFIG, force=ForceFieldSpec("gfn2-xtb", "vacuum"))).expensive
 
 
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
@@ -162,5 +162,5 @@ def test_the_slowest_relaxation_is_that_of_a_torsion_that_jumps(monkeypatch: pyt
         frames = np.where(state[..., None, None] > 0, other, scene.positions_nm)
         frames = (frames + 1e-3 * rng.standard_normal(frames.shape)).astype(np.float32)
         rolled = Ensemble("rolled", list(frames), 100.0, scene)
-        monkeypatch.setattr("surrogate.judge.read.ensemble.load_ensemble", lambda files, rolled=rolled: rolled)
+        monkeypatch.setattr("surrogate.comparison.read.ensemble.load_ensemble", lambda files, rolled=rolled: rolled)
         assert 0.6 < measuring._slowest_ps([]) / (100.0 * tau) < 1.7

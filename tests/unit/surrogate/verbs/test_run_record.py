@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from surrogate import api
-from surrogate.judge.md_answer import Answer, StateEnergy
-from surrogate.judge.worth import Worth
+from surrogate.comparison.equivalent_time import EquivalentTime
+from surrogate.comparison.md_answer import Answer, StateEnergy
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run.decision import Way, decide
 from surrogate.verbs.run.outcome_words import Costs, lines_of, outcome
@@ -95,10 +95,10 @@ def test_without_ambertools_a_run_ends_in_one_line_and_peptides_are_run(
     api.run("sequence:ACE-GLY-NME", budget_s=60.0, dry_run=True, quiet=True)
 
 
-def worth(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> Worth:
-    given: dict[str, Any] = {"worth_ps": 10_000.0, "high_ps": 12_000.0, "share": 1.0, "errors_low": ()} | more
+def equivalent_time(bound: str = "", low_ps: float | None = 8_000.0, **more: Any) -> EquivalentTime:
+    given: dict[str, Any] = {"equivalent_ps": 10_000.0, "high_ps": 12_000.0, "share": 1.0, "errors_low": ()} | more
     of: Any = bound
-    return Worth("map", "distribution", "φ/ψ map", low_ps=low_ps, bound=of, candidate_error=0.1,
+    return EquivalentTime("map", "distribution", "φ/ψ map", low_ps=low_ps, bound=of, candidate_error=0.1,
                  lengths_ps=(1e3, 1e4, 1e5), errors=(3.0, 2.0, 1.0), errors_high=(), **given)  # fmt: skip
 
 
@@ -118,20 +118,20 @@ SHORT = convergence(converged=False, verdict="32 replicas of 380 ps, not converg
                     remedy="replicas of 3.8 ns or more would tell")  # fmt: skip
 
 
-def account(total_ps: float, n: int) -> Any:
+def summary(total_ps: float, n: int) -> Any:
     return SimpleNamespace(total_ps=total_ps, n_segments=n)
 
 
-def judgement(found: Worth | None, status: str = "close") -> Any:
-    return SimpleNamespace(account=account(50_000.0, 16), worth=(found,) if found else (), status=status,
-                           worth_words="words" if found else "", verdict="Close.", effective_samples=4.0,
+def evaluation(found: EquivalentTime | None, status: str = "close") -> Any:
+    return SimpleNamespace(summary=summary(50_000.0, 16), equivalent_time=(found,) if found else (), status=status,
+                           equivalent_time_words="words" if found else "", verdict="Close.", effective_samples=4.0,
                            in_short=("Use it.", "Right: all.", "Why: so."))  # fmt: skip
 
 
-def told(way: Way, found: Worth | None, costs: Costs = CHEAP, answer: Any = None, of: Any = None) -> Outcome:
-    half, judged = account(6_000.0, 16), judgement(found, "close" if found else "undecided")
+def told(way: Way, found: EquivalentTime | None, costs: Costs = CHEAP, answer: Any = None, of: Any = None) -> Outcome:
+    half, evaluated = summary(6_000.0, 16), evaluation(found, "close" if found else "undecided")
     comparison: Any = SimpleNamespace(
-        judgements=(judged,), reference=half, replicate=half, convergence=of or convergence()
+        evaluations=(evaluated,), reference=half, replicate=half, convergence=of or convergence()
     )
     return outcome(way, comparison, costs, answer)
 
@@ -149,8 +149,8 @@ def answer(**more: Any) -> Answer:
     return Answer(**(given | more))
 
 
-def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_worth() -> None:
-    found = told("rollout", worth(), answer=answer())
+def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_equivalent_time() -> None:
+    found = told("rollout", equivalent_time(), answer=answer())
     assert found.in_short == (
         "Use MD's answer.",
         "For populations and free energies of 2 states, each to 1 % or better (one standard error), "
@@ -158,13 +158,15 @@ def test_the_first_line_says_use_it_or_not_and_the_details_what_it_is_worth() ->
         "Why: MD is 32 replicas of 380 ps, weighed by a Markov model; the slowest process takes 900 ps ± 90 ps.",
     )
     assert found.headline == " ".join(found.in_short) and found.converged
-    assert "16 replicas of 3.1 ns of the surrogate are worth 10 ns [8 ns, 12 ns]" in found.details
+    assert "16 replicas of 3.1 ns of the surrogate are equivalent to 10 ns [8 ns, 12 ns]" in found.details
     assert (
-        found.gain == pytest.approx(8_000.0 / (200.0 * 10.0))
+        found.speed_up == pytest.approx(8_000.0 / (200.0 * 10.0))
         and "speed-up at equal accuracy at least 4:" in found.details
     )
     simd = replace(CHEAP, replicas=32, by="SIMD")
-    assert "MD by SIMD, the fastest here, makes 32 replicas of 62 ps" in told("rollout", worth(), simd).details
+    assert (
+        "MD by SIMD, the fastest here, makes 32 replicas of 62 ps" in told("rollout", equivalent_time(), simd).details
+    )
 
 
 def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
@@ -198,20 +200,20 @@ def replace_in(found: Any, **more: Any) -> Any:
 
 
 def test_the_lines_over_the_comparison_agree_with_md_s_answer() -> None:
-    judged = judgement(None, "different")
-    assert lines_of("md", judged, answer()) == answer().in_short
-    assert lines_of("rollout", judged, answer())[0] == "Use the surrogate for populations."
+    evaluated = evaluation(None, "different")
+    assert lines_of("md", evaluated, answer()) == answer().in_short
+    assert lines_of("rollout", evaluated, answer())[0] == "Use the surrogate for populations."
     wrong = answer(states=(state(surrogate=0.9), state(state="β")))
-    use, for_what, why = lines_of("rollout", judgement(None, "agrees"), wrong)
+    use, for_what, why = lines_of("rollout", evaluation(None, "agrees"), wrong)
     assert use == "Use MD's populations, not the surrogate's." and "1 of 2 states. Wrong: ALA 2 α." in for_what
     assert "90 % instead of 50.0 ± 1.0 %" in why
-    assert lines_of("rollout", judged, answer(holds=False))[0].startswith("Not known yet")
-    assert lines_of("rollout", judgement(None, "broken"), answer())[0] == "Use it.", "the judge's own words"
+    assert lines_of("rollout", evaluated, answer(holds=False))[0].startswith("Not known yet")
+    assert lines_of("rollout", evaluation(None, "broken"), answer())[0] == "Use it.", "the comparison's own words"
 
 
 def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:
     rolled = SimpleNamespace(wall_s=7.0)
-    comparison: Any = SimpleNamespace(judgements=(SimpleNamespace(account=rolled),))
+    comparison: Any = SimpleNamespace(evaluations=(SimpleNamespace(summary=rolled),))
     spent = {"train": 120.0, "rollout": 9.0, "held-out md": 10.0, "report": 50.0}
     run = replace(record(), spent_in=spent)
     assert costs_of(run, comparison, 1_000.0) == Costs(7.0, 120.0, RATES.md_ps_per_s, 600.0, 2, "OpenMM")
@@ -220,27 +222,27 @@ def test_costs_are_of_training_and_rolling_beside_the_faster_md() -> None:
     assert costs_of(run, comparison, 1_000.0).rolling_s == 9.0
 
 
-def test_a_capped_worth_is_at_least_what_md_there_is() -> None:
-    found = told("rollout", worth("at least", None, share=0.5))
+def test_a_capped_equivalent_time_is_at_least_what_md_there_is() -> None:
+    found = told("rollout", equivalent_time("at least", None, share=0.5))
     assert "at least 10 ns" in found.details
-    assert found.gain == pytest.approx(10_000.0 / (200.0 * 5.0)), "by the part of the rollout that it takes"
+    assert found.speed_up == pytest.approx(10_000.0 / (200.0 * 5.0)), "by the part of the rollout that it takes"
 
 
 def test_where_md_was_the_better_choice_it_is_said() -> None:
-    dear = Costs(10.0, 90.0, 200.0, 60.0)
-    found = told("potential", worth(), dear)
-    assert found.gain == pytest.approx(0.4)
+    expensive = Costs(10.0, 90.0, 200.0, 60.0)
+    found = told("potential", equivalent_time(), expensive)
+    assert found.speed_up == pytest.approx(0.4)
     assert "MD was the better choice" in found.details and "training included" in found.details
-    unsure = told("potential", worth(high_ps=None), dear)
+    unsure = told("potential", equivalent_time(high_ps=None), expensive)
     assert "no speed-up is shown" in unsure.details, "its upper end is not known"
-    none = told("rollout", worth("less than", None))
-    assert none.gain == 0.0
+    none = told("rollout", equivalent_time("less than", None))
+    assert none.speed_up == 0.0
 
 
 def test_md_claims_no_speed_up() -> None:
-    found = told("md", worth())
-    assert found.gain is None
-    assert found.details.startswith("16 replicas of 3.1 ns of MD, judged by 32 replicas of 380 ps: worth 10 ns")
+    found = told("md", equivalent_time())
+    assert found.speed_up is None
+    assert found.details.startswith("16 replicas of 3.1 ns of MD, evaluated by 32 replicas of 380 ps: worth 10 ns")
     assert "No equivalent MD time is told" in told("rollout", None).details
 
 

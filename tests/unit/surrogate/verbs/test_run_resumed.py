@@ -15,7 +15,7 @@ import pytest
 
 from md_reference.run import replicas
 from md_reference.simd.force_field import SimdReplicas
-from quick_report import judged_at_once
+from quick_report import evaluated_at_once
 from surrogate import api
 from surrogate.verbs.options import RunOptions
 from surrogate.verbs.run import one_scene, stages
@@ -107,7 +107,7 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Way:
     monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
     # However long it took to get there: lengths of runs are those of the whole budget.
     monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     return asked, rates, names
 
 
@@ -141,7 +141,7 @@ def test_kills_before_and_after_each_stage_change_nothing(
 def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
     monkeypatch.setattr(one_scene, "decide", lambda rates, left_s, *how, **more: decide(rates, BUDGET_S, *how, **more))
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     one, two = tmp_path / "one", tmp_path / "two"
     run(one, "surrogate")
     with monkeypatch.context() as patch:
@@ -158,7 +158,7 @@ def test_md_begins_at_frames_of_the_rollout_and_does_so_again(tmp_path: Path, mo
 
 @needs_compiler
 @pytest.mark.parametrize("good_frames", [0, 5])
-def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
+def test_where_simd_blow_up_openmm_goes_on_and_nothing_is_lost(
     good_frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     count, step = [0], SimdReplicas.step
@@ -171,7 +171,7 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
 
     monkeypatch.setattr(SimdReplicas, "step", fails)
     monkeypatch.setattr(one_scene, "measure", lambda *_: SIMD)
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     found = run(tmp_path / "run", "md", starts="one")
     assert ended(found) == [("md", "done"), ("held-out md", "done"), ("report", "done")]
     assert found["rates"]["platform"] == "auto" and "blew up" in found["decision"]["why"][0]
@@ -180,8 +180,8 @@ def test_where_lanes_blow_up_openmm_goes_on_and_nothing_is_lost(
     by_simd = [len(positions) for name, positions in kept.items() if "openmm" not in name]
     assert by_simd == [good_frames] * (16 if good_frames else 0)
     assert len(kept["md-openmm.h5"]) > 20 and len(kept["held_out-openmm.h5"]) > 20
-    judged = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
-    assert sorted(judged) == sorted(kept) and "md-openmm.h5" in judged[: len(found["trajectory"])]
+    evaluated = [Path(name).name for name in (*found["trajectory"], *found["held_out"])]
+    assert sorted(evaluated) == sorted(kept) and "md-openmm.h5" in evaluated[: len(found["trajectory"])]
     assert run(tmp_path / "run", "md", resume=True, starts="one")["outcome"] == found["outcome"]
 
 
@@ -197,7 +197,7 @@ def test_a_stage_that_has_no_time_to_go_on_keeps_its_frames(
 ) -> None:
     rates = replace(OPENMM, cores=2 if asked == "md" else 1)
     monkeypatch.setattr(one_scene, "measure", lambda *_: rates)
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     with monkeypatch.context() as patch:
         patch.setitem(stages.STAGES, name, disturbed(stages.STAGES[name], after=kill))
         with pytest.raises(Killed):
@@ -219,7 +219,7 @@ def spend_until_no_time_for(name: str, folder: Path) -> None:
     write_run(folder, replace(record, spent_s=BUDGET_S - left_s))
 
 
-def test_files_of_one_frame_are_not_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_one_frame_are_not_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One frame tells no interval: MD that made no more when its time was up has come to nothing."""
     simulate, n_frames = replicas.simulate_replicas, [1]
 
@@ -230,22 +230,22 @@ def test_files_of_one_frame_are_not_judged(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("md_reference.run.replicas.simulate_replicas", shorter)
     monkeypatch.setattr(one_scene, "measure", lambda *_: OPENMM)
     one, two = tmp_path / "one", tmp_path / "two"
-    with pytest.raises(InputError, match="MD to judge it by came to nothing in its time"):
+    with pytest.raises(InputError, match="MD to compare it with came to nothing in its time"):
         run(one, "md")
     assert {name: len(positions) for name, positions in frames(one).items()} == {"md.h5": 1, "held_out.h5": 1}
     record = read_run(one)
     assert [(entry.name, entry.status) for entry in record.stages] == [("md", "failed"), ("held-out md", "failed")]
     assert record.trajectory == record.held_out == ()
     n_frames[0] = 2  # control
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     found = run(two, "md")
     assert ended(found) == [("md", "out of time"), ("held-out md", "out of time"), ("report", "done")]
     assert found["trajectory"] == ["trajectory/md.h5"] and found["held_out"] == ["reference/held_out.h5"]
 
 
-def test_md_that_judges_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_md_that_comparisons_is_made_however_late_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(one_scene, "measure", lambda *_: replace(OPENMM, md_ps_per_s=0.01))
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     with monkeypatch.context() as patch:
         patch.setitem(stages.STAGES, "held-out md", disturbed(stages.STAGES["held-out md"], before=kill))
         with pytest.raises(Killed):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quick_report import judged_at_once
+from quick_report import evaluated_at_once
 from surrogate import api
 from surrogate.verbs.run import many_scenes, one_scene, stages
 from surrogate.verbs.run.many_scenes import molecules_in
@@ -80,12 +80,12 @@ def test_weights_that_roll_nothing_end_the_training_and_not_the_run(
         (tmp_path / "run" / stages.WEIGHTS_NAME).touch()
 
     monkeypatch.setattr(
-        one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="nothing", md_ps_per_s=0.01, dear=True)
+        one_scene, "measure", lambda *_: replace(SLOW, rolls=None, coverage="nothing", md_ps_per_s=0.01, expensive=True)
     )
     monkeypatch.setattr(stages, "train", train)
     monkeypatch.setattr("surrogate.models.weights.load_weights", lambda path: path)
     monkeypatch.setattr(stages, "rollout_rate", fail)
-    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=judged_at_once))
+    monkeypatch.setitem(stages.STAGES, "report", replace(stages.STAGES["report"], work=evaluated_at_once))
     found = api.run("alanine-dipeptide", tmp_path / "run", budget_s=400.0, way="surrogate", quiet=True)
     failed = next(stage for stage in found["stages"] if stage["name"] == "train")
     assert failed["status"] == "failed" and failed["note"] == "its weights roll nothing: 31 frames and no valid one."
@@ -166,7 +166,7 @@ def test_lines_that_are_no_molecule_are_known_before_the_budget_is_shared(
 def test_what_fails_among_many_is_listed_with_its_reason(tmp_path: Path) -> None:
     (tmp_path / "m.smi").write_text("C1CC broken\n[H] atom\n")
     found = api.run(tmp_path / "m.smi", tmp_path / "runs", budget_s=100.0, workers=1, quiet=True)
-    assert found["failed"].keys() == {"broken", "atom"} and found["summary"] == "0 of 2 molecules judged"
+    assert found["failed"].keys() == {"broken", "atom"} and found["summary"] == "0 of 2 molecules evaluated"
     told = api.info(tmp_path / "runs")
     assert told["type"] == "runs" and told["molecules"]["broken"].startswith("failed: ")
     assert "failed: " in (tmp_path / "runs" / "index.html").read_text("utf-8")
@@ -179,7 +179,7 @@ def test_what_fails_among_many_is_listed_with_its_reason(tmp_path: Path) -> None
 def test_the_table_links_each_report_and_takes_names_as_text(tmp_path: Path) -> None:
     line = {
         "name": "<b>", "scene": "smiles:C", "failed": "", "way": "md", "wall_s": 61.0, "rolled_ps": 1500.0,
-        "held_out_ps": 1234.0, "worth": "at least 1 ns", "gain": None, "verdict": "Close.",
+        "held_out_ps": 1234.0, "equivalent_time": "at least 1 ns", "speed_up": None, "verdict": "Close.",
     }  # fmt: skip
     write_results(tmp_path, [line, {"name": "x", "scene": "smiles:X", "failed": "no & such"}])
     page = (tmp_path / "index.html").read_text("utf-8")

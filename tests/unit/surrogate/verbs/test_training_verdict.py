@@ -14,7 +14,7 @@ from surrogate import api
 from surrogate.data.frames import TrainingFrames
 from surrogate.data.shipped import weights_path
 from surrogate.models.weights import Weights, load_weights, save_weights
-from surrogate.verbs.train_verdict import TrainingVerdict, judge_training, word_of
+from surrogate.verbs.train_verdict import TrainingVerdict, compare_training, word_of
 from systems.scene import Scene
 from systems.trajectory.codec import open_writer
 
@@ -66,7 +66,7 @@ def test_too_short_a_training_is_called_unusable_and_told_what_would_help(
 def test_weights_that_are_good_are_called_usable(tmp_path: Path) -> None:
     path = tmp_path / "good.safetensors"
     shutil.copy(weights_path("alanine-dipeptide"), path)
-    verdict = judge_training(path)
+    verdict = compare_training(path)
     assert verdict.word == "usable" and verdict.percent_valid > 99.0 and verdict.advice == ()
     assert "usable; whether populations" in verdict.lines()[-1]
 
@@ -78,7 +78,7 @@ def test_weights_that_stand_still_are_not(tmp_path: Path, small_weights: Weights
     domain = replace(small_weights.domain, limits={**limits, "jump_min_nm": 1.0, "jump_max_nm": 10.0})
     path = tmp_path / "still.safetensors"
     save_weights(path, small_weights.model, domain, small_weights.provenance)
-    verdict = judge_training(path)
+    verdict = compare_training(path)
     assert verdict.word == "not usable" and any("hardly a change" in reason for reason in verdict.reasons)
     assert load_weights(path).domain.limits is not None
 

@@ -86,7 +86,7 @@ def test_clash_distances_from_frames(alanine_dipeptide: Scene) -> None:
     assert (distance.min(axis=0) >= geometry.clash_pair_min_nm / 0.8 - 1e-6).all()
 
 
-def test_a_mirrored_reference_is_the_new_truth(alanine_dipeptide: Scene) -> None:
+def test_a_mirrored_reference_is_the_new_reference(alanine_dipeptide: Scene) -> None:
     """Handedness is the reference's, not the scene's."""
     mirrored = wobbling(alanine_dipeptide, 20) * np.array([1.0, 1.0, -1.0], dtype=np.float32)
     geometry = geometry_from_frames(alanine_dipeptide, mirrored)

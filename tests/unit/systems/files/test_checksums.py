@@ -113,7 +113,7 @@ def test_sealed_text() -> None:
 def test_each_flipped_bit_of_the_frames_is_noticed(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     write(path)
-    whole, truth = path.read_bytes(), everything(path)
+    whole, reference = path.read_bytes(), everything(path)
     if suffix == ".dcd":
         places = range(len(whole) - 3 * (3 * (2 * 4 + 8)), len(whole))
     else:
@@ -127,7 +127,7 @@ def test_each_flipped_bit_of_the_frames_is_noticed(tmp_path: Path, suffix: str) 
         with pytest.raises(TrajectoryError, match=r"damaged at frame [012]"):
             everything(path)
     path.write_bytes(whole)
-    assert everything(path) == truth
+    assert everything(path) == reference
 
 
 @pytest.mark.parametrize("name", ["velocities", "forces", "particles/trajectory/box/edges/value", "time",
@@ -163,14 +163,14 @@ def test_a_changed_cell_of_a_dcd_is_noticed(tmp_path: Path) -> None:
 def test_files_of_earlier_versions_are_read_and_not_continued(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write(path)
-    truth = everything(path)
+    reference = everything(path)
     with h5py.File(path, "r+") as file:
         for name in ("record", "scene"):
             text = json.loads(file[f"surromd/{name}"][()])
             del text["_seal"], file[f"surromd/{name}"]
             file[f"surromd/{name}"] = np.bytes_(json.dumps(text).encode())
         del file["surromd/checksums"], file["surromd/run_id"]
-    assert everything(path) == truth
+    assert everything(path) == reference
     with pytest.raises(TrajectoryError, match="earlier version"):
         open_writer(path, pair(), {}, append=True)
-    assert everything(path) == truth
+    assert everything(path) == reference

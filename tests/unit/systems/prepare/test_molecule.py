@@ -260,7 +260,7 @@ def test_broken_mol_files_are_refused_in_one_line(tmp_path: Path, molecule: Any)
         prepare(str(tmp_path / "missing.sdf"))
 
 
-# ---- the judge of the benchmark -----------------------------------------------------------------------------------
+# ---- the comparison of the benchmark ---------------------------------------------------------------------------------
 
 
 def test_the_benchmark_sees_what_a_run_may_lose() -> None:

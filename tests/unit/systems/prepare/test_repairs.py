@@ -1,4 +1,4 @@
-"""The account of repairs: what stands beside the peptide, residues under other names, numbers, handedness."""
+"""The summary of repairs: what stands beside the peptide, residues under other names, numbers, handedness."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from systems.library.named_scenes import prepare
 from systems.prepare.bonding import find_bonds
 from systems.prepare.checks import handedness, refuse_changed, say_inverted
 from systems.prepare.heterogens import ligand_atoms
-from systems.prepare.protonation import protonation_account
+from systems.prepare.protonation import protonation_summary
 from systems.prepare.read.records import AtomRecord, standardise
 from systems.prepare.read.structure_text import decode, encode, read_structure
 from systems.prepare.repair import _with_usual_lengths, complete
@@ -189,7 +189,7 @@ def test_protonation_is_chosen_by_ph_and_said(tmp_path: Path) -> None:
     text = "".join(pdb_text(scene).splitlines(keepends=True)[1 + i] for i in heavy)
     at_seven = prepare(_write(tmp_path / "x.pdb", text)).provenance["repairs"]
     assert "protonation at pH 7: ASP charged: ASP A2" in at_seven
-    assert protonation_account(["ASP 2"], [("A", "2", "ASP")], ["ASH"], [], 7.0) == []
+    assert protonation_summary(["ASP 2"], [("A", "2", "ASP")], ["ASH"], [], 7.0) == []
 
 
 def test_disulfides_are_said(tmp_path: Path) -> None:
@@ -244,9 +244,9 @@ def test_completion_never_turns_a_residue_over(monkeypatch: pytest.MonkeyPatch, 
     import systems.prepare.repair
 
     def mirrored(atoms, bonding, *, ph):
-        records, bonds, account = complete(atoms, bonding, ph=ph)
+        records, bonds, summary = complete(atoms, bonding, ph=ph)
         flip = [replace(a, position_angstrom=(*a.position_angstrom[:2], -a.position_angstrom[2])) for a in records]
-        return flip, bonds, account
+        return flip, bonds, summary
 
     path = _write(tmp_path / "x.pdb", _peptide(drop=("HB1", "HB2", "HB3")))
     prepare(path)

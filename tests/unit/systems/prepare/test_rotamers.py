@@ -12,7 +12,7 @@ from systems.chemistry.residues import amino_acid_names, template_for
 from systems.errors import PreparationError
 from systems.library.named_scenes import prepare
 from systems.prepare import repair
-from systems.prepare.rotamers import _conformers, _tree, residue_shape, settle_side_chains
+from systems.prepare.rotamers import _conformers, _tree, residue_shape, resolve_side_chains
 
 
 @pytest.mark.parametrize("name", [n for n in amino_acid_names() if n not in ("GLY", "ALA", "PRO")])
@@ -47,7 +47,7 @@ def test_an_added_side_chain_that_stands_in_another_atom_takes_another_rotamer()
     shape = residue_shape("LYS")
     x, elements, bonds, sites = _lysine(np.array([shape["CE"] + [0.05, 0.1, 0.0]]))
     before = x.copy()
-    notes = settle_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
+    notes = resolve_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
     assert notes == ["LYS A1: CG CD CE NZ overlapped and were built again in the rotamer with most room"]
     kept = [i for a, i in sites.items() if a not in ADDED] + [9]
     np.testing.assert_array_equal(x[kept], before[kept])
@@ -60,7 +60,7 @@ def test_bonds_of_2_67_angstrom_are_built_again() -> None:
     """PDBFixer's way out of an overlap; nothing else is in the way."""
     x, elements, bonds, sites = _lysine(np.empty((0, 3)))
     x[sites["NZ"]] += (x[sites["NZ"]] - x[sites["CE"]]) * (2.67 / 1.49 - 1.0)
-    assert settle_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
+    assert resolve_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
     assert np.linalg.norm(x[sites["NZ"]] - x[sites["CE"]]) == pytest.approx(0.149, abs=2e-3)
 
 
@@ -69,14 +69,14 @@ def test_where_there_is_room_nothing_is_touched_and_where_there_is_none_it_is_re
     shape = residue_shape("LYS")
     x, elements, bonds, sites = _lysine(np.array([shape["CE"] + [3.0, 0.0, 0.0]]))
     before = x.copy()
-    assert settle_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)]) == []
+    assert resolve_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)]) == []
     np.testing.assert_array_equal(x, before)
     grid = np.stack(np.meshgrid(*[np.arange(-0.8, 0.81, 0.2)] * 3), axis=-1).reshape(-1, 3) + shape["CB"]
     there = np.array([shape[a] for a in ("N", "CA", "C", "O", "CB")])
     wall = grid[np.linalg.norm(grid[:, None] - there, axis=2).min(axis=1) > 0.2]
     x, elements, bonds, sites = _lysine(wall)
     with pytest.raises(PreparationError, match=r"LYS A1: CG CD CE NZ, .* in every rotamer"):
-        settle_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
+        resolve_side_chains(x, elements, bonds, [("LYS A1", "LYS", sites, ADDED)])
 
 
 def test_what_the_file_has_of_a_side_chain_stays() -> None:

@@ -12,7 +12,7 @@ import pytest
 from surrogate.verbs.outputs import TRAJECTORY_SUFFIXES, check_outputs
 from systems.errors import SimulationError, TrajectoryError
 from systems.scene import Scene, part_of, reordered
-from systems.trajectory.checkpoint import claimed_outputs
+from systems.trajectory.checkpoint import locked_outputs
 from systems.trajectory.codec import open_trajectory, open_writer
 from systems.trajectory.companion_writer import pdb_text
 
@@ -102,8 +102,8 @@ def test_a_run_that_fails_before_its_first_frame_leaves_nothing(
     tmp_path: Path, alanine_dipeptide: Scene, suffix: str
 ) -> None:
     path = tmp_path / f"a{suffix}"
-    with pytest.raises(SimulationError), claimed_outputs([path], may_exist=False):
-        with open_writer(path, alanine_dipeptide, {}, claimed=True):
+    with pytest.raises(SimulationError), locked_outputs([path], may_exist=False):
+        with open_writer(path, alanine_dipeptide, {}, locked=True):
             assert (tmp_path / "a.pdb").exists()
         raise SimulationError("no frame")
     assert list(tmp_path.iterdir()) == []

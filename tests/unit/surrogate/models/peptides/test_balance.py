@@ -46,10 +46,10 @@ def test_as_many_frames_enter_as_leave() -> None:
     balance_entries(model, subjects)
     after = [lacking_entries(model, phi) for subject in subjects for phi in told_phis(model, subject)]
     assert max(map(abs, after)) < 0.35
-    assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the odds of leaving are what they were"
+    assert torch.equal(model.jumps.of_change[:, :, :, 1], leaving), "the probabilities of leaving are what they were"
 
 
-def test_how_likely_the_rare_side_is_sets_the_odds() -> None:
+def test_how_likely_the_rare_side_is_sets_the_probabilities() -> None:
     frames = _frames("ACE-ALA-NME")
     config = with_scale(PeptideConfig(width=16, n_layers=1, n_heads=1, chunk_frames=4), [frames])
     subject = _subject(frames, config)

@@ -22,7 +22,7 @@ from surrogate.models.peptides.chains import (
 from surrogate.models.peptides.layout import (
     chain_layout,
     chain_scale,
-    settled,
+    resolved,
     stated_torsions,
     unknown_coordinates,
 )
@@ -52,7 +52,7 @@ def scale(scenes: dict[str, Scene]) -> ChainScale:
 
 
 def code_of(scene: Scene, scale: ChainScale) -> ChainCode:
-    return ChainCode(settled(chain_layout(scene), scale), scale)
+    return ChainCode(resolved(chain_layout(scene), scale), scale)
 
 
 def distances(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -172,7 +172,7 @@ def test_what_a_reference_holds_rigid_is_a_constant() -> None:
             bond = x[:, hydrogen] - x[:, heavy]
             x[:, hydrogen] = x[:, heavy] + 0.1 * bond / np.linalg.norm(bond, axis=-1, keepdims=True)
     scale = chain_scale([(chain_layout(scene), x)])
-    layout = settled(chain_layout(scene), scale)
+    layout = resolved(chain_layout(scene), scale)
     assert {RIGID, STIFF, TURNING} == set(layout.kinds)
     rigid = [key for key, kind in zip(layout.keys, layout.kinds, strict=True) if kind == RIGID]
     assert len(rigid) == 12 and all(" length H" in key or " H" in key.split("length")[1] for key in rigid)
@@ -182,7 +182,7 @@ def test_what_a_reference_holds_rigid_is_a_constant() -> None:
 
 def test_what_no_data_tell_of_is_refused(scale: ChainScale) -> None:
     with pytest.raises(InputError, match=r"occur in no training molecule.*GLY"):
-        settled(chain_layout(build_peptide("ACE-GLY-NME")), scale)
+        resolved(chain_layout(build_peptide("ACE-GLY-NME")), scale)
     with pytest.raises(InputError, match="no single peptide chain"):
         chain_layout(scene_from_smiles("CCO"))
 

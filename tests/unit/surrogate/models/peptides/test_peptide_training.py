@@ -121,7 +121,8 @@ def test_batches_are_of_every_length_that_a_chunk_has(frames: TrainingFrames, co
 
 
 def test_positive_phi_weighs_what_metadynamics_says() -> None:
-    """Two runs at either sign of phi of both residues: each of the four patterns weighs what its residues' odds say."""
+    """Two runs at either sign of phi of both residues: each of the four patterns weighs what its residues'
+    probabilities say."""
     scene = build_peptide("ACE-ALA-VAL-NME")
     turned = with_phi_turned(scene)
     rng = np.random.default_rng(0)
@@ -311,10 +312,11 @@ def test_what_goes_on_from_weights_takes_their_configuration(tmp_path: Path, fra
 def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
     tmp_path: Path, frames: TrainingFrames
 ) -> None:
-    """Nearer than its own two steps come, with the same odds of states; the weights say how many steps they take."""
+    """Nearer than its own two steps come, with the same probabilities of states; the weights say how many steps they
+    take."""
     training = PeptideTraining(steps=150, batch=32, learning_rate=3e-3, validate_every_s=1e9)
     start = train_peptides([frames], tmp_path / "a.safetensors", SMALL, training)
-    teacher = load_weights(start)
+    labeller = load_weights(start)
     apart = {}
     for name, rate in (("still", 1e-12), ("taught", 1e-3)):
         taught = replace(training, learning_rate=rate)
@@ -323,24 +325,24 @@ def test_a_flow_is_taught_to_end_in_two_evaluations_where_it_ended_in_six(
             apart[name] = [float(row["validation_apart"]) for row in csv.DictReader(curves)][-1]
     assert apart["taught"] < 0.5 * apart["still"]
     found = load_weights(out)
-    assert (teacher.model.usual_steps, found.model.usual_steps) == (6, 2)
-    assert (teacher.model.solvers[0], found.model.solvers[0]) == ("gaussian", "angular")
-    assert sorted(teacher.model.solvers) == sorted(found.model.solvers)
+    assert (labeller.model.usual_steps, found.model.usual_steps) == (6, 2)
+    assert (labeller.model.solvers[0], found.model.solvers[0]) == ("gaussian", "angular")
+    assert sorted(labeller.model.solvers) == sorted(found.model.solvers)
     with pytest.raises(InputError, match="usual_solver = 'angle' is none of gaussian, angular"):
         PeptideSlide(replace(found.model.config, usual_solver="angle"))
-    for name, tensor in teacher.model.jumps.state_dict().items():
+    for name, tensor in labeller.model.jumps.state_dict().items():
         torch.testing.assert_close(found.model.jumps.state_dict()[name], tensor)
     assert found.provenance["distilled_to_steps"] == 2
     last = torch.from_numpy(frames.positions_nm(np.arange(0, 800, 50)))[:, None]
-    noise = torch.randn(len(last), *teacher.model.noise_shape(frames.scene.n_atoms))
+    noise = torch.randn(len(last), *labeller.model.noise_shape(frames.scene.n_atoms))
 
     def rolled(weights: Weights, steps: int) -> torch.Tensor:
         model = weights.model
         chunk = model.next_chunk(last, model.featurise(frames.scene), noise, solver_steps=steps, solver="angular")
         return chunk.frames_nm
 
-    there = rolled(teacher, 6)
-    ours, its_own = ((rolled(weights, 2) - there).square().mean() for weights in (found, teacher))
+    there = rolled(labeller, 6)
+    ours, its_own = ((rolled(weights, 2) - there).square().mean() for weights in (found, labeller))
     assert ours < 0.5 * its_own
     # What learns further from it ends in two evaluations no more.
     request = TrainingRequest("lam-slide-peptides", tmp_path / "on.safetensors", steps=1, start_from=out)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surrogate.models.peptides import chains as settling
-from surrogate.models.peptides.chains import ChainFeatures, dihedral, mirrored, settle
+from surrogate.models.peptides.chains import ChainFeatures, dihedral, mirrored, resolve_settings
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.torsion_states import MOST_TORSIONS, PHI, PSI, RING, THREEFOLD, StatedTorsions
 from systems.prepare.peptide import build_peptide
@@ -64,7 +64,7 @@ def test_overlapping_atoms_are_turned_apart_and_nothing_else_is(
     overlap = chain.overlap(before)
     assert 0.2 < overlap.float().mean() < 0.9
     with torch.inference_mode():  # as in rollouts
-        frames, astray, still = settle(tokens, states, chain)
+        frames, astray, still = resolve_settings(tokens, states, chain)
     torch.testing.assert_close(frames[~overlap], before[~overlap], rtol=0, atol=1e-6)
     assert torch.equal(still, chain.overlap(frames)) and still.sum() < 0.15 * overlap.sum()
     right = ~astray & ~still
@@ -72,13 +72,15 @@ def test_overlapping_atoms_are_turned_apart_and_nothing_else_is(
     turned = _turned_deg(chain, before[overlap & right], frames[overlap & right])
     assert turned.max(1).values.median() < 25.0
     # Bonds, angles and handedness are what they were.
-    told = [chain.code.encode(x[overlap]) for x in (before, frames)]
+    conditioning = [chain.code.encode(x[overlap]) for x in (before, frames)]
     stiff = chain.code.filled.flatten().clone()
     stiff[chain.code.turning_at] = stiff[chain.code.turning_at + 1] = False
-    torch.testing.assert_close(told[0].flatten(-2)[:, stiff], told[1].flatten(-2)[:, stiff], rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        conditioning[0].flatten(-2)[:, stiff], conditioning[1].flatten(-2)[:, stiff], rtol=0, atol=2e-3
+    )
     # Each frame by itself.
     one = int(torch.nonzero(overlap)[3])
-    torch.testing.assert_close(settle(tokens[one : one + 1], states[one : one + 1], chain)[0][0], frames[one],
+    torch.testing.assert_close(resolve_settings(tokens[one : one + 1], states[one : one + 1], chain)[0][0], frames[one],
                                rtol=0, atol=1e-5)  # fmt: skip
 
 
@@ -87,7 +89,7 @@ def test_without_turns_they_stay_where_they_are(
 ) -> None:
     chain, tokens, states = crowded
     monkeypatch.setattr(settling, "_TURNS", 0)
-    frames, astray, still = settle(tokens, states, chain)
+    frames, astray, still = resolve_settings(tokens, states, chain)
     assert torch.equal(still, chain.overlap(chain.code.decode(tokens))) and not astray.any()
     torch.testing.assert_close(frames, chain.code.decode(tokens), rtol=0, atol=1e-6)
 

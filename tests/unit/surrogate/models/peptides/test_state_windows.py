@@ -1,4 +1,4 @@
-"""Windows for the odds of states: what is rare comes oftener, and counts so much less where it must."""
+"""Windows for the probabilities of states: what is rare comes oftener, and counts so much less where it must."""
 
 from __future__ import annotations
 
@@ -31,11 +31,13 @@ def _subject() -> Any:
         return first + torch.arange(4), torch.arange(1.0, 4.0).expand(n, -1)
 
     stated = SimpleNamespace(residue=torch.tensor([0, 0]), slot=torch.tensor([0, 1]), n_residues=1)
-    told = torch.from_numpy(states)[:, None]
-    return SimpleNamespace(windows=windows, states=lambda idx: told[idx], chain=SimpleNamespace(stated=stated))
+    conditioning = torch.from_numpy(states)[:, None]
+    return SimpleNamespace(windows=windows, states=lambda idx: conditioning[idx], chain=SimpleNamespace(stated=stated))
 
 
-def test_rare_states_and_changes_come_oftener_and_odds_stay_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rare_states_and_changes_come_oftener_and_probabilities_stay_what_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(state_windows, "_POOL", 100_000)
     subject = _subject()
     pool = StateWindows.of(cast(PeptideSubject, subject), PeptideConfig())
@@ -47,12 +49,12 @@ def test_rare_states_and_changes_come_oftener_and_odds_stay_what_they_are(monkey
     assert float((plain[:, 0, 0] == 1).float().mean()) < 0.013
     assert float((share[:, 0, 0] * rare).mean()) > 0.25, "windows start in the rare state"
     for torsion, state in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        shares, odds = [], []
+        shares, probabilities = [], []
         for found, counted in ((plain, torch.ones(len(plain))), (drawn, share[:, 0, torsion])):
             starts = (found[:, 0, torsion] == state).float()
             changes = (found[:, 1, torsion] != state) * starts
-            odds.append(float((counted * changes).sum() / (counted * starts).sum()))
+            probabilities.append(float((counted * changes).sum() / (counted * starts).sum()))
             shares.append(float(changes.sum() / starts.sum()))
-        assert odds[1] == pytest.approx(odds[0], rel=0.12), (torsion, state)
+        assert probabilities[1] == pytest.approx(probabilities[0], rel=0.12), (torsion, state)
         if state == 0:
             assert shares[1] > 5 * shares[0], "changes come oftener, and would be overrated if all counted alike"

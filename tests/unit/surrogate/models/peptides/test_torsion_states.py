@@ -1,4 +1,5 @@
-"""States of torsions: which they are, odds of changes learned by log-likelihood, and draws that follow them."""
+"""States of torsions: which they are, probabilities of changes learned by log-likelihood, and draws that follow
+them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from small_scenes import with_phi_turned
-from surrogate.models.peptides.chains import ChainFeatures, settle
+from surrogate.models.peptides.chains import ChainFeatures, resolve_settings
 from surrogate.models.peptides.layout import PeptideConfig, chain_features, chain_layout, chain_scale
 from surrogate.models.peptides.model import PeptideSlide
 from surrogate.models.peptides.torsion_states import (
@@ -20,8 +21,8 @@ from surrogate.models.peptides.torsion_states import (
     THREEFOLD,
     StatedTorsions,
     StateJumps,
+    conditioning_states,
     times_apart,
-    told_states,
 )
 from systems.chemistry.geometry import torsion
 from systems.prepare.peptide import build_peptide
@@ -67,8 +68,8 @@ def test_the_states_of_frames_are_those_of_their_torsions() -> None:
     np.testing.assert_array_equal(found[:, 2, 3], degrees[:, 0] // 120.0)
     np.testing.assert_array_equal(found[:, 3, 2], degrees[:, 1] // 120.0)
     assert (found[0, 2:5, 0] != found[1, 2:5, 0]).all()
-    told = told_states(found, chain.stated.counts)
-    assert told.sum(-1).tolist() == [[0, 1, 7, 4, 4, 0]] * 2
+    conditioning = conditioning_states(found, chain.stated.counts)
+    assert conditioning.sum(-1).tolist() == [[0, 1, 7, 4, 4, 0]] * 2
 
 
 _CHI1 = ("N", "CA", "CB", "CG")
@@ -134,7 +135,7 @@ def test_the_loss_is_the_negative_log_likelihood_of_what_was_done() -> None:
     assert float(forbidden) == pytest.approx((-np.log(crosses) - np.log(turns)) / 2.0, rel=1e-5)
 
 
-def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once() -> None:
+def test_draws_change_as_often_as_their_probabilities_say_and_turn_two_torsions_at_once() -> None:
     """Of three states each is left for the next at a known rate; the second torsion turns when the first has."""
     jumps, counts = StateJumps(4, 2).requires_grad_(False), _counts([0, 3, 3])
     jumps.logits.bias.fill_(-30.0)
@@ -154,7 +155,7 @@ def test_draws_change_as_often_as_their_odds_say_and_turn_two_torsions_at_once()
         for b in set(range(3)) - {a}:
             share = float(((before == a) & (after == b)).sum() / (before == a).sum())
             assert share == pytest.approx(rates.get((a, b), 0.0), rel=0.1, abs=1e-9)
-    assert seen.shape[1] == told_states(start, counts).shape[-1]
+    assert seen.shape[1] == conditioning_states(start, counts).shape[-1]
 
 
 def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() -> None:
@@ -165,17 +166,17 @@ def test_the_second_torsion_sees_the_new_state_of_the_first_and_not_its_own() ->
     places, time = torch.tensor([[0, 1, 1]]), torch.ones(1, 1)
     common = jumps.of_known(torch.zeros(1, 1, 4), before[:, 0], places, counts)
     of_times, levels = jumps.of_times_alone(time, time, places, counts)
-    told = told_states(before, counts)
-    h = jumps.of_frames(told, told) + common[:, None] + of_times[:, :, None]
+    conditioning = conditioning_states(before, counts)
+    h = jumps.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
 
-    def odds(**moved: int) -> torch.Tensor:
+    def probabilities(**moved: int) -> torch.Tensor:
         new = before.clone()
         for name, state in moved.items():
             new[..., int(name[1:])] = state
-        return jumps.odds(1, h, levels, before[..., 1], told_states(new, counts))
+        return jumps.probabilities(1, h, levels, before[..., 1], conditioning_states(new, counts))
 
-    assert not torch.equal(odds(), odds(t0=1))
-    assert torch.equal(odds(), odds(t1=2)) and torch.equal(odds(), odds(t2=1))
+    assert not torch.equal(probabilities(), probabilities(t0=1))
+    assert torch.equal(probabilities(), probabilities(t1=2)) and torch.equal(probabilities(), probabilities(t2=1))
 
 
 def test_times_between_frames_and_endless_ones() -> None:
@@ -184,7 +185,7 @@ def test_times_between_frames_and_endless_ones() -> None:
 
 
 def test_rates_of_two_residue_types_are_learned() -> None:
-    """One type leaves phi > 0 ten times as often as the other; frames of 1 and of 10 ps, odds accordingly."""
+    """One type leaves phi > 0 ten times as often as the other; frames of 1 and of 10 ps, probabilities accordingly."""
     torch.manual_seed(0)
     net, counts = StateJumps(6, 4), _counts([2], [2])
     places = torch.tensor([[2, 0, 3], [3, 2, 1]])
@@ -206,10 +207,10 @@ def test_rates_of_two_residue_types_are_learned() -> None:
         time = torch.tensor([[apart_ps]])
         common = net.of_known(torch.zeros(1, 2, 6), up, places, counts)
         of_times, levels = net.of_times_alone(time, time, places, counts)
-        told = told_states(up[:, None], counts)
-        h = net.of_frames(told, told) + common[:, None] + of_times[:, :, None]
-        odds = net.odds(0, h, levels, up[:, None, :, 0], told)[0, 0].softmax(-1)[:, 0]
-        np.testing.assert_allclose(odds.detach(), leaves * apart_ps, rtol=0.35)
+        conditioning = conditioning_states(up[:, None], counts)
+        h = net.of_frames(conditioning, conditioning) + common[:, None] + of_times[:, :, None]
+        probabilities = net.probabilities(0, h, levels, up[:, None, :, 0], conditioning)[0, 0].softmax(-1)[:, 0]
+        np.testing.assert_allclose(probabilities.detach(), leaves * apart_ps, rtol=0.35)
 
 
 def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
@@ -225,7 +226,8 @@ def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
 
 
 def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_others() -> None:
-    """With numbers that scatter widely about the middles of states, many frames disobey; with the odds of changes at
+    """With numbers that scatter widely about the middles of states, many frames disobey; with the probabilities of
+    changes at
     nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the end of
     their states, and a row alone is drawn as it is in a batch."""
     from surrogate.models.peptides import chains as settling
@@ -311,13 +313,13 @@ def test_a_chunk_whose_atoms_overlap_is_drawn_again_in_the_same_states(monkeypat
     model.token_mean.copy_(_middles(model, chain))
     seen: list[int] = []
 
-    def settled(tokens: torch.Tensor, *told: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        frames, astray, crowded = settle(tokens, *told)
+    def resolved(tokens: torch.Tensor, *conditioning: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        frames, astray, crowded = resolve_settings(tokens, *conditioning)
         seen.append(len(frames) // model.n_new)
         crowded[model.n_new - 1] = len(seen) < 3
         return frames, astray, crowded
 
-    monkeypatch.setattr(module, "settle", settled)
+    monkeypatch.setattr(module, "resolve_settings", resolved)
     last = torch.tensor(scene.positions_nm).float().expand(3, 1, -1, -1)
     noise = torch.randn(3, *model.noise_shape(scene.n_atoms), generator=torch.Generator().manual_seed(3))
     chunk = model.next_chunk(last, molecule, noise, solver_steps=2)

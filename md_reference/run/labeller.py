@@ -1,0 +1,203 @@
+"""An expensive reference as a labeller: states of a molecule to ask about, and its energies and forces there, a
+process a core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from md_reference.forces.forcefield import build_system
+from md_reference.forces.mixture import is_water, molecules_of
+from md_reference.forces.quantum import Potential, check_minimum
+from md_reference.forces.spec import QUANTUM, ForceFieldSpec
+from md_reference.run.config import Conditions
+from md_reference.run.engine import Engine
+from md_reference.run.machine import available_cores
+from systems.chemistry.distance_bonds import changed_bond
+from systems.chemistry.geometry_rules import changed_stereo
+from systems.chemistry.graph import turn_torsions
+from systems.errors import PreparationError, SimulationError
+from systems.interrupts import end_with_parent
+from systems.scene import FloatArray, Scene
+
+
+@dataclass(frozen=True)
+class _Pace:
+    """How hot MD goes: its step and its hydrogens, how long it settles, how far apart its states are, and how many of
+    the frames asked of plain MD it makes."""
+
+    timestep_ps: float
+    hydrogen_mass_da: float | None
+    discarded_ps: float
+    apart_ps: float
+    share: float
+
+
+_CHEAP = _Pace(0.0005, None, 2.0, 0.25, 1.0)
+# Where every step is an expensive force: as few as will do. H2 has no heavy atom to make its hydrogens heavier.
+_DEAR = _Pace(0.002, 3.0, 0.3, 0.01, 0.125)
+_DEAR_LIGHT = replace(_DEAR, timestep_ps=0.0005, hydrogen_mass_da=None)
+# Every so many-th hot state has one of its torsions turned to any angle.
+_TURN_EVERY = 3
+# Bonds of hot states are stretched, which a potential must learn; those longer than this, in radii, are broken.
+_BROKEN = 1.6
+_worker: Potential | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in
+    kJ/mol/nm; `failed`: how many more were asked for, at which the reference finds no answer; `rearranged`: those that
+    are
+    another molecule, at which it was not asked."""
+
+    positions_nm: FloatArray
+    energies_kj_mol: FloatArray
+    forces_kj_mol_nm: FloatArray
+    failed: int = 0
+    rearranged: int = 0
+
+
+class Labeller:
+    """GFN2-xTB of one molecule. Use as a context manager or call `close`.
+
+    `n_rearranged` counts the states that were left out since they are another molecule.
+    Raises PreparationError for what GFN2-xTB refuses, and for a molecule whose minimum is another one.
+    """
+
+    def __init__(self, scene: Scene, *, workers: int | None = None) -> None:
+        self.scene = scene
+        self._potential = Potential(scene)
+        check_minimum(scene)  # what the method refuses is known before anything runs
+        self.n_rearranged = 0
+        n_workers = workers or available_cores()
+        self._pool: Any = None
+        if n_workers > 1:
+            context = multiprocessing.get_context("spawn")
+            self._pool = context.Pool(n_workers, _start, (scene.to_dict(),))
+
+    def __enter__(self) -> Labeller:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+                 ) -> None:  # fmt: skip
+        self.close()
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.terminate()
+            self._pool.join()
+            self._pool = None
+
+    def label(self, positions_nm: FloatArray) -> Labels:
+        """Return energies and forces at states `(n, n_atoms, 3)` nm; those without an answer are left out, as are those
+        of another molecule."""
+        asked = np.asarray(positions_nm, dtype=np.float64)
+        stereo = changed_stereo(self.scene, asked)
+        states = [
+            state
+            for state, turned in zip(asked, stereo, strict=True)
+            if not turned and not changed_bond(self.scene, state, stretch=_BROKEN)
+        ]
+        self.n_rearranged += len(asked) - len(states)
+        if self._pool is None:
+            answers = [_answer(self._potential, state) for state in states]
+        else:
+            answers = self._pool.map(_ask, states, chunksize=4)
+        good = [(state, answer) for state, answer in zip(states, answers, strict=True) if answer is not None]
+        shape = (len(good), self.scene.n_atoms, 3)
+        return Labels(
+            np.array([state for state, _ in good]).reshape(shape),
+            np.array([energy for _, (energy, _) in good]),
+            np.array([forces for _, (_, forces) in good]).reshape(shape),
+            len(states) - len(good),
+            len(asked) - len(states),
+        )
+
+    def explore(self, n_states: int, temperatures_k: Sequence[float], *, seed: int) -> FloatArray:
+        """Return states `(n, n_atoms, 3)` nm of hot MD by GAFF2, or by GFN2-xTB where GAFF2 has no parameters and of
+        water, which is rigid beside it; of every third one torsion is turned. They are near the molecule's own, and as
+        many at each temperature."""
+        rng = np.random.default_rng(seed)
+        each = -(-n_states // len(temperatures_k))
+        found = []
+        for temperature_k in temperatures_k:
+            seed = int(rng.integers(2**31))
+            found.append(self._md(each, self._cheap[2].apart_ps, temperature_k, seed=seed))
+        states = np.concatenate(found)
+        turn_torsions(self.scene, states, _TURN_EVERY, rng)
+        order: FloatArray = states[rng.permutation(len(states))[:n_states]]
+        return order
+
+    def motion(
+        self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
+    ) -> FloatArray:
+        """Return frames `(n_frames, n_atoms, 3)` nm of MD as hot as asked, `lag_ps` apart, an eighth as many where
+        GFN2-xTB makes it; the centre of mass stays where it is."""
+        n_frames = max(2, round(n_frames * self._cheap[2].share))
+        return self._md(n_frames, lag_ps, temperature_k, seed=seed, constrain_hydrogens=constrain_hydrogens)
+
+    def _md(
+        self, n_frames: int, lag_ps: float, temperature_k: float, *, seed: int, constrain_hydrogens: bool = False
+    ) -> FloatArray:
+        spec, system, pace = self._cheap
+        if constrain_hydrogens:
+            spec = replace(spec, constrain_hydrogens=True)
+            system = build_system(self.scene, spec)
+        conditions = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=pace.timestep_ps, seed=seed,
+                                platform="Reference")  # fmt: skip
+        frames = np.empty((n_frames, self.scene.n_atoms, 3))
+        with Engine(self.scene, conditions, system=system) as engine:
+            engine.minimise()
+            engine.thermalise()
+            engine.step(round(pace.discarded_ps / pace.timestep_ps))
+            for k in range(n_frames):
+                engine.step(round(lag_ps / pace.timestep_ps))
+                frames[k] = engine.positions()
+        share = self.scene.masses_da / self.scene.masses_da.sum()
+        return frames - np.einsum("n,tnk->tk", share, frames)[:, None]
+
+    @cached_property
+    def _cheap(self) -> tuple[ForceFieldSpec, Any, _Pace]:
+        """The forces of hot MD, their `openmm.System`, and how it goes."""
+        elements, found = self.scene.elements, []
+        ways = [("gaff2", _CHEAP), (QUANTUM, _DEAR if set(elements) != {"H"} else _DEAR_LIGHT)]
+        if any(is_water(elements, molecule) for molecule in molecules_of(self.scene)):
+            del ways[0]
+        for name, pace in ways:
+            spec = ForceFieldSpec(name, "vacuum", pace.hydrogen_mass_da, constrain_hydrogens=False)
+            try:
+                return spec, build_system(self.scene, spec), pace
+            except PreparationError as error:
+                found.append(error)
+        raise found[-1]
+
+
+def _start(scene: dict[str, Any]) -> None:
+    global _worker
+    # Ctrl-C is the parent's to answer: a worker that it ends while it takes a task leaves the pool's queue locked.
+    for name in ("SIGINT", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    end_with_parent()
+    _worker = Potential(Scene.from_dict(scene))
+
+
+def _ask(state: FloatArray) -> tuple[float, FloatArray] | None:
+    assert _worker is not None
+    return _answer(_worker, state)
+
+
+def _answer(potential: Potential, state: FloatArray) -> tuple[float, FloatArray] | None:
+    try:
+        return potential(state)
+    except (PreparationError, SimulationError):
+        return None

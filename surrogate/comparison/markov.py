@@ -1,0 +1,356 @@
+"""Equilibrium from many short MD replicas: a reversible Markov model of their transitions, or plain averages.
+
+Replicas that are shorter than the slowest relaxation remember where they began, so their plain averages are wrong; the
+transitions between states are not. A reversible maximum-likelihood Markov model turns transition counts into
+stationary populations, and these into a weight for every frame (Prinz et al., J. Chem. Phys. 134, 174105 (2011);
+deeptime: Hoffmann et al., Mach. Learn.: Sci. Technol. 3, 015009 (2022)). Nothing is invented: what transitions do not
+connect in both directions gets no weight and is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.measure.msm import block_transitions
+from surrogate.comparison.measure.statistics import Blocks, Piece
+from systems.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_N_DRAWS = 50
+_LAGS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+# A lag leaves each replica four pairs that do not overlap.
+_LAGS_A_REPLICA = 4
+# Timescales are flat where a lag some twice as long changes the slowest by no more than this or two standard errors.
+_FLAT = 0.15
+_CK_MULTIPLES = (2, 3)
+_CK_TOLERANCE = 0.05
+# Replicas outlast the slowest process when they are so many times as long; three of these are left out at their start.
+_OUTLASTS, _LEFT_OUT = 20.0, 3.0
+_LEAST_UNITS = 8
+# Fewer transitions of the slowest process, in its rarer direction, tell no populations.
+_LEAST_CROSSINGS = 5
+# What has fewer frames than this share is not named as missing.
+_NAMED_SHARE = 0.005
+
+Fate = Literal["only begun in", "entered and never left", "left and never entered"]
+
+
+@dataclass(frozen=True)
+class Unconnected:
+    """States that transitions do not connect with the others in both directions: which microstates, their share of
+    all frames, in how many replicas, and what happened there."""
+
+    microstates: tuple[int, ...]
+    share: float
+    n_replicas: int
+    fate: Fate
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """What MD says of equilibrium.
+
+    `method`: how it was found; `lag_frames`: of the Markov model; `timescales`, `timescale_errors` `(k,)` in frames,
+    descending; `flat`: whether the slowest is the same at a longer lag; `ck_error`: the largest difference between
+    predicted and observed probabilities to be where one was (Chapman-Kolmogorov), `ck_holds` whether that is within
+    errors; `crossings`: how often the slowest process was seen, in the rarer direction. `populations` `(n_micro,)`, 0
+    outside the connected set; `draws` `(n_draws, n_micro)` of a bootstrap over replicas, whose multiplicities are
+    `resampled` `(n_draws, n_units)`; `unit_of` says for each unit which replica and which frames it is. `weights`: of
+    every frame, one array a replica, mean 1 over all. `unconnected`: what has no weight.
+    """
+
+    method: Literal["Markov model", "plain averages"]
+    lag_frames: int
+    timescales: FloatArray
+    timescale_errors: FloatArray
+    flat: bool
+    ck_error: float
+    ck_holds: bool
+    crossings: int
+    populations: FloatArray
+    draws: FloatArray
+    resampled: IntArray
+    unit_of: tuple[tuple[int, int, int], ...]
+    weights: tuple[FloatArray, ...]
+    unconnected: tuple[Unconnected, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the model passed its tests and rests on more than a few transitions; plain averages need none."""
+        seen = self.crossings >= _LEAST_CROSSINGS or not len(self.timescales)
+        return self.method == "plain averages" or (self.flat and self.ck_holds and seen)
+
+    def shares(self, micro: Sequence[IntArray], labels: Sequence[IntArray], n: int) -> tuple[FloatArray, FloatArray]:
+        """Return the equilibrium share `(n,)` of each label and its bootstrap draws `(n_draws, n)`.
+
+        `micro`: what `equilibrium` was given; `labels`: a label 0 to n - 1 for each frame, -1 for none.
+        """
+        n_micro = len(self.populations)
+        counts = np.zeros((len(self.unit_of), n_micro, n))
+        for u, (k, start, stop) in enumerate(self.unit_of):
+            weighted = self.weights[k][start:stop] > 0
+            m, s = micro[k][start:stop][weighted], labels[k][start:stop][weighted]
+            known = (m >= 0) & (s >= 0)
+            counts[u] = np.bincount(m[known] * n + s[known], minlength=n_micro * n).reshape(n_micro, n)
+        draws = [_spread(p, np.tensordot(r, counts, 1)) for p, r in zip(self.draws, self.resampled, strict=True)]
+        return _spread(self.populations, counts.sum(0)), np.array(draws).reshape(-1, n)
+
+
+def _spread(populations: FloatArray, counts: FloatArray) -> FloatArray:
+    """Return populations of labels from those of microstates `(n_micro,)` and counts `(n_micro, n)`."""
+    total = counts.sum(1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = np.nansum(populations[:, None] * np.where(total[:, None] > 0, counts / total[:, None], np.nan), axis=0)
+    norm = found.sum()
+    return np.asarray(found / norm if norm > 0 else found)
+
+
+def equilibrium(micro: Sequence[IntArray], *, lag: int | None = None, seed: int = 0) -> Equilibrium:
+    """Return the equilibrium of MD replicas whose frames were put into microstates.
+
+    `micro`: one array `(n_frames,)` a replica of microstates from 0, -1 for none, frames equally far apart; `lag`: in
+    frames, None for the shortest at which the slowest timescale is flat. Where every replica is twenty times as long as
+    the slowest process, plain averages. Raises InputError where there is nothing to count.
+    """
+    micro = [np.asarray(m, dtype=np.int64) for m in micro if len(m) > 1]
+    if not micro or max(m.max() for m in micro) < 0:
+        raise InputError("there are no frames in any state, and so no equilibrium to tell; give longer replicas.")
+    n_micro = 1 + max(int(m.max()) for m in micro)
+    rng = np.random.default_rng(seed)
+    longest = max(1, int(np.median([len(m) for m in micro])) // _LAGS_A_REPLICA)
+    lags = [n for n in _LAGS if n <= longest] if lag is None else [lag]
+    units = _units(micro, lags[-1])
+    resampled = rng.multinomial(len(units), np.full(len(units), 1.0 / len(units)), size=_N_DRAWS)
+    models = [_Model(micro, units, n_micro, n) for n in lags]
+    chosen, flat = _choose(models, resampled)
+    model = models[chosen]
+    draws, times = _draw(model, resampled)
+    errors = np.nanstd(times, axis=0, ddof=1) if len(times) > 1 else np.full(len(model.times), np.nan)
+    slowest = float(model.times[0]) if len(model.times) else 0.0
+    n_frames = np.array([len(m) for m in micro])
+    unconnected = _unconnected(model, micro)
+    lost = any(u.fate != "left and never entered" for u in unconnected)
+    ck_error, ck_holds = _chapman_kolmogorov(model, micro, units, resampled[:20])
+    found = Equilibrium(
+        "Markov model", model.lag, model.times, errors, flat, ck_error, ck_holds, model.crossings(micro),
+        model.populations, draws, resampled, tuple(units), (), unconnected,
+    )  # fmt: skip
+    if n_frames.min() >= _OUTLASTS * slowest and not lost and found.crossings > 0:
+        return _averaged(found, micro, round(_LEFT_OUT * slowest))
+    visits = np.zeros(n_micro)
+    for m in micro:
+        visits += np.bincount(m[m >= 0], minlength=n_micro)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        each = np.where(visits > 0, model.populations / visits, 0.0)
+    return _with_weights(found, [np.append(each, 0.0)[m] for m in micro])
+
+
+def _with_weights(found: Equilibrium, weights: list[FloatArray]) -> Equilibrium:
+    mean = sum(w.sum() for w in weights) / sum(map(len, weights))
+    return replace(found, weights=tuple(w / mean for w in weights))
+
+
+def _averaged(found: Equilibrium, micro: list[IntArray], left_out: int) -> Equilibrium:
+    """Return plain averages over all frames behind the first `left_out` of each replica."""
+    n_micro = len(found.populations)
+    weights = [((np.arange(len(m)) >= left_out) & (m >= 0)).astype(np.float64) for m in micro]
+    counts = np.array([
+        np.bincount(micro[k][a:b][weights[k][a:b] > 0], minlength=n_micro) for k, a, b in found.unit_of
+    ], dtype=np.float64)  # fmt: skip
+    draws = found.resampled @ counts
+    draws /= np.maximum(draws.sum(1, keepdims=True), 1.0)
+    total = counts.sum(0)
+    averaged = replace(found, method="plain averages", populations=total / total.sum(), draws=draws)
+    return _with_weights(averaged, weights)
+
+
+def _units(micro: list[IntArray], lag: int) -> list[tuple[int, int, int]]:
+    """Return what a bootstrap draws from: replicas, or pieces of them where they are few."""
+    pieces = -(-_LEAST_UNITS // len(micro))
+    units = []
+    for k, m in enumerate(micro):
+        n = max(1, min(pieces, len(m) // (2 * lag)))
+        edges = np.linspace(0, len(m), n + 1).astype(int).tolist()
+        units += [(k, a, b) for a, b in pairwise(edges)]
+    return units
+
+
+def _counts(micro: list[IntArray], units: list[tuple[int, int, int]], n: int, lag: int) -> FloatArray:
+    """Return sliding transition counts `(n_units, n, n)` at a lag; a pair belongs to where it begins."""
+    pieces = tuple(Piece(k, start, stop, u) for u, (k, start, stop) in enumerate(units))
+    return block_transitions(micro, Blocks(pieces, len(units), 0), n, lag).reshape(-1, n, n)
+
+
+def _components(counts: FloatArray) -> IntArray:
+    """Return for each state which strongly connected set it is in; 0 is the one with most counts."""
+    from scipy.sparse.csgraph import connected_components
+
+    n, labels = connected_components(counts > 0, directed=True, connection="strong")
+    weight = np.bincount(labels, weights=counts.sum(0) + counts.sum(1), minlength=n)
+    rank = np.empty(n, dtype=np.int64)
+    rank[np.argsort(-weight, kind="stable")] = np.arange(n)
+    return np.asarray(rank[labels])
+
+
+def _fit(counts: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
+    """Return transition matrix and stationary distribution of the largest connected set, and its states."""
+    from deeptime.markov.msm import MaximumLikelihoodMSM
+
+    kept = np.flatnonzero((_components(counts) == 0) & (counts.sum(0) + counts.sum(1) > 0))
+    if not len(kept):
+        return None
+    if len(kept) == 1:
+        return np.ones((1, 1)), np.ones(1), kept
+    try:
+        estimator = MaximumLikelihoodMSM(reversible=True, allow_disconnected=False, maxiter=100_000, maxerr=1e-7)
+        model = estimator.fit(counts[np.ix_(kept, kept)]).fetch_model()
+    except (RuntimeError, ValueError, AssertionError, np.linalg.LinAlgError):
+        return None
+    if model.n_states != len(kept):
+        return None
+    return np.asarray(model.transition_matrix), np.asarray(model.stationary_distribution), kept
+
+
+def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int, most: int = 5) -> tuple[FloatArray, FloatArray]:
+    """Return the slowest timescales, descending, and the eigenfunction of the first."""
+    root = np.sqrt(np.maximum(stationary, 1e-300))
+    values, vectors = np.linalg.eigh(0.5 * ((root[:, None] * matrix / root) + (root[:, None] * matrix / root).T))
+    order = np.argsort(-values)[1 : 1 + most]
+    with np.errstate(divide="ignore"):
+        times = -lag / np.log(np.clip(values[order], 1e-6, 1 - 1e-12))
+    first = vectors[:, order[0]] / root if len(order) else np.zeros(len(stationary))
+    return times, first
+
+
+class _Model:
+    """The Markov model of all replicas at one lag."""
+
+    def __init__(self, micro: list[IntArray], units: list[tuple[int, int, int]], n: int, lag: int) -> None:
+        self.lag, self.n = lag, n
+        self.by_unit = _counts(micro, units, n, lag)
+        self.counts = self.by_unit.sum(0)
+        fitted = _fit(self.counts)
+        if fitted is None:
+            raise InputError(f"no reversible Markov model fits transitions {lag} frames apart; give longer replicas.")
+        self.matrix, self.stationary, self.kept = fitted
+        self.times, self.first = _timescales(self.matrix, self.stationary, lag)
+        self.populations = np.zeros(n)
+        self.populations[self.kept] = self.stationary
+        # Which side of the slowest process a microstate is on, -1 outside the connected set.
+        self.side = np.full(n, -1)
+        self.side[self.kept] = self.first > 0
+
+    def crossings(self, micro: list[IntArray]) -> int:
+        """Return how often the slowest process is seen in its rarer direction, at steps of the lag."""
+        ways = np.zeros(2, dtype=int)
+        for m in micro:
+            side = np.append(self.side, -1)[m[:: self.lag]]
+            side = side[side >= 0]
+            for way in (0, 1):
+                ways[way] += int(((side[:-1] == way) & (side[1:] == 1 - way)).sum())
+        return int(ways.min())
+
+
+def _draw(model: _Model, resampled: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return populations `(n_draws, n)` and timescales `(n_draws, k)` of resampled replicas."""
+    populations, times = [], []
+    for multiplicity in resampled:
+        fitted = _fit(np.tensordot(multiplicity, model.by_unit, 1))
+        drawn = np.zeros(model.n)
+        if fitted is None:
+            populations.append(model.populations)
+            continue
+        matrix, stationary, kept = fitted
+        drawn[kept] = stationary
+        populations.append(drawn)
+        found = np.full(len(model.times), np.nan)
+        own = _timescales(matrix, stationary, model.lag)[0][: len(found)]
+        found[: len(own)] = own
+        times.append(found)
+    return np.array(populations), np.array(times).reshape(len(times), len(model.times))
+
+
+def _choose(models: list[_Model], resampled: IntArray) -> tuple[int, bool]:
+    """Return which lag to take, the shortest from which on the slowest timescale is flat, and whether one is."""
+    if len(models) == 1:
+        return 0, True
+    slowest = [float(m.times[0]) if len(m.times) else 0.0 for m in models]
+    errors = []
+    for model in models:
+        times = _draw(model, resampled[:10])[1]
+        errors.append(float(np.nanstd(times[:, 0])) if times.size else 0.0)
+    for k in range(len(models) - 1):
+        off = [abs(slowest[j] - slowest[k]) for j in range(k + 1, min(k + 3, len(models)))]
+        room = [max(_FLAT * slowest[k], 2.0 * errors[j]) for j in range(k + 1, min(k + 3, len(models)))]
+        # A process as fast as the lag cannot be followed any longer.
+        fast = slowest[k] < models[k].lag
+        if fast or all(o <= r for o, r in zip(off, room, strict=True)):
+            return k, True
+    return len(models) - 1, False
+
+
+def _chapman_kolmogorov(
+    model: _Model, micro: list[IntArray], units: list[tuple[int, int, int]], resampled: IntArray
+) -> tuple[float, bool]:
+    """Return the largest difference of predicted and observed probabilities to be on the side of the slowest process
+    that one was on, after some lags, and whether it is within two standard errors, or small."""
+    if len(model.kept) < 2:
+        return 0.0, True
+    worst, holds = 0.0, True
+    sides = [model.side[model.kept] == side for side in (0, 1)]
+    for multiple in _CK_MULTIPLES:
+        lag = multiple * model.lag
+        if lag * 2 > max(map(len, micro)):
+            break
+        power = np.linalg.matrix_power(model.matrix, multiple)
+        by_unit = _counts(micro, units, model.n, lag)[:, model.kept][:, :, model.kept]
+
+        def observed(counts: FloatArray, side: npt.NDArray[np.bool_]) -> float:
+            rows = counts[side]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                stay = rows[:, side].sum(1) / rows.sum(1)
+            weight = np.where(np.isfinite(stay), model.stationary[side], 0.0)
+            return float((np.nan_to_num(stay) * weight).sum() / max(weight.sum(), 1e-300))
+
+        for side in sides:
+            if not side.any():
+                continue
+            weight = model.stationary[side]
+            predicted = float((power[np.ix_(side, side)].sum(1) * weight).sum() / weight.sum())
+            off = abs(predicted - observed(by_unit.sum(0), side))
+            error = float(np.std([observed(np.tensordot(r, by_unit, 1), side) for r in resampled]))
+            worst, holds = max(worst, off), holds and off <= max(_CK_TOLERANCE, 2.0 * error)
+    return worst, holds
+
+
+def _unconnected(model: _Model, micro: list[IntArray]) -> tuple[Unconnected, ...]:
+    """Return the sets of microstates without weight that hold more than a few frames."""
+    total = sum(map(len, micro))
+    visits = sum((np.bincount(m[m >= 0], minlength=model.n) for m in micro), np.zeros(model.n, dtype=np.int64))
+    labels = _components(model.counts)
+    inside = np.zeros(model.n, dtype=bool)
+    inside[model.kept] = True
+    fates: dict[Fate, list[int]] = {}
+    for component in np.unique(labels[(visits > 0) & ~inside]):
+        members = np.flatnonzero((labels == component) & (visits > 0) & ~inside)
+        if visits[members].sum() < _NAMED_SHARE * total:
+            continue
+        others = np.setdiff1d(np.arange(model.n), members)
+        out, back = model.counts[np.ix_(members, others)].sum(), model.counts[np.ix_(others, members)].sum()
+        fate: Fate = "left and never entered" if out else "entered and never left" if back else "only begun in"
+        fates.setdefault(fate, []).extend(members.tolist())
+    return tuple(
+        Unconnected(
+            tuple(sorted(members)), float(visits[members].sum() / total),
+            sum(bool(np.isin(m, members).any()) for m in micro), fate,
+        )
+        for fate, members in fates.items()
+    )  # fmt: skip

@@ -1,0 +1,444 @@
+"""MD's answer: states, free energies, maps and timescales of a molecule from many MD replicas, errors from MD alone.
+
+Torsions -> TICA (kinetic map) -> k-means -> reversible Markov model (`surrogate.comparison.markov`). What is reported
+are
+states that a chemist names: α, β and left-handed of each residue, and the wells of every other torsion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.markov import Equilibrium, equilibrium
+from surrogate.comparison.measure import kinetics, msm
+from surrogate.comparison.measure.distributions import is_alpha
+from surrogate.comparison.measure.slow_motion import SLOW_KINDS
+from surrogate.comparison.measure.structure import Backbone, backbone
+from surrogate.comparison.measure.torsions import Torsion, find_torsions, find_wells
+from surrogate.comparison.read.ensemble import Ensemble
+from systems.chemistry.validity import INVALID
+from systems.errors import InputError
+from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_TICA_LAG_PS = 10.0
+_DIMENSIONS, _MICROSTATES, _FRAMES_A_MICROSTATE = 8, 100, 50
+_CLUSTERED_FRAMES = 10_000
+_MAP_BINS = 36
+# Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
+_APART, _LEAST_APART = 2.5, 0.02
+# A state that has a smaller share of a rollout is no reason to begin there.
+_DRAWN_SHARE = 2e-3
+
+
+@dataclass(frozen=True)
+class StateEnergy:
+    """A state of one torsion or residue. `share` of equilibrium with its standard `error`; `free_energy_kj_mol` above
+    the likeliest state of that torsion, with `free_energy_error`; None where MD gives no weight; `n_replicas` that ever
+    were there, `n_begun` there; `surrogate`: the share that the surrogate gives, `surrogate_error` its standard error,
+    None without one; `missing`: what MD does not tell."""
+
+    torsion: str
+    state: str
+    share: float
+    error: float
+    free_energy_kj_mol: float | None
+    free_energy_error: float | None
+    n_replicas: int
+    n_begun: int
+    surrogate: float | None = None
+    surrogate_error: float | None = None
+    missing: str = ""
+
+    @property
+    def differs(self) -> bool:
+        """Whether the surrogate's share is outside the errors."""
+        if self.surrogate is None or self.missing:
+            return False
+        error = math.hypot(self.error, self.surrogate_error or 0.0)
+        return abs(self.surrogate - self.share) > max(_APART * error, _LEAST_APART)
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What MD says of a molecule. `weights`: of every frame, an array a replica; `lag_ps` between frames;
+    `timescales_ps` with `timescale_errors_ps`, descending; `states`; `maps`: for each residue the free energy in kJ/mol
+    `(36, 36)` over φ and ψ, from -180°, infinity where MD never was; `missing`: what it cannot tell."""
+
+    method: str
+    n_replicas: int
+    replica_ps: float
+    lag_ps: float
+    model_lag_ps: float
+    timescales_ps: tuple[float, ...]
+    timescale_errors_ps: tuple[float, ...]
+    tests: str
+    holds: bool
+    states: tuple[StateEnergy, ...]
+    maps: dict[str, FloatArray]
+    missing: tuple[str, ...]
+    weights: tuple[FloatArray, ...]
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether its tests hold, and transitions connect more than one of the states that were visited."""
+        return self.holds and bool(self.timescales_ps or not self.missing)
+
+    @property
+    def in_short(self) -> tuple[str, str, str]:
+        """Three lines: whether to use it, for what and what is missing, why."""
+        told = [s for s in self.states if not s.missing]
+        if not self.is_sure:
+            use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
+        else:
+            widest = 100 * max((s.error for s in told), default=0.0)
+            use = "Use MD's answer" + (", but for what it did not connect." if self.missing else ".")
+            what = f"For populations and free energies of {len(told)} states, each to {widest:.2g} % or better"
+            what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
+        missing = f" Missing: {'; '.join(self.missing)}." if self.missing else ""
+        slow = ""
+        if self.timescales_ps:
+            error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
+            slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
+        length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
+        not_yet = "" if self.is_sure else " and has not converged"
+        return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
+
+    @property
+    def on_surrogate(self) -> str:
+        """One sentence about the surrogate's populations; empty where there is none."""
+        told = [s for s in self.states if s.surrogate is not None and not s.missing]
+        if not told:
+            return ""
+        off = sorted((s for s in told if s.differs), key=lambda s: -abs((s.surrogate or 0.0) - s.share))
+        if not off:
+            widest = max(s.error for s in told)
+            return (
+                f"The surrogate's populations agree with MD's in all {len(told)} states, within errors of up to "
+                f"{100 * widest:.2g} %."
+            )
+        worst = off[0]
+        instead = f"{100 * (worst.surrogate or 0.0):.3g} % instead of {percent(worst.share, worst.error)}"
+        return (
+            f"The surrogate's populations differ from MD's in {len(off)} of {len(told)} states, most in "
+            f"{worst.torsion} {worst.state}: {instead}."
+        )
+
+    @property
+    def model_error(self) -> float:
+        """Root mean square difference of the surrogate's populations from MD's, 0 without a surrogate."""
+        off = [(s.surrogate - s.share) ** 2 for s in self.states if s.surrogate is not None and not s.missing]
+        return math.sqrt(sum(off) / len(off)) if off else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; weights are in the trajectories."""
+        found = {key: value for key, value in vars(self).items() if key not in ("weights", "states", "maps")}
+        states = [vars(s) | {"differs": s.differs} for s in self.states]
+        maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
+        own = {
+            "in_short": list(self.in_short),
+            "on_surrogate": self.on_surrogate,
+            "states": states,
+            "maps_kj_mol": maps,
+        }
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()} | own
+
+    def table(self) -> list[tuple[str, str]]:
+        """Return the states as lines of a name and a text."""
+        lines = []
+        for s in self.states:
+            text = s.missing or percent(s.share, s.error)
+            if not s.missing and s.free_energy_kj_mol is not None and s.free_energy_kj_mol > 0.0:
+                text += f", {s.free_energy_kj_mol:.1f} ± {s.free_energy_error or 0.0:.1f} kJ/mol"
+            if s.surrogate is not None:
+                text += f"; surrogate {percent(s.surrogate, s.surrogate_error or 0.0)}{', differs' * s.differs}"
+            lines.append((f"{s.torsion} {s.state}", text))
+        return lines
+
+
+def percent(share: float, error: float) -> str:
+    """Return a share and its error in per cent."""
+    return f"{100 * share:.1f} ± {100 * error:.1f} %"
+
+
+class _Torsions:
+    """Which torsions of a scene turn slowly, and what they are in frames."""
+
+    def __init__(self, ensemble: Ensemble) -> None:
+        scene = ensemble.scene
+        self.backbone: Backbone = backbone(scene)
+        self.others: list[Torsion] = [t for t in find_torsions(scene) if t.kind in SLOW_KINDS]
+        rows = [self.backbone.phi, self.backbone.psi, np.array([t.quad for t in self.others]).reshape(-1, 4)]
+        self.quads = np.concatenate([np.asarray(r, dtype=np.int64).reshape(-1, 4) for r in rows])
+        self.fold = np.array([1] * (len(rows[0]) + len(rows[1])) + [t.fold for t in self.others])
+        self.n_phi, self.n_psi = len(rows[0]), len(rows[1])
+
+    def of(self, ensemble: Ensemble) -> list[FloatArray]:
+        """Return angles `(n_frames, k)` rad per segment, times their fold; NaN where a frame is not finite."""
+        from systems.chemistry.geometry import column_blocks, torsion_angle
+
+        out = []
+        for segment in ensemble.segments:
+            angles = np.empty((len(segment), len(self.quads)))
+            for start in range(0, len(segment), 8192):
+                block = np.asarray(segment[start : start + 8192])
+                with np.errstate(invalid="ignore", over="ignore"):
+                    for first, x in column_blocks(block, max(len(self.quads), 1)):
+                        rows = slice(start + first, start + first + x.shape[2])
+                        angles[rows] = torsion_angle(x, self.quads).T
+                angles[start : start + len(block)][~np.isfinite(block).all(axis=(1, 2))] = np.nan
+            folded = angles * self.fold
+            out.append(np.asarray(np.arctan2(np.sin(folded), np.cos(folded))))
+        return out
+
+
+def md_answer(md: Ensemble, temperature_k: float, *, surrogate: Ensemble | None = None, seed: int = 0) -> Answer:
+    """Return what MD replicas say of equilibrium, and how a surrogate's populations compare with that.
+
+    `md`: one segment a replica; `temperature_k` of its bath. Raises InputError where no torsion of the molecule turns
+    or replicas are too short to tell anything.
+    """
+    torsions = _Torsions(md)
+    if not len(torsions.quads):
+        raise InputError(f"{md.scene.name}: no torsion turns, and so there are no states to weigh.")
+    angles = torsions.of(md)
+    micro = _microstates(angles, md.lag_ps)
+    found = equilibrium(micro, seed=seed)
+    own = torsions.of(surrogate) if surrogate is not None else None
+    states: list[StateEnergy] = []
+    missing: list[str] = []
+    for name, labels, names, rolled in _named_states(torsions, angles, own):
+        states += _energies(found, micro, (name, names), labels, rolled, temperature_k)
+    for lost in found.unconnected:
+        # What is left for good has no weight, rightly.
+        if lost.fate != "left and never entered":
+            where = _where(lost.microstates, micro, states, torsions, angles, own)
+            missing.append(f"not connected: {where} was {lost.fate} ({lost.n_replicas} of {len(micro)} replicas)")
+    states = [_said_missing(s) for s in states]
+    missing += [
+        f"{s.torsion} {s.state}: {s.missing}" for s in states if s.missing and (not missing or not s.n_replicas)
+    ]
+    if found.method == "Markov model" and not missing and found.crossings == 0 and len(found.timescales):
+        missing.append("the slowest process was seen in one direction only")
+    ps = md.lag_ps
+    return Answer(
+        method=found.method,
+        n_replicas=len(micro),
+        replica_ps=float(np.median([len(m) for m in micro])) * ps,
+        lag_ps=ps,
+        model_lag_ps=found.lag_frames * ps,
+        timescales_ps=tuple((found.timescales * ps).tolist()),
+        timescale_errors_ps=tuple((found.timescale_errors * ps).tolist()),
+        tests=_tests(found, ps),
+        holds=found.holds,
+        states=tuple(states),
+        maps=_maps(torsions, angles, found.weights, temperature_k),
+        missing=tuple(dict.fromkeys(missing)),
+        weights=found.weights,
+    )
+
+
+def _tests(found: Equilibrium, ps: float) -> str:
+    """Return by what weights were found and which tests that passed."""
+    if found.method == "plain averages":
+        return "plain averages, as replicas outlast the slowest process"
+    flat = "flat" if found.flat else "not flat"
+    holds = "within errors" if found.ck_holds else "beyond errors"
+    return (
+        f"a reversible Markov model at a lag of {format_time_ps(found.lag_frames * ps, 2)} (timescales {flat}, "
+        f"Chapman-Kolmogorov off by {found.ck_error:.2g}, {holds}, {found.crossings} crossings of the slowest process)"
+    )
+
+
+def _microstates(angles: list[FloatArray], lag_ps: float) -> list[IntArray]:
+    """Return the microstate of every frame: k-means in the slow space of the torsions."""
+    from deeptime.clustering import KMeans
+
+    features = [kinetics.circular_features(a) for a in angles]
+    shortest = min(map(len, features))
+    lag = max(1, min(round(_TICA_LAG_PS / lag_ps), shortest // 4))
+    projection = msm.fit_projection(features, lag, _DIMENSIONS, least=0.05)
+    if projection is None:
+        raise InputError("MD's replicas are too short to tell states apart; give them more time.")
+    coordinates = [projection.project(x) for x in features]
+    every = np.concatenate([x[np.isfinite(x).all(axis=1)] for x in coordinates])
+    n = max(2, min(_MICROSTATES, len(every) // _FRAMES_A_MICROSTATE))
+    sample = every[:: max(1, len(every) // _CLUSTERED_FRAMES)]
+    model = KMeans(n, max_iter=100, tolerance=1e-3, fixed_seed=1, n_jobs=1).fit(sample).fetch_model()
+    out = []
+    for x in coordinates:
+        finite = np.isfinite(x).all(axis=1)
+        labels = np.full(len(x), -1, dtype=np.int64)
+        if finite.any():
+            labels[finite] = model.transform(np.ascontiguousarray(x[finite]), n_jobs=1)
+        out.append(labels)
+    return out
+
+
+Named = tuple[str, list[IntArray], tuple[str, ...], list[IntArray] | None]
+
+
+def _named_states(torsions: _Torsions, angles: list[FloatArray], own: list[FloatArray] | None) -> list[Named]:
+    """Return for every residue and further torsion its name, the label of each frame of MD, the names of labels, and
+    the labels of the surrogate's frames."""
+    found: list[Named] = []
+
+    def both(label: Any, *columns: int) -> tuple[list[IntArray], list[IntArray] | None]:
+        def of(segments: list[FloatArray]) -> list[IntArray]:
+            return [np.where(np.isfinite(a).all(axis=1), label(*(a[:, c] for c in columns)), -1) for a in segments]
+
+        return of(angles), None if own is None else of(own)
+
+    for residue in torsions.backbone.residues:
+        labels, rolled = both(
+            lambda phi, psi: np.where(phi > 0, 2, np.where(is_alpha(psi), 0, 1)),
+            residue.phi,
+            torsions.n_phi + residue.psi,
+        )
+        found.append((residue.label, labels, ("α", "β", "left-handed"), rolled))
+    first = torsions.n_phi + torsions.n_psi
+    for k, torsion in enumerate(torsions.others):
+        of_md, of_own = ([a[:, first + k] for a in segments or []] for segments in (angles, own))
+        wells = find_wells(torsion.label, of_md, of_own)
+        if len(wells.names) < 2:
+            continue
+        labels, rolled = wells.labels(of_md), None if own is None else wells.labels(of_own)
+        values, state = np.concatenate([*of_md, *of_own]), np.concatenate([*labels, *(rolled or [])])
+        names = tuple(f"{math.degrees(msm.circular_mean(values[state == s]) / torsion.fold):.0f}°"
+                      for s in range(len(wells.names)))  # fmt: skip
+        found.append((torsion.label, labels, names, rolled))
+    return found
+
+
+def _energies(
+    found: Equilibrium, micro: list[IntArray], named: tuple[str, tuple[str, ...]], labels: list[IntArray],
+    rolled: list[IntArray] | None, temperature_k: float,
+) -> list[StateEnergy]:  # fmt: skip
+    """Return the states of one torsion with their free energies."""
+    torsion, names = named
+    n = len(names)
+    shares, draws = found.shares(micro, labels, n)
+    kt = GAS_CONSTANT_KJ_MOL_K * temperature_k
+    best = int(np.argmax(shares))
+    n_frames = sum(map(len, labels))
+    visits = [np.bincount(x[x >= 0], minlength=n) for x in labels]
+    own, own_error = (None, None) if rolled is None else _own_shares(rolled, n)
+    out = []
+    for s, name in enumerate(names):
+        energy = error = None
+        if shares[s] > 0:
+            drawn = draws[(draws[:, s] > 0) & (draws[:, best] > 0)]
+            energies = -kt * np.log(drawn[:, s] / drawn[:, best]) if len(drawn) else np.zeros(0)
+            energy = float(-kt * math.log(shares[s] / shares[best]))
+            error = float(np.std(energies, ddof=1)) if len(energies) > 1 else None
+        there = sum(bool(v[s]) for v in visits)
+        rolled_share = None if own is None else float(own[s])
+        if there == 0 and not rolled_share:
+            continue
+        out.append(StateEnergy(
+            torsion, name, float(shares[s]), max(float(draws[:, s].std()), 1.0 / n_frames), energy, error, there,
+            sum(bool(len(x)) and bool(x[0] == s) for x in labels), rolled_share,
+            None if own_error is None else float(own_error[s]),
+            "" if shares[s] > 0 or _left(found, micro, labels, s) else "no weight is known",
+        ))  # fmt: skip
+    return out
+
+
+def _left(found: Equilibrium, micro: list[IntArray], labels: list[IntArray], state: int) -> bool:
+    """Return whether MD was in a state and left it for good, so that no weight is the right one."""
+    gone = {m for lost in found.unconnected if lost.fate == "left and never entered" for m in lost.microstates}
+    inside = [m[x == state] for m, x in zip(micro, labels, strict=True)]
+    every = np.concatenate(inside)
+    ends = sum(bool(len(x)) and bool(x[-1] == state) for x in labels)
+    return len(every) > 0 and (set(np.unique(every).tolist()) <= gone or ends == 0)
+
+
+def _said_missing(state: StateEnergy) -> StateEnergy:
+    if not state.missing:
+        return state
+    if state.n_replicas == 0:
+        return replace(state, missing="only the surrogate was there; no MD began there")
+    begun = f"{state.n_begun} replicas began there" if state.n_begun else "it was entered"
+    return replace(state, missing=f"not connected: {begun}, and MD shows no way out and back")
+
+
+def _own_shares(labels: list[IntArray], n: int) -> tuple[FloatArray, FloatArray]:
+    """Return a rollout's shares `(n,)` and their standard errors, from its replicas, or from eight parts of an only
+    one."""
+    parts = labels if len(labels) >= 4 else [p for x in labels for p in np.array_split(x, 8)]
+    each = np.array([np.bincount(x[x >= 0], minlength=n) / max(int((x >= 0).sum()), 1) for x in parts if len(x)])
+    return each.mean(0), each.std(0, ddof=1) / math.sqrt(len(each)) if len(each) > 1 else np.zeros(n)
+
+
+def _where(
+    lost: Sequence[int], micro: list[IntArray], states: list[StateEnergy], torsions: _Torsions,
+    angles: list[FloatArray], own: list[FloatArray] | None,
+) -> str:  # fmt: skip
+    """Return the state of one torsion that tells unconnected microstates from the rest best."""
+    inside = np.isin(np.concatenate(micro), lost)
+    best, said = 0.0, "a state"
+    for name, labels, names, _ in _named_states(torsions, angles, own):
+        every = np.concatenate(labels)
+        for s, state in enumerate(names):
+            apart = float((every[inside] == s).mean() - (every[~inside] == s).mean()) if (~inside).any() else 0.0
+            if apart > best:
+                best, said = apart, f"{name} {state}"
+    return said
+
+
+def _maps(
+    torsions: _Torsions, angles: list[FloatArray], weights: Sequence[FloatArray], temperature_k: float
+) -> dict[str, FloatArray]:
+    """Return the free energy over φ and ψ of each residue, kJ/mol, from weighted frames."""
+    every, w = np.concatenate(angles), np.concatenate(weights)
+    kt = GAS_CONSTANT_KJ_MOL_K * temperature_k
+    found = {}
+    for residue in torsions.backbone.residues:
+        phi, psi = every[:, residue.phi], every[:, torsions.n_phi + residue.psi]
+        good = np.isfinite(phi) & np.isfinite(psi)
+        span = [(-math.pi, math.pi)] * 2
+        density = np.histogram2d(phi[good], psi[good], bins=_MAP_BINS, range=span, weights=w[good])[0]
+        with np.errstate(divide="ignore"):
+            found[residue.label] = np.asarray(-kt * np.log(density / max(float(density.max()), 1e-300)))
+    return found
+
+
+def frames_over_states(ensemble: Ensemble, n: int, *, seed: int = 0) -> npt.NDArray[np.float32]:
+    """Return `n` valid frames `(n, n_atoms, 3)` nm of an ensemble, drawn so that no state of any torsion is left out.
+
+    By turns a frame from the state that was drawn least so far, and any frame: rough weights are kept where there is
+    room. In this order, so that the first few cover as much as they can.
+    """
+    rng = np.random.default_rng(seed)
+    torsions = _Torsions(ensemble)
+    angles = torsions.of(ensemble)
+    flags = ensemble.flags or [np.zeros(len(a), dtype=np.uint16) for a in angles]
+    good = np.concatenate([(f & INVALID) == 0 for f in flags]) & np.isfinite(np.concatenate(angles)).all(axis=1)
+    valid = np.flatnonzero(good) if good.any() else np.arange(len(good))
+    labels = [np.concatenate(named[1])[valid] for named in _named_states(torsions, angles, None)]
+    states = [(x, s) for x in labels for s in np.unique(x).tolist() if (x == s).mean() >= _DRAWN_SHARE]
+    drawn = np.zeros(len(states), dtype=int)
+    picks = []
+    for k in range(n):
+        pool = np.arange(len(valid))
+        if k % 2 == 0 and states:
+            x, s = states[int(np.argmin(drawn + 1e-3 * rng.random(len(states))))]
+            pool = np.flatnonzero(x == s)
+        pick = int(rng.choice(pool))
+        drawn += [int(x[pick] == s) for x, s in states]
+        picks.append(int(valid[pick]))
+    ends = np.cumsum([len(a) for a in angles])
+    found = []
+    for pick in picks:
+        k = int(np.searchsorted(ends, pick, side="right"))
+        at = pick - (int(ends[k - 1]) if k else 0)
+        found.append(np.asarray(ensemble.segments[k][at : at + 1])[0])
+    return np.stack(found)

@@ -1,0 +1,190 @@
+"""What the viewer plays: some frames of reference and candidate, superposed and packed into a few hundred kB."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.measure.structure import Features
+from surrogate.comparison.read.ensemble import Ensemble
+from systems.chemistry import validity
+from systems.chemistry.geometry import superpose
+from systems.scene import Scene
+
+IntArray = npt.NDArray[np.int64]
+Frames = npt.NDArray[np.float32]
+Packed = npt.NDArray[np.int16]
+
+MAX_FRAMES = 240
+MAX_NUMBERS = 120_000
+HYDROGENS_UP_TO = 300
+NOT_FINITE = -32768
+_LARGEST = 32767
+# Room beyond the first frame's extent before a coordinate is cut off: what flies further has left the picture anyway.
+_ROOM = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames of both trajectories at the same times: `time_ps (n,)`, coordinates `(n, n_shown, 3)` int16.
+
+    A coordinate is `value * Movie.scale_nm`; NOT_FINITE marks a frame that cannot be drawn. `*_flags (n,)` are validity
+    bits; `chunk_idx (n,)` is the candidate's chunk, None where its file marks none.
+    """
+
+    name: str
+    time_ps: npt.NDArray[np.float64]
+    reference: Packed
+    candidate: Packed
+    reference_flags: npt.NDArray[np.uint16]
+    candidate_flags: npt.NDArray[np.uint16]
+    chunk_idx: npt.NDArray[np.int32] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Movie:
+    """Clips of one candidate beside the reference: the atoms shown (`elements`, names) and the bonds among them.
+
+    `bonds (n_bonds, 2)` count within the shown atoms; `scale_nm` is nm per unit of the clips' coordinates.
+    """
+
+    elements: tuple[str, ...]
+    bonds: IntArray
+    scale_nm: float
+    clips: tuple[Clip, ...]
+    hydrogens_left_out: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the viewer reads; coordinates as base64 of little-endian int16."""
+        return {
+            "elements": list(self.elements),
+            "bonds": self.bonds.ravel().tolist(),
+            "scale": self.scale_nm,
+            "faults": {str(bit): validity.flag_names(bit)[0] for bit in _bits()},
+            "clips": [_clip_dict(clip) for clip in self.clips],
+        }
+
+
+def make_movie(
+    reference: Ensemble, candidate: Ensemble, reference_features: Features, candidate_features: Features, n_frames: int
+) -> Movie:
+    """Return the movie of the first `n_frames` of both: a clip over the whole length, and one of consecutive frames.
+
+    Every frame is laid over the reference's first finite one by its heavy atoms (all atoms where fewer than three are
+    heavy), which is turned so that its longest axis lies across the picture. Hydrogens are left out above 300 atoms.
+    """
+    scene = reference.scene
+    shown = _shown_atoms(scene)
+    fitted = np.flatnonzero(np.array([e != "H" for e in scene.elements]))
+    if len(fitted) < 3:
+        fitted = np.arange(scene.n_atoms)
+    template = _flat_on(_first_finite(reference, candidate), fitted)
+    scale = _ROOM * max(float(np.abs(template).max()), 0.1) / _LARGEST
+    n_clip = int(min(MAX_FRAMES, max(2, MAX_NUMBERS // (3 * len(shown))), n_frames))
+    spread = np.unique(np.linspace(0, n_frames - 1, n_clip).astype(np.int64))
+    wanted = [("whole length", spread)]
+    if n_frames > n_clip:
+        wanted.append(("frame by frame", np.arange(n_clip, dtype=np.int64)))
+    clips = []
+    for name, idx in wanted:
+        both = [_pack(pick_frames(e.segments, idx), template, fitted, shown, scale) for e in (reference, candidate)]
+        chunks = candidate_features.chunk_idx
+        clips.append(
+            Clip(
+                name,
+                np.asarray((idx + 1) * reference.lag_ps, dtype=np.float64),
+                both[0],
+                both[1],
+                _pick(reference_features.flags, idx),
+                _pick(candidate_features.flags, idx),
+                None if chunks is None else _pick(chunks, idx),
+            )
+        )
+    bonds = np.asarray(scene.bonds, dtype=np.int64).reshape(-1, 2)
+    place = np.full(scene.n_atoms, -1)
+    place[shown] = np.arange(len(shown))
+    kept = place[bonds]
+    return Movie(
+        tuple(scene.elements[a] for a in shown),
+        kept[(kept >= 0).all(axis=1)],
+        scale,
+        tuple(clips),
+        len(shown) < scene.n_atoms,
+    )
+
+
+def pick_frames(segments: Sequence[Any], idx: IntArray) -> Frames:
+    """Return frames `idx` (sorted, counted through the segments in order) as `(len(idx), n_atoms, 3)` nm.
+
+    Consecutive frames are read at once, so that segments may lie in a file.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(s) for s in segments])])
+    of_segment = np.searchsorted(starts, idx, side="right") - 1
+    breaks = np.flatnonzero((np.diff(idx) != 1) | (np.diff(of_segment) != 0)) + 1
+    runs = zip(np.split(idx, breaks), np.split(of_segment, breaks), strict=True)
+    parts = [segments[s[0]][run[0] - starts[s[0]] : run[-1] + 1 - starts[s[0]]] for run, s in runs]
+    return np.asarray(np.concatenate(parts), dtype=np.float32)
+
+
+def _pick(series: Sequence[npt.NDArray[Any]], idx: IntArray) -> npt.NDArray[Any]:
+    return np.asarray(np.concatenate(list(series))[idx])
+
+
+def _shown_atoms(scene: Scene) -> IntArray:
+    everything = np.arange(scene.n_atoms)
+    if scene.n_atoms <= HYDROGENS_UP_TO:
+        return everything
+    return everything[[e != "H" for e in scene.elements]]
+
+
+def _first_finite(*ensembles: Ensemble) -> Frames:
+    for ensemble in ensembles:
+        first = pick_frames(ensemble.segments, np.arange(min(100, ensemble.n_frames)))
+        finite = np.isfinite(first).all(axis=(1, 2))
+        if finite.any():
+            return np.asarray(first[int(finite.argmax())], dtype=np.float32)
+    return np.asarray(ensembles[0].scene.positions_nm, dtype=np.float32)
+
+
+def _flat_on(frame: Frames, fitted: IntArray) -> Frames:
+    """Return one frame centred on its fitted atoms, with their longest axis along x and the next along y."""
+    centred = np.asarray(frame, dtype=np.float64) - frame[fitted].mean(axis=0, dtype=np.float64)
+    _, _, axes = np.linalg.svd(centred[fitted], full_matrices=True)
+    if np.linalg.det(axes) < 0:
+        axes[2] = -axes[2]
+    return np.asarray(centred @ axes.T, dtype=np.float32)
+
+
+def _pack(frames: Frames, template: Frames, fitted: IntArray, shown: IntArray, scale_nm: float) -> Packed:
+    # A frame that has exploded may overflow when squared: it cannot be laid over anything either.
+    usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.nan_to_num(frames)).max(axis=(1, 2)) < 1e6)
+    packed = np.full((len(frames), len(shown), 3), NOT_FINITE, dtype=np.int16)
+    if usable.any():
+        laid = superpose(frames[usable], template, idx=fitted)[:, shown]
+        packed[usable] = np.clip(np.rint(laid / scale_nm), -_LARGEST, _LARGEST).astype(np.int16)
+    return packed
+
+
+def _bits() -> list[int]:
+    return [1 << k for k in range(16) if validity.flag_names(1 << k)]
+
+
+def _clip_dict(clip: Clip) -> dict[str, Any]:
+    return {
+        "name": clip.name,
+        "time": [float(f"{t:.8g}") for t in clip.time_ps],
+        "reference": _base64(clip.reference),
+        "candidate": _base64(clip.candidate),
+        "referenceFlags": clip.reference_flags.tolist(),
+        "candidateFlags": clip.candidate_flags.tolist(),
+        "chunk": None if clip.chunk_idx is None else clip.chunk_idx.tolist(),
+    }
+
+
+def _base64(values: Packed) -> str:
+    return base64.b64encode(values.astype("<i2").tobytes()).decode("ascii")

@@ -1,0 +1,502 @@
+"""An ensemble: all frames of one candidate, as segments of unbroken time, in the atom order of one scene.
+
+It is read from files that are opened, matched to the reference's atoms, made whole and laid out in time, and holds what
+they say of themselves: settings, costs, what guards did.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import reduce
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.read.common_atoms import Match, match_scenes, solute_atoms
+from surrogate.comparison.read.stored_frames import StoredFrames, bond_tree, grid_of, rounded, rounding_note
+from systems.errors import InputError, OutOfDomainError, TrajectoryError, listed
+from systems.scene import Scene, part_of
+from systems.trajectory.base import TrajectoryReader
+from systems.trajectory.codec import DIFFERENCE_COLUMN, replicas_of, reweighting
+from systems.units import format_time_ps
+
+Frames = npt.NDArray[np.float32] | StoredFrames
+Flags = npt.NDArray[np.uint16]
+IntArray = npt.NDArray[np.int64]
+
+IN_MEMORY_BYTES = 128 * 2**20
+# What a note begins with of files that hold fewer frames than were asked for.
+STOPPED = "Stopped before the end"
+_LEAST_FRAMES = 10
+# Of a sample of frames, about as many numbers.
+_SAMPLED_VALUES = 20_000_000
+# Scalar column, 0 for a frame that nothing was done about.
+GUARD_COLUMN = "intervention"
+FloatArray = npt.NDArray[np.float64]
+
+_LEAST = 10
+# Below this share of effective frames populations of the reference and of the model are two things.
+_FEW = 0.5
+_WIDEST_BOND_NM = 0.3
+# No MD saves frames this close; and a DCD header of one AKMA unit of time is a default, not a time.
+_LEAST_LAG_PS = 1e-4
+_AKMA_PS = 0.04888821
+_SETTINGS = ("force_field", "solvent", "temperature_k", "friction_per_ps", "model", "weights_hash")
+
+
+def length_words(segment_lengths: Sequence[int], lag_ps: float) -> str:
+    """Return how long trajectories are, as what they are: '32 replicas of 3.8 ns', never their sum."""
+    if not segment_lengths:
+        return "no frames"
+    short, long = (format_time_ps(n * lag_ps) for n in (min(segment_lengths), max(segment_lengths)))
+    each = long if short == long else f"{short} to {long}"
+    return each if len(segment_lengths) == 1 else f"{len(segment_lengths)} replicas of {each}"
+
+
+class InSegments(ABC):
+    """Base of what holds one value or more for every frame, `lag_ps` apart, in segments of unbroken time."""
+
+    lag_ps: float
+
+    @property
+    @abstractmethod
+    def segment_lengths(self) -> list[int]:
+        """Frames in each segment."""
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of all segments together."""
+        return sum(self.segment_lengths)
+
+    @property
+    def total_ps(self) -> float:
+        """Simulated time of all segments together (frames times lag)."""
+        return self.n_frames * self.lag_ps
+
+    @property
+    def length_words(self) -> str:
+        """Such as '32 replicas of 3.8 ns'."""
+        return length_words(self.segment_lengths, self.lag_ps)
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble(InSegments):
+    """Frames of one candidate: one or several segments (replicas, or stretches of unbroken time).
+
+    `segments`: each `(n, n_atoms, 3)` float32 nm, atoms in the order of `scene`, in memory or in their file, to be read
+    by slices; `kept`: which atoms of the reference's scene these are, None for all; `lag_ps`: time between frames;
+    `flags` `(n,)` uint16, `chunk_idx` `(n,)` int32 and `changed` `(n,)` bool (what a rollout's guards changed) per
+    segment, or None where the file does not say; `record`: what the writer said of itself (costs summed over files);
+    `sources`: the files; `top`, `stated_lag_ps`: what the user said of them; `notes`: what was done on reading;
+    `grids_nm`: what the coordinates of each segment are rounded to, 0 for nothing (none given: nothing).
+    Raises InputError for shapes that do not fit, no frame at all, or a lag that is not positive.
+    """
+
+    label: str
+    segments: Sequence[Frames]
+    lag_ps: float
+    scene: Scene
+    flags: Sequence[Flags] | None = None
+    chunk_idx: Sequence[npt.NDArray[np.int32]] | None = None
+    record: dict[str, Any] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    top: str | None = None
+    stated_lag_ps: float | None = None
+    notes: tuple[str, ...] = ()
+    kept: IntArray | None = None
+    changed: Sequence[npt.NDArray[np.bool_]] | None = None
+    grids_nm: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.lag_ps) and self.lag_ps > 0):
+            raise InputError(f"{self.label}: the time between frames is {self.lag_ps} ps; state it with `dt_ps='1ps'`.")
+        for i, segment in enumerate(self.segments):
+            if segment.ndim != 3 or segment.shape[1:] != (self.scene.n_atoms, 3):
+                raise InputError(
+                    f"{self.label}: segment {i} has shape {segment.shape}, expected (n, {self.scene.n_atoms}, 3)."
+                )
+        if self.n_frames == 0:
+            raise InputError(f"{self.label}: no frames.")
+        for name, series in (("flags", self.flags), ("chunk_idx", self.chunk_idx), ("changed", self.changed)):
+            if series is not None and [len(s) for s in series] != self.segment_lengths:
+                raise InputError(f"{self.label}: {name} do not match the segments in length.")
+
+    @property
+    def segment_lengths(self) -> list[int]:
+        return [len(s) for s in self.segments]
+
+    @property
+    def grid_nm(self) -> float:
+        """The coarsest rounding of any segment's coordinates, nm, 0 for none."""
+        return max(self.grids_nm, default=0.0)
+
+    def sample(self, n_frames: int) -> npt.NDArray[np.float32]:
+        """Return about `n_frames` finite frames `(n, n_atoms, 3)` nm, spread evenly (fewer of very large scenes)."""
+        wanted = max(min(n_frames, _SAMPLED_VALUES // max(3 * self.scene.n_atoms, 1)), 10)
+        stride = max(1, -(-self.n_frames // wanted))
+        frames = np.concatenate([s[::stride] for s in self.segments])
+        return frames[np.isfinite(frames).all(axis=(1, 2))]
+
+    def strided(self, stride: int) -> Ensemble:
+        """Return every `stride`-th frame of each segment, with the lag that follows."""
+        if stride == 1:
+            return self
+        return replace(
+            self,
+            segments=[s.thinned(stride) if isinstance(s, StoredFrames) else s[::stride] for s in self.segments],
+            flags=None if self.flags is None else [f[::stride] for f in self.flags],
+            chunk_idx=None if self.chunk_idx is None else [c[::stride] for c in self.chunk_idx],
+            changed=None if self.changed is None else [c[::stride] for c in self.changed],
+            lag_ps=self.lag_ps * stride,
+            notes=(*self.notes, f"{self.label}: one frame in {stride} is used, for equal save intervals."),
+        )
+
+    def on_grid(self, grid_nm: float) -> Ensemble:
+        """Return the same frames with coordinates rounded to `grid_nm`, where they are not as coarse already."""
+        own = self.grids_nm or (0.0,) * len(self.segments)
+        if min(own) >= grid_nm:
+            return self
+        segments = [
+            s if g >= grid_nm else s.on_grid(grid_nm) if isinstance(s, StoredFrames) else rounded(s, grid_nm)
+            for s, g in zip(self.segments, own, strict=True)
+        ]
+        return replace(self, segments=segments, grids_nm=tuple(max(g, grid_nm) for g in own))
+
+    def restricted(self, atoms: IntArray, scene: Scene) -> Ensemble:
+        """Return the same frames with `atoms` `(k,)` only, which are those of `scene`."""
+        segments = [s.restricted(atoms) if isinstance(s, StoredFrames) else s[:, atoms] for s in self.segments]
+        kept = atoms if self.kept is None else self.kept[atoms]
+        return replace(self, segments=segments, scene=scene, kept=kept)
+
+
+def load_ensemble(
+    paths: Sequence[str | Path],
+    *,
+    label: str | None = None,
+    template: Scene | None = None,
+    top: str | Path | None = None,
+    lag_ps: float | None = None,
+    in_memory_bytes: int = IN_MEMORY_BYTES,
+) -> Ensemble:
+    """Read one or several trajectory files as the replicas of one candidate.
+
+    Any format that MDTraj or MDAnalysis reads. Atoms are put in the order of `template` (matched by the bond graph
+    where order or names differ); a file that holds only some of them (no hydrogens, backbone) gives an ensemble of
+    those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
+    periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
+    the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
+    coordinates together are left where they are and read block by block.
+    Raises InputError (no files, nothing known of the topology, no times without `lag_ps`, replicas with different lags
+    or atoms), OutOfDomainError (another molecule) and TrajectoryError (a damaged file, uneven time).
+    """
+    if not paths:
+        raise InputError("No trajectory file was given.")
+    name = label or Path(paths[0]).name + (f" + {len(paths) - 1} more" if len(paths) > 1 else "")
+    segments: list[Frames] = []
+    flags: list[Flags] = []
+    chunks: list[npt.NDArray[np.int32]] = []
+    changed: list[npt.NDArray[np.bool_]] = []
+    records: list[dict[str, Any]] = []
+    scalars: list[Mapping[str, npt.NDArray[np.float64]]] = []
+    lags: list[float] = []
+    notes: list[str] = []
+    kept: list[IntArray] = []
+    grids: list[float] = []
+    stopped: list[str] = []
+    for path in paths:
+        opened = open_matched(Path(path), template, None if top is None else Path(top), notes)
+        reader, template = opened.reader, opened.template
+        kept.append(opened.kept)
+        lag, cuts, note = time_axis(str(path), reader.time_ps if reader.times_known else None, reader.n_frames, lag_ps)
+        replicas = replicas_of(reader.record, reader.n_frames)
+        cuts = sorted({*cuts, *(part.start for part, _ in replicas[1:])})
+        notes += note
+        lags.append(lag)
+        frames = opened.frames
+        grids += [grid_of(reader)] * (len(cuts) + 1)
+        size = 12 * len(frames) * reader.n_atoms
+        if size <= in_memory_bytes:
+            in_memory_bytes -= size
+            segments += np.split(frames[:], cuts)
+            reader.close()
+        else:
+            segments += frames.split(cuts)
+        if reader.flags is not None:
+            flags += np.split(np.asarray(reader.flags, dtype=np.uint16), cuts)
+        if reader.chunk_idx is not None:
+            chunks += np.split(np.asarray(reader.chunk_idx, dtype=np.int32), cuts)
+        if GUARD_COLUMN in reader.scalars:
+            changed += np.split(reader.scalars[GUARD_COLUMN] > 0, cuts)
+        if len(replicas) > 1:
+            notes.append(f"{path}: {len(replicas)} replicas in one file, which are compared as separate runs.")
+        records += [record for _, record in replicas]
+        scalars += [{key: values[part] for key, values in reader.scalars.items()} for part, _ in replicas]
+        if reader.record.get("completed") is False:
+            stopped.append(f"{path} ({reader.n_frames} frames)")
+    assert template is not None
+    if stopped:
+        notes.append(f"{STOPPED}: {listed(stopped, 3)}.")
+    if any(len(k) != len(kept[0]) or (k != kept[0]).any() for k in kept[1:]):
+        raise InputError(f"{name}: its files hold different atoms of {template.name!r}; give them as candidates apart.")
+    notes += unseen_notes(name, records) + intervention_notes(name, records) + reweighting_notes(name, records, scalars)
+    lag = common_lag([x for x in lags if math.isfinite(x)], paths, lag_ps)
+    part = kept[0] if len(kept[0]) < template.n_atoms else None
+    return Ensemble(
+        label=name,
+        segments=segments,
+        lag_ps=lag,
+        scene=template if part is None else part_of(template, part),
+        flags=flags if len(flags) == len(segments) else None,
+        chunk_idx=chunks if len(chunks) == len(segments) else None,
+        changed=changed if len(changed) == len(segments) else None,
+        record=merged_record(records, name, notes),
+        sources=tuple(str(p) for p in paths),
+        top=None if top is None else str(top),
+        stated_lag_ps=lag_ps,
+        notes=tuple(notes),
+        kept=part,
+        grids_nm=tuple(grids),
+    )
+
+
+def alike(ensembles: Sequence[Ensemble]) -> tuple[list[Ensemble], IntArray | None]:
+    """Return the ensembles on the atoms that all of them hold, thinned by whole strides to their least common save
+    interval, rounded to the coarsest grid of any; and which of the first's atoms these are (None: all).
+
+    The first is the reference, in whose atoms the others' `kept` counts. Raises InputError when fewer than three atoms
+    are left, or when no common interval leaves 10 frames of each.
+    """
+    reference, out = ensembles[0], list(ensembles)
+    every = np.arange(reference.scene.n_atoms)
+    common = _common_atoms(every, [e.kept for e in out[1:]])
+    if common is not None:
+        scene = part_of(reference.scene, common)
+        held = [every if e is reference or e.kept is None else e.kept for e in out]
+        out = [e.restricted(np.searchsorted(atoms, common), scene) for e, atoms in zip(out, held, strict=True)]
+        note = f"Compared on the {len(common)} atoms that all trajectories hold, of {len(every)}."
+        out[0] = replace(out[0], notes=(*out[0].notes, note))
+    strides = _common_strides([e.lag_ps for e in out])
+    if any(e.n_frames // stride < _LEAST_FRAMES for e, stride in zip(out, strides, strict=True)):
+        intervals = ", ".join(f"{e.label}: {format_time_ps(e.lag_ps)}" for e in out)
+        raise InputError(
+            f"Save intervals have no common multiple short enough to compare at ({intervals}); "
+            "save again at a multiple of one another, or state the interval with `dt_ps`."
+        )
+    out = [e.strided(stride) for e, stride in zip(out, strides, strict=True)]
+    grid = max(e.grid_nm for e in out)
+    if grid > 0:
+        note = rounding_note([e.label for e in out if e.grid_nm == grid], grid)
+        out = [e.on_grid(grid) for e in out]
+        out[0] = replace(out[0], notes=(*out[0].notes, note))
+    return out, common
+
+
+def _common_atoms(every: IntArray, kept: Sequence[IntArray | None]) -> IntArray | None:
+    """Return those of the atoms that all keep, None where nobody leaves any out."""
+    parts = [atoms for atoms in kept if atoms is not None]
+    if not parts:
+        return None
+    common = reduce(np.intersect1d, parts, every)
+    if len(common) < 3:
+        raise InputError("The trajectories have fewer than three atoms in common; save more, or compare them apart.")
+    return common
+
+
+def _common_strides(lags_ps: Sequence[float]) -> list[int]:
+    """Return by how many of its frames each must step, so that all step by the same time."""
+    lags = [Fraction(float(f"{lag:.6g}")).limit_denominator(1_000_000) for lag in lags_ps]
+    common = lags[0]
+    for lag in lags[1:]:
+        common = Fraction(math.lcm(common.numerator, lag.numerator), math.gcd(common.denominator, lag.denominator))
+    return [int(common / lag) for lag in lags]
+
+
+def unseen_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return that a rollout's molecule was not trained on, else nothing."""
+    if not any(r.get("unseen_molecule") for r in records):
+        return []
+    return [f"{label}: its weights ({records[0].get('weights')}) were not trained on this molecule."]
+
+
+def intervention_notes(label: str, records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what the guards of a rollout did, replicas together, and what it may do to statistics; else nothing."""
+    summaries = [r["interventions"] for r in records if isinstance(r.get("interventions"), dict)]
+    frames: Counter[str] = Counter()
+    bias: dict[str, None] = {}
+    for summary in summaries:
+        frames.update({str(k): int(v) for k, v in summary.get("frames", {}).items()})
+        bias |= dict.fromkeys(str(why) for why in summary.get("bias", []))
+    if not frames:
+        return []
+    chunks, caught = (sum(int(a.get(key, 0)) for a in summaries) for key in ("chunks", "chunks_caught"))
+    done = ", ".join(f"{n} {name}" for name, n in frames.items())
+    return [
+        f"{label}: guard {summaries[0].get('guard')} stepped in in {caught} of {chunks} chunks; frames that are not "
+        f"the model's first draw: {done}. What that may do: {'; '.join(bias)}."
+    ]
+
+
+def reweighting_notes(
+    label: str, records: Sequence[Mapping[str, Any]], scalars: Sequence[Mapping[str, FloatArray]]
+) -> list[str]:
+    """Return how far a learned potential's frames are those of its reference, where a rollout asked it; else
+    nothing."""
+    temperature = records[0].get("temperature_k") if records else None
+    columns = [s[DIFFERENCE_COLUMN] for s in scalars if DIFFERENCE_COLUMN in s]
+    if not columns or not isinstance(temperature, int | float):
+        return []
+    asked = np.concatenate(columns)
+    asked = asked[~np.isnan(asked)]
+    known = asked[np.isfinite(asked)]
+    if len(known) < _LEAST:
+        return []
+    _, effective = reweighting(known, float(temperature))
+    ref = records[0].get("force_field", "its reference")
+    few = "" if effective >= _FEW * len(known) else "; so few say that populations of the two differ: train longer"
+    none = f" and has no energy for {len(asked) - len(known)} more" if len(known) < len(asked) else ""
+    return [
+        f"{label}: {ref} was asked about {len(known)} frames{none}: U({ref}) - U(model) is {known.mean():.3g} "
+        f"kJ/mol with a standard deviation of {known.std():.3g}. Reweighted by exp(-difference / kT) at "
+        f"{temperature:g} K, {effective:.0f} of {len(known)} frames are effective{few}."
+    ]
+
+
+class Opened(NamedTuple):
+    """An open file: its frames in the template's order, and which of the template's atoms they are."""
+
+    reader: TrajectoryReader
+    frames: StoredFrames
+    template: Scene
+    kept: IntArray
+
+
+def open_matched(path: Path, template: Scene | None, top: Path | None, notes: list[str]) -> Opened:
+    """Open a file and match its atoms to `template` (its own solute where None); what was done goes to `notes`.
+
+    Raises InputError, OutOfDomainError (another molecule), TrajectoryError.
+    """
+    from systems.trajectory.codec import open_trajectory
+
+    reader = open_trajectory(path, top=top)
+    if reader.n_frames == 0:
+        reader.close()
+        raise InputError(f"{path}: no frames.")
+    notes.extend(f"{path}: {note}" for note in reader.notes)
+    scene = reader.scene
+    order: IntArray | None = None
+    if scene is None and template is None:
+        raise InputError(f"{path} holds no topology; give one with `top='FILE.pdb'`.")
+    if template is None:
+        assert scene is not None
+        order = solute_atoms(scene)
+        if len(order) < scene.n_atoms:
+            notes.append(f"{path}: water and single ions are left out ({scene.n_atoms - len(order)} atoms).")
+            template = part_of(scene, order)
+        else:
+            order, template = None, scene
+        kept = np.arange(template.n_atoms)
+    elif scene is None:
+        kept = np.arange(template.n_atoms)
+        if reader.n_atoms != template.n_atoms:
+            raise OutOfDomainError(
+                f"{path} has {reader.n_atoms} atoms, {template.name!r} has {template.n_atoms}; give its topology with "
+                "`top`."
+            )
+        notes.append(f"{path}: no topology; its atoms are taken to be in the order of {template.name!r}.")
+    else:
+        try:
+            match = match_scenes(scene, template)
+        except OutOfDomainError as error:
+            raise OutOfDomainError(f"{path} does not hold the molecule of the reference: {error}") from error
+        order, kept = match.order, match.kept
+        moved = len(order) < reader.n_atoms or bool((order != np.arange(len(order))).any())
+        if match.how:
+            notes.append(_matched_note(path, match, template, moved))
+        order = order if moved else None
+    tree = None
+    cells = reader.read_cells(0, 1)
+    if cells is not None and len(cells) and float(np.linalg.norm(cells[0], axis=1).min()) > 2 * _WIDEST_BOND_NM:
+        tree = bond_tree(scene or template)
+        notes.append(f"{path}: periodic; molecules are made whole.")
+    return Opened(reader, StoredFrames(reader, order=order, tree=tree), template, kept)
+
+
+def _matched_note(path: Path, match: Match, template: Scene, moved: bool) -> str:
+    how = "reordered" if moved else "in the same order"
+    if len(match.kept) < template.n_atoms:
+        how = f"{len(match.kept)} of {template.n_atoms} atoms"
+    return f"{path}: atoms matched by {match.how} ({how})."
+
+
+def time_axis(
+    path: str, time_ps: npt.NDArray[np.float64] | None, n_frames: int, stated: float | None
+) -> tuple[float, list[int], list[str]]:
+    """Return the lag (NaN when one frame leaves it open), the frames at which a new segment starts, and notes."""
+    steps = np.empty(0) if time_ps is None else np.diff(time_ps)
+    measured = float(f"{np.median(steps):.6g}") if len(steps) else math.nan
+    if stated is not None:
+        note = []
+        if math.isfinite(measured) and abs(measured - stated) > 1e-3 * stated:
+            note = [f"{path}: {format_time_ps(stated)} per frame as stated; the file itself says {measured:g} ps."]
+        return stated, [], note
+    if n_frames < 2:
+        return math.nan, [], []
+    if time_ps is None or not (np.isfinite(time_ps).all() and measured > 0):
+        raise InputError(f"{path}: the file holds no usable times; state the time between frames with `dt_ps='1ps'`.")
+    if measured < _LEAST_LAG_PS or abs(measured - _AKMA_PS) < 1e-6:
+        raise InputError(
+            f"{path}: its header says {1e3 * measured:.3g} fs between frames, which is what a writer that was told "
+            "nothing puts there; state the time between frames with `dt_ps='1ps'`."
+        )
+    # Times that passed through float32 are exact only to its spacing.
+    tolerance = 1e-3 * measured + 2.0 * float(np.spacing(np.float32(np.abs(time_ps).max())))
+    odd = np.abs(steps - measured) > tolerance
+    jump = odd & ((steps <= 0) | (steps >= 1.5 * measured))
+    if (odd & ~jump).any() or jump.sum() > 0.02 * len(steps):
+        first = int(np.flatnonzero(odd)[0])
+        raise TrajectoryError(
+            f"{path}: time is uneven (frame {first} to {first + 1}: {steps[first]:g} ps, most steps {measured:g} ps); "
+            "state the time between frames with `dt_ps` if you know it to be even."
+        )
+    cuts = (np.flatnonzero(jump) + 1).tolist()
+    notes = [f"{path}: time jumps {len(cuts)} times; the stretches between are treated as segments."] if cuts else []
+    return measured, cuts, notes
+
+
+def common_lag(lags: Sequence[float], paths: Sequence[str | Path], stated: float | None) -> float:
+    """Return the one save interval of all replicas, ps. Raises InputError when they differ or none is known."""
+    if stated is not None:
+        return stated
+    if not lags:
+        raise InputError(
+            f"{paths[0]}: one frame only, so the time between frames is unknown; state it with `dt_ps='1ps'`."
+        )
+    if max(lags) - min(lags) > 1e-3 * min(lags):
+        listed = ", ".join(f"{p}: {x:g} ps" for p, x in zip(paths, lags, strict=False))
+        raise InputError(
+            f"Replicas of one candidate must share one save interval ({listed}); thin them or use `dt_ps`."
+        )
+    return lags[0]
+
+
+def merged_record(records: Sequence[dict[str, Any]], label: str, notes: list[str]) -> dict[str, Any]:
+    """Return the first record with costs summed over all, noting settings in which the files differ."""
+    merged = dict(records[0])
+    for key in _SETTINGS:
+        values = {str(r.get(key)) for r in records}
+        if len(values) > 1:
+            notes.append(f"{label}: its files differ in {key} ({', '.join(sorted(values))}).")
+    costs = [c for c in (r.get("cost") for r in records) if isinstance(c, dict)]
+    merged.pop("cost", None)
+    if len(costs) == len(records):
+        shared = set.intersection(*(set(c) for c in costs))
+        numbers = sorted(k for k in shared if all(isinstance(c[k], (int, float)) for c in costs))
+        merged["cost"] = {k: sum(c[k] for c in costs) for k in numbers}
+    return merged

@@ -1,0 +1,381 @@
+"""Charts to SVG, by their type, and which of them a page shows.
+
+Colours are names of CSS variables, so that one picture serves light and dark pages and any width."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from io import StringIO
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.measure.distributions import free_energy_kj
+from surrogate.comparison.rows.charts import BarChart, Chart, Histogram, Landscape, Line, LineChart, Section
+from systems.units import GAS_CONSTANT_KJ_MOL_K
+
+FloatArray = npt.NDArray[np.float64]
+
+MAP_MAX_KJ = 20.0
+MAP_SIZE, CURVE_SIZE = (2.95, 2.5), (2.95, 2.3)
+DIFFERENCE_MAX_KJ = 4.0
+# The two ends of the difference map, in words: high (too rare) and low (too frequent).
+DIFFERENCE_COLOURS = ("orange", "purple")
+_MIN_COUNT = 5
+# Characters in a line below a narrow picture.
+_LABEL_WIDTH = 36
+# Stand-ins that matplotlib carries through; each becomes a CSS variable in the finished SVG.
+TEXT, CANDIDATE, REPLICATE, LINE, EMPTY, PAGE = (f"#01010{i}" for i in range(1, 7))
+_VARIABLES = {
+    TEXT: "currentColor",
+    CANDIDATE: "var(--candidate)",
+    REPLICATE: "var(--replicate)",
+    LINE: "var(--line)",
+    EMPTY: "var(--map-empty)",
+    PAGE: "var(--page)",
+}
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "surromd",
+    "font.size": 9,
+    "axes.facecolor": "none",
+    "font.family": "sans-serif",
+    "axes.edgecolor": LINE,
+    "axes.labelcolor": TEXT,
+    "text.color": TEXT,
+    "xtick.color": TEXT,
+    "ytick.color": TEXT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.6,
+}
+_COLOURS = {"reference": TEXT, "candidate": CANDIDATE, "replicate": REPLICATE, "other": TEXT}
+_DASHES: dict[str, Any] = {
+    "reference": "solid",
+    "candidate": "solid",
+    "replicate": (0, (4, 2)),
+    "other": (0, (1, 1.5)),
+}
+_MAX_NAMES = 12
+# Characters in a line of a name beside its bar.
+_NAME_WIDTH = 20
+# Of the height of the axes: what a line of small print takes.
+_NAME_HEIGHT = 0.07
+_MOST_MAPS, _MOST_CHARTS = 6, 12
+_TITLES: dict[Section, str] = {
+    "equivalent_time": "What it is worth",
+    "distributions": "Distributions",
+    "kinetics": "How fast things move",
+    "structure": "Structure",
+    "forecast": "Forecast error",
+    "validity": "Validity and energies",
+}
+
+
+class Figure(NamedTuple):
+    """One SVG with its caption."""
+
+    svg: str
+    caption: str
+
+
+def draw(title: str, size: tuple[float, float], paint: Callable[[Any, Any], None]) -> str:
+    """Return one SVG of `size` inches; `paint(figure, axes)` draws it. Nothing of matplotlib's global state is kept."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE | {"text.parse_math": False}):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        paint(figure, figure.add_subplot())
+        text = StringIO()
+        figure.savefig(text, format="svg", transparent=False, facecolor="none", metadata={"Date": None})
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(<svg\b[^>]*?)\s+width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg\b[^>]*?)\s+height="[^"]*"', r"\1", svg, count=1)
+    for stand_in, variable in _VARIABLES.items():
+        svg = svg.replace(stand_in, variable)
+    return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(title, quote=True)}"', 1)
+
+
+def _visible(colours: str) -> Any:
+    """Return a colour map without its darkest ends where it diverges: they would vanish on a dark page."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    if colours != "PuOr_r":
+        return colormaps[colours]
+    return ListedColormap(colormaps[colours](np.linspace(0.14, 0.86, 256)))
+
+
+def _degrees(axes: Any, *, both: bool) -> None:
+    ticks = [-180, -90, 0, 90, 180]
+    axes.set_xticks(ticks)
+    axes.set_xlim(-180, 180)
+    if both:
+        axes.set_yticks(ticks)
+        axes.set_ylim(-180, 180)
+
+
+def difference_kj(reference: FloatArray, candidate: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
+    """Return candidate minus reference in kJ/mol, cut off at the second number; NaN where there are too few counts."""
+    rt_kj = GAS_CONSTANT_KJ_MOL_K * temperature_k
+    p_reference, p_candidate = (counts / max(counts.sum(), 1.0) for counts in (reference, candidate))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = -rt_kj * np.log(p_candidate / p_reference)
+    enough = np.maximum(reference, candidate) >= _MIN_COUNT
+    return np.where(enough, np.clip(change, -DIFFERENCE_MAX_KJ, DIFFERENCE_MAX_KJ), np.nan), DIFFERENCE_MAX_KJ
+
+
+def map_caption() -> str:
+    """Return what a difference map shows."""
+    rare, often = DIFFERENCE_COLOURS
+    return f"Candidate minus reference: {rare} where the candidate comes too rarely, {often} where too often"
+
+
+def _map_note(temperature_k: float) -> str:
+    """Return what stands below a row of maps."""
+    return (
+        f"Free energy in kJ/mol at {temperature_k:.0f} K above the deepest bin, up to {MAP_MAX_KJ:.0f} kJ/mol, 50 × 50 "
+        "bins; what was never visited is left empty. In the difference, bins with fewer than 5 counts are left empty "
+        "and bins that only one of the two visits stand at the end of the scale."
+    )
+
+
+def paint_map(
+    figure: Any,
+    axes: Any,
+    values: FloatArray,
+    colours: str,
+    limits: tuple[float, float],
+    step: float,
+    extent: tuple[float, float, float, float],
+) -> None:
+    """Paint `values (n_x, n_y)` kJ/mol over `extent` (left, right, bottom, top) with a colour bar; NaN stays empty."""
+    axes.set_facecolor(EMPTY)
+    image = axes.imshow(
+        values.T,
+        origin="lower",
+        extent=extent,
+        aspect="auto",
+        cmap=_visible(colours),
+        vmin=limits[0],
+        vmax=limits[1],
+        interpolation="nearest",
+    )
+    bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
+    bar.outline.set_visible(False)
+    bar.set_ticks(np.arange(limits[0], limits[1] + 0.5 * step, step).tolist())
+    bar.ax.set_title("kJ/mol", fontsize=8, pad=5)
+
+
+def histogram(data: Histogram) -> str:
+    """Return the three densities as steps."""
+    scale = 180.0 / math.pi if data.unit == "rad" else 1.0
+
+    def paint(figure: Any, axes: Any) -> None:
+        for values, colour, style in (
+            (data.reference, TEXT, "solid"),
+            (data.replicate, REPLICATE, (0, (4, 2))),
+            (data.candidate, CANDIDATE, "solid"),
+        ):
+            axes.stairs(
+                values / scale,
+                data.edges * scale,
+                color=colour,
+                linestyle=style,
+                linewidth=1.4,
+                baseline=None,
+            )
+        axes.set_xlim(data.edges[0] * scale, data.edges[-1] * scale)
+        axes.set_ylim(bottom=0)
+        if data.unit == "rad":
+            _degrees(axes, both=False)
+        unit = "°" if data.unit == "rad" else data.unit
+        axes.set_xlabel(textwrap.fill(f"{data.label} / {unit}" if unit else data.label, _LABEL_WIDTH))
+        axes.set_ylabel("density")
+        axes.set_yticks([])
+
+    return draw(f"Distribution of {data.label}", CURVE_SIZE, paint)
+
+
+def draw_chart(chart: Chart, temperature_k: float) -> list[Figure]:
+    """Return the pictures of one chart: four maps for a landscape, one for anything else."""
+    if isinstance(chart, Landscape):
+        return _landscape(chart, temperature_k)
+    if isinstance(chart, Histogram):
+        outside = chart.outside[1]
+        beyond = f"; {100 * outside:.2g} % of the candidate's frames lie outside" if outside > 0 else ""
+        return [Figure(histogram(chart), f"Distribution of {chart.label}{beyond}")]
+    if isinstance(chart, BarChart):
+        shown = f"The first {_MAX_NAMES} of {len(chart.names)}." if len(chart.names) > _MAX_NAMES else ""
+        return [Figure(_bars(chart), _caption(chart.title, " ".join(filter(None, (chart.caption, shown)))))]
+    return [Figure(_lines(chart), _caption(chart.title, chart.caption))]
+
+
+def _caption(title: str, caption: str) -> str:
+    return f"{title}: {caption}" if caption else title
+
+
+def _lines(chart: LineChart) -> str:
+    def paint(figure: Any, axes: Any) -> None:
+        # Of dots those drawn last are seen best.
+        for line in sorted(chart.lines, key=lambda x: x.role != "replicate") if chart.dots else chart.lines:
+            colour, dash = _COLOURS[line.role], _DASHES[line.role]
+            if line.low is not None and line.high is not None:
+                axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.17, linewidth=0)
+            if chart.dots:
+                axes.plot(line.x, line.y, color=colour, linestyle="none", marker=".", markersize=2.2, alpha=0.75)
+                continue
+            marker = "o" if line.role != "other" and np.count_nonzero(np.isfinite(line.y)) <= 12 else None
+            axes.plot(line.x, line.y, color=colour, linestyle=dash, marker=marker, markersize=3)
+        if chart.log_x:
+            axes.set_xscale("log")
+            _plain_ticks(axes.xaxis, axes.get_xlim())
+        if chart.log_y:
+            axes.set_yscale("log")
+            _plain_ticks(axes.yaxis, axes.get_ylim())
+        axes.set_xlabel(chart.x_label)
+        axes.set_ylabel(chart.y_label)
+        axes.margins(x=0.01)
+        _name_guides(axes, [line for line in chart.lines if line.role == "other"])
+
+    return draw(chart.title, CURVE_SIZE, paint)
+
+
+def _plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+    """Label a logarithmic axis with plain numbers: decades, or 1-2-5, or even steps where it spans less than three."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+    factor = limits[1] / limits[0]
+    if factor < 3:
+        axis.set_major_locator(MaxNLocator(4))
+        axis.set_minor_locator(NullLocator())
+    elif factor < 300:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if factor < 30 else (1.0, 3.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _name_guides(axes: Any, lines: Sequence[Line]) -> None:
+    """Write the name of each guide line, up to a comma, at its end, except where it would run into another name."""
+    taken: list[float] = []
+    for line in lines:
+        finite = np.flatnonzero(np.isfinite(line.y))
+        if not line.name or not len(finite):
+            continue
+        x, y = line.x[finite[-1]], line.y[finite[-1]]
+        height = float(axes.transAxes.inverted().transform(axes.transData.transform((x, y)))[1])
+        if all(abs(height - other) > _NAME_HEIGHT for other in taken):
+            taken.append(height)
+            axes.annotate(
+                line.name.partition(",")[0],
+                (x, y),
+                xytext=(-4, 4),
+                textcoords="offset points",
+                ha="right",
+                fontsize=7,
+                bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 0.4},
+            )
+
+
+def short_name(name: str) -> str:
+    """Return a name in at most two lines that leave a narrow picture room for what they name; what is cut off ends in
+    an ellipsis."""
+    lines = textwrap.wrap(name, _NAME_WIDTH, max_lines=2, placeholder=" …")
+    return "\n".join(lines) if len(name) > _NAME_WIDTH else name
+
+
+def _bars(chart: BarChart) -> str:
+    """Dots with error bars, one row per name: the names stay legible where upright bars would have to turn them."""
+    names = [short_name(name) for name in chart.names[:_MAX_NAMES]]
+    n = len(names)
+    height = 0.36 if any("\n" in name for name in names) else 0.24
+    series = (
+        (chart.reference, chart.reference_low, chart.reference_high, TEXT, "o", -0.2),
+        (chart.candidate, chart.candidate_low, chart.candidate_high, CANDIDATE, "s", 0.0),
+        (chart.replicate, None, None, REPLICATE, "D", 0.2),
+    )
+
+    def paint(figure: Any, axes: Any) -> None:
+        for values, low, high, colour, marker, shift in series:
+            if values is None:
+                continue
+            at = np.arange(n) + shift
+            if low is not None and high is not None:
+                axes.hlines(at, low[:n], high[:n], color=colour, linewidth=1.2)
+            axes.plot(values[:n], at, linestyle="none", marker=marker, markersize=3.5, color=colour)
+        axes.set_yticks(range(n), labels=names, fontsize=7 if height > 0.3 else 9)
+        axes.set_ylim(n - 0.5, -0.5)
+        axes.set_xlabel(chart.y_label)
+        axes.grid(axis="y", color=LINE, linewidth=0.4)
+
+    return draw(chart.title, (CURVE_SIZE[0], max(1.2, 0.6 + height * n)), paint)
+
+
+def energy_map(
+    title: str,
+    energy_kj: FloatArray,
+    edges: tuple[FloatArray, FloatArray],
+    labels: tuple[str, str],
+    colours: str = "viridis_r",
+    limits: tuple[float, float] = (0.0, MAP_MAX_KJ),
+) -> str:
+    """Return one map of energies `(n_x, n_y)` kJ/mol over x and y; NaN stays empty."""
+    box = (float(edges[0][0]), float(edges[0][-1]), float(edges[1][0]), float(edges[1][-1]))
+
+    def paint(figure: Any, axes: Any) -> None:
+        paint_map(figure, axes, energy_kj, colours, limits, (limits[1] - limits[0]) / 4, box)
+        in_degrees = labels[0].endswith("°")
+        if in_degrees:
+            _degrees(axes, both=True)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1], labelpad=-5 if in_degrees else None)
+
+    return draw(title, MAP_SIZE, paint)
+
+
+def _landscape(chart: Landscape, temperature_k: float) -> list[Figure]:
+    where = (chart.x_edges, chart.y_edges), (chart.x_label, chart.y_label)
+    out = []
+    for caption, counts in zip(chart.captions, (chart.reference, chart.candidate, chart.replicate), strict=True):
+        energy = np.clip(free_energy_kj(counts, temperature_k), 0.0, MAP_MAX_KJ)
+        out.append(Figure(energy_map(f"{caption}, {chart.title}", energy, *where), caption))
+    change, limit = difference_kj(chart.reference, chart.candidate, temperature_k)
+    title = f"Candidate minus reference, {chart.title}"
+    out.append(Figure(energy_map(title, change, *where, "PuOr_r", (-limit, limit)), map_caption()))
+    return out
+
+
+class Album(NamedTuple):
+    """Pictures under one heading; `note` says below them what they show, or what is only in the JSON."""
+
+    title: str
+    figures: list[Figure]
+    note: str
+
+
+def albums(charts: Sequence[Chart], temperature_k: float) -> list[Album]:
+    """Return the charts of one candidate by section, landscapes each by themselves; of a long series the first."""
+    out: list[Album] = []
+    note = _map_note(temperature_k)
+    for section, title in _TITLES.items():
+        mine = [c for c in charts if c.section == section]
+        # A landscape is a row of maps; the last is that of TICA.
+        landscapes = [c for c in mine if isinstance(c, Landscape)]
+        shown = [*landscapes[:_MOST_MAPS], *landscapes[_MOST_MAPS:][-1:]]
+        out += [Album(c.title, draw_chart(c, temperature_k), note) for c in shown]
+        others = [c for c in mine if not isinstance(c, Landscape)]
+        drawn = [figure for chart in others[:_MOST_CHARTS] for figure in draw_chart(chart, temperature_k)]
+        n_left = max(len(others) - _MOST_CHARTS, 0)
+        if drawn:
+            out.append(Album(title, drawn, f"{n_left} more stand in the JSON file." if n_left else ""))
+    return out

@@ -1,0 +1,160 @@
+"""Charts as plain numbers: what any room of metrics hands to the report, which draws each by its type.
+
+A room computes, the report draws: nothing here knows colours or pixels, and all of it goes into the JSON as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, is_dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from surrogate.comparison.measure.statistics import Estimate
+
+FloatArray = npt.NDArray[np.float64]
+
+Section = Literal["structure", "distributions", "kinetics", "forecast", "validity", "equivalent_time"]
+Role = Literal["reference", "candidate", "replicate", "other"]
+ROLES: tuple[Role, Role, Role] = ("reference", "candidate", "replicate")
+
+
+class Curve:
+    """Base of the records below."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values, and under "type" which chart it is."""
+        return {name: jsonable(value) for name, value in vars(self).items()} | {"type": type(self).__name__}
+
+
+def jsonable(value: Any) -> Any:
+    """Return JSON-able values of dataclasses, arrays (six digits) and numbers; what is not finite becomes None."""
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {name: jsonable(x) for name, x in vars(value).items()}
+    if isinstance(value, dict):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(x) for x in value]
+    if isinstance(value, np.ndarray):
+        return jsonable([float(f"{x:.6g}") for x in value] if value.ndim == 1 else list(value))
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if not isinstance(value, float) or math.isfinite(value) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram(Curve):
+    """Densities of one quantity over `edges` `(n + 1,)`; `outside` is the share beyond the range or not finite."""
+
+    label: str
+    unit: str
+    edges: FloatArray
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray
+    outside: tuple[float, float, float]
+    section: Section = "distributions"
+
+
+@dataclass(frozen=True, eq=False)
+class Line(Curve):
+    """One line of a chart: `x` and `y` `(n,)`, NaN in gaps, with a 95 % band where `low` and `high` are given.
+
+    `role` gives the colour; lines that are neither of the three (a baseline, a guide) are "other".
+    """
+
+    name: str
+    role: Role
+    x: FloatArray
+    y: FloatArray
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LineChart(Curve):
+    """Lines over one pair of axes; labels carry their units ("lag / ps"), `caption` says what is seen.
+
+    `dots`: a dot for each number instead of strokes between them, where lines would hide each other.
+    """
+
+    section: Section
+    title: str
+    caption: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    log_x: bool = False
+    log_y: bool = False
+    dots: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape(Curve):
+    """Counts `(n_x, n_y)` over two coordinates, drawn as free energies: φ and ψ of a residue, or two TICs.
+
+    `x_edges` `(n_x + 1,)`, `y_edges` `(n_y + 1,)`; `captions` below the maps of reference, candidate and replicate.
+    """
+
+    section: Section
+    title: str
+    x_label: str
+    y_label: str
+    x_edges: FloatArray
+    y_edges: FloatArray
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray
+    captions: tuple[str, str, str] = ("Reference", "Candidate", "Replicate")
+
+
+@dataclass(frozen=True, eq=False)
+class BarChart(Curve):
+    """One number per name and role, `(n,)`, with 95 % intervals `*_low`, `*_high` where they are given."""
+
+    section: Section
+    title: str
+    caption: str
+    y_label: str
+    names: tuple[str, ...]
+    reference: FloatArray
+    candidate: FloatArray
+    replicate: FloatArray | None = None
+    reference_low: FloatArray | None = None
+    reference_high: FloatArray | None = None
+    candidate_low: FloatArray | None = None
+    candidate_high: FloatArray | None = None
+
+
+def bar_chart(
+    section: Section, title: str, caption: str, y_label: str, names: Sequence[str], made: Sequence[Sequence[Estimate]]
+) -> BarChart:
+    """Return the chart of numbers with their 95 % intervals; `made`: of (reference, candidate, replicate), one estimate
+    for each name, in the unit of `y_label`. Intervals of shares in % end at 0 and 100."""
+
+    def pick(which: int, name: str) -> FloatArray:
+        found = np.array([getattr(e, name) for e in made[which]], dtype=np.float64)
+        return np.clip(found, 0.0, 100.0) if y_label.endswith("/ %") else found
+
+    return BarChart(
+        section=section,
+        title=title,
+        caption=caption,
+        y_label=y_label,
+        names=tuple(names),
+        reference=pick(0, "value"),
+        candidate=pick(1, "value"),
+        replicate=pick(2, "value"),
+        reference_low=pick(0, "low"),
+        reference_high=pick(0, "high"),
+        candidate_low=pick(1, "low"),
+        candidate_high=pick(1, "high"),
+    )
+
+
+Chart = LineChart | Landscape | BarChart | Histogram

@@ -1,0 +1,259 @@
+"""From numbers to words: is each metric as a replicate's, within tolerance, wrong; one sentence for the whole; and the
+three lines on top of a report: use it or not, for what, why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+from surrogate.comparison.measure.statistics import holm
+from surrogate.comparison.rows.rows import UNLIKE_BELOW, Group, Options, Row, Word
+from systems.chemistry import validity
+
+Status = Literal["indistinguishable", "close", "different", "broken", "undecided"]
+
+_FAILS_AT = 10.0
+_SHARE_SIGNIFICANCE = 0.01
+_SEVERITY: dict[Word, int] = {"fails": 3, "differs": 2, "close": 1, "agrees": 0, "undecided": 0}
+_MENTIONED = 3
+FINITE_KEY, STRAINED_KEY = f"valid:{validity.NOT_FINITE}", f"valid:{validity.BOND_20_PERCENT}"
+ALL_KEY = "valid:all"
+_WHAT: dict[Group, str] = {
+    "validity": "single structures",
+    "structure": "bonds, angles, shape and contacts",
+    "populations": "populations of states",
+    "distributions": "distributions and free energies of torsions",
+    "kinetics": "relaxation times and rates",
+}
+_MENTIONED_WHY = 2
+_GOOD, _BAD = ("agrees", "close"), ("differs", "fails")
+
+
+class Cautions(NamedTuple):
+    """Why a verdict must wait, in words, empty where it need not: `short` for slow motion sampled too little for
+    anything to agree, `apart` for states between which hardly any run passes, so that a difference says nothing,
+    `copied` for frames that are the reference's own, `start` for a reference that depends on where it started."""
+
+    short: str = ""
+    apart: str = ""
+    copied: str = ""
+    start: str = ""
+
+
+SURE = Cautions()
+
+
+def evaluated_rows(rows: Sequence[Row], options: Options) -> tuple[Row, ...]:
+    """Return the rows with corrected p-values and a word each.
+
+    agrees: no significant difference (5 % over all rows, Holm), and a difference beyond the tolerance would have shown;
+    close: significant, but within the tolerance; differs: significant and beyond it; fails: not computable where the
+    reference is, or a validity check missed tenfold; undecided: the error bars are wider than the tolerance.
+    """
+    corrected = holm([math.nan if r.form == "share" else r.p_value for r in rows])
+    evaluated = [
+        replace(row, p_corrected=p, verdict=_word(row, p, options.significance))
+        for row, p in zip(rows, corrected, strict=True)
+    ]
+    hard = [r.verdict for r in evaluated if r.form == "share" and r.key not in (ALL_KEY, STRAINED_KEY)]
+    worst: Word = max(hard, key=lambda word: _SEVERITY[word], default="agrees")
+    return tuple(replace(r, verdict=worst) if r.key == ALL_KEY else r for r in evaluated)
+
+
+def _word(row: Row, p: float, significance: float) -> Word:
+    if row.form == "share":
+        return _share_word(row)
+    value = row.candidate.value
+    if not math.isfinite(value):
+        known = row.reference is None or math.isfinite(row.reference.value)
+        return "fails" if known else "undecided"
+    if not math.isfinite(p):
+        return "undecided"
+    within = _within_tolerance(row)
+    if p < significance and not _beats_replicate(row):
+        return "close" if within else "differs"
+    if row.form == "distance":
+        return "agrees" if within else "undecided"
+    return "agrees" if _resolution(row) <= row.tolerance else "undecided"
+
+
+def _beats_replicate(row: Row) -> bool:
+    """Whether a distance is no greater than the replicate's own: nothing is off by it."""
+    return row.form == "distance" and row.ratio is not None and row.ratio.value <= 1.0
+
+
+def _within_tolerance(row: Row) -> bool:
+    """A distance is held against the replicate baseline (or a bound, where it has no ratio), a number against the
+    reference's."""
+    if row.form == "distance":
+        measured = row.candidate.value if row.ratio is None else row.ratio.value
+        return measured <= row.tolerance
+    if row.reference is None:
+        return False
+    return abs(row.candidate.value - row.reference.value) <= row.tolerance
+
+
+def _resolution(row: Row) -> float:
+    """The difference that this much data could just have shown: 1.96 combined standard errors."""
+    if row.reference is None:
+        return math.nan
+    combined = math.hypot(row.reference.error, row.candidate.error)
+    if combined == 0.0 and row.tolerance == 0.0:
+        return math.inf
+    return 1.96 * combined
+
+
+def _share_word(row: Row) -> Word:
+    failing = 100.0 - row.candidate.value
+    others = [100.0 - e.value for e in (row.reference, row.replicate) if e is not None]
+    excess = failing - max(others, default=0.0)
+    if not math.isfinite(excess):
+        return "fails"
+    # Where thermal motion cannot reach, p is NaN: no fault is put down to chance.
+    if excess <= 1e-9 or row.p_value > _SHARE_SIGNIFICANCE:
+        return "agrees"
+    if excess <= row.tolerance:
+        return "close"
+    return "differs" if excess <= _FAILS_AT * row.tolerance else "fails"
+
+
+def untested(rows: Sequence[Row], *, start: bool = False) -> list[Row]:
+    """Return the rows of a comparison too short to test what follows the slow motion: those rows without a p-value.
+
+    What is left is fast (frames that are no molecule, bonds, angles, steps, what moves within a state). What moves
+    within a state is not, where the reference and its replicate differ by it: there a state they do not share, such as
+    another rotamer beside it, is as good a reason as a wrong. Of a reference that depends on its `start` both share
+    that, and what moves within a state is left out, but for steps from frame to frame.
+    """
+
+    def tested(row: Row) -> bool:
+        if row.time_scale == "slow" or (start and row.time_scale == "within states"):
+            return False
+        return row.time_scale == "fast" or not row.p_replicate < UNLIKE_BELOW
+
+    return [r if tested(r) else replace(r, p_value=math.nan, p_replicate=math.nan) for r in rows]
+
+
+def status(rows: Sequence[Row], cautions: Cautions = SURE) -> Status:
+    """Return the word for the whole: that of the worst row; undecided when most statistical rows are, or by `doubts`.
+
+    Frames that are no molecule are so whatever the cautions are."""
+    words = [r.verdict for r in rows]
+    if "fails" in words:
+        return "broken"
+    if cautions.copied:
+        return "undecided"
+    if cautions.apart and not any(r.verdict == "differs" and r.kind == "validity" for r in rows):
+        return "undecided"
+    if "differs" in words:
+        return "different"
+    statistical = [r.verdict for r in rows if r.form != "share"]
+    if cautions.short or cautions.start:
+        return "undecided"
+    if statistical and statistical.count("undecided") > 0.5 * len(statistical):
+        return "undecided"
+    return "close" if "close" in words else "indistinguishable"
+
+
+def findings(rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return what is wrong, worst first; within one severity validity first, then by how far beyond the tolerance."""
+    bad = [r for r in rows if _SEVERITY[r.verdict] > 0 and r.key != ALL_KEY and r.statement]
+    # Beside what is wrong, what is within its tolerance is no finding.
+    if any(_SEVERITY[r.verdict] > _SEVERITY["close"] for r in bad):
+        bad = [r for r in bad if r.verdict != "close"]
+    bad.sort(key=lambda r: (-_SEVERITY[r.verdict], r.key != FINITE_KEY, r.kind != "validity", -_excess(r)))
+    return tuple(r.statement for r in bad)
+
+
+def replicate_differs(rows: Sequence[Row], options: Options) -> tuple[str, ...]:
+    """Return the metrics in which reference and replicate differ from each other (Holm over all rows)."""
+    corrected = holm([math.nan if r.form == "share" else r.p_replicate for r in rows])
+    return tuple(r.metric for r, p in zip(rows, corrected, strict=True) if p < options.significance)
+
+
+def _excess(row: Row) -> float:
+    """How many tolerances off."""
+    value = row.candidate.value
+    if not math.isfinite(value):
+        return math.inf
+    if row.form == "distance":
+        off = value if row.ratio is None else row.ratio.value - 1.0
+    else:
+        off = abs(value - (100.0 if row.form == "share" or row.reference is None else row.reference.value))
+    return off / row.tolerance if row.tolerance > 0 else off
+
+
+def sentence(rows: Sequence[Row], found: Sequence[str], compared: str, cautions: Cautions = SURE) -> str:
+    """Return the verdict in one or two sentences; `compared` is the compared length in words."""
+    kind = status(rows, cautions)
+    n = len(rows)
+    undecided = sum(r.verdict == "undecided" for r in rows)
+    worst = "; ".join(found[:_MENTIONED])
+    more = f" (and {len(found) - _MENTIONED} more)" if len(found) > _MENTIONED else ""
+    tail = ""
+    if undecided:
+        tail = f" {undecided} of {n} metrics cannot be decided: their error bars are wider than the tolerances."
+    if kind == "broken":
+        return f"Broken: {worst}{more}.{tail}"
+    if kind == "different":
+        return f"Differs from reference MD over {compared}: {worst}{more}.{tail}"
+    if kind == "close":
+        n_close = sum(r.verdict == "close" for r in rows)
+        verb = "differs" if n_close == 1 else "differ"
+        return (
+            f"Close to reference MD over {compared}: {n_close} of {n} metrics {verb} measurably, each within its "
+            f"tolerance: {worst}{more}.{tail}"
+        )
+    if kind == "undecided":
+        why = "; ".join(filter(None, reversed(cautions))) or "the error bars are wider than the tolerances"
+        all_the_same = f" Significant as it stands: {worst}{more}." if found else ""
+        return f"Undecided over {compared}: {why}.{all_the_same}{tail}"
+    return (
+        f"Indistinguishable from reference MD over {compared}: none of {n - undecided} metrics differs significantly "
+        f"from it.{tail}"
+    )
+
+
+def in_short(
+    rows: Sequence[Row], status: Status, findings: Sequence[str], cautions: Cautions = SURE, equivalent_time: str = ""
+) -> tuple[str, str, str]:
+    """Return the three lines: whether to use the trajectory in place of reference MD, for what, and why."""
+    good, bad, unknown = _sorted(rows)
+    why = "; ".join(findings[:_MENTIONED_WHY])
+    for_what = f"Right: {_listed(good) or 'nothing that could be tested'}."
+    for_what += f" Wrong: {_listed(bad)}." if bad else ""
+    for_what += f" Not known: {_listed(unknown)}." if unknown else ""
+    ends = f" {equivalent_time}" if equivalent_time else ""
+    if status == "broken":
+        return "Do not use it.", "For nothing: frames are no molecules, or do not move as one.", f"Why: {why}."
+    if status == "undecided":
+        reason = next(filter(None, reversed(cautions)), "the error bars are wider than what would matter")
+        return "Not known yet whether it can be used.", for_what, f"Why: {reason}.{ends}"
+    if status == "different":
+        waits = f" What is not known waits: {cautions.start}." if cautions.start else ""
+        return "Do not use it for what is wrong in it.", for_what, f"Why: {why}.{waits}{ends}"
+    if status == "close":
+        return "Use it within its tolerances.", for_what, f"Why: {why}, each within its tolerance.{ends}"
+    return "Use it.", for_what, f"Why: nothing measured differs from reference MD by more than chance.{ends}"
+
+
+def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
+    """Return what is right, what is wrong and what is not known, by the words of each group's rows."""
+    good, bad, unknown = [], [], []
+    for group, name in _WHAT.items():
+        words = [r.verdict for r in rows if r.group == group and r.key != ALL_KEY]
+        if not words:
+            continue
+        if any(w in _BAD for w in words):
+            bad.append(name)
+        elif 2 * sum(w in _GOOD for w in words) >= len(words):
+            good.append(name)
+        else:
+            unknown.append(name)
+    return good, bad, unknown
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -1,0 +1,118 @@
+"""The peptide papers' recipe against scipy and deeptime called directly, on real frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.distance import jensenshannon
+
+from surrogate.comparison.comparison import Evaluation, compare
+from surrogate.comparison.measure import structure
+from surrogate.comparison.measure.structure import Features
+from surrogate.comparison.read.ensemble import Ensemble, load_ensemble
+from surrogate.comparison.rows import peptide_protocol
+from surrogate.comparison.rows.rows import Options
+from systems.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def real(shared_data: Path, alanine_dipeptide: Scene) -> tuple[Features, Features]:
+    folder = shared_data / "alanine-dipeptide"
+
+    def load(number: int) -> Ensemble:
+        files = [folder / f"trajectory-{number}.dcd"]
+        return load_ensemble(files, template=alanine_dipeptide, top=folder / "ala2.pdb", lag_ps=1.0)
+
+    first, second = load(1), load(2)
+    baseline = structure.Baseline.of(first, probing=False)
+    found = [baseline.measure(e) for e in (first, second)]
+    return found[0], found[1]
+
+
+def test_the_table_equals_scipy_and_deeptime(real: tuple[Features, Features]) -> None:
+    from deeptime.decomposition import TICA
+
+    reference, other = real
+    fit = peptide_protocol.fit_recipe(reference)
+    assert fit is not None and fit.model is not None
+    table = peptide_protocol.peptide_table(fit, reference, other)
+
+    def column(features: Features, name: str) -> np.ndarray:
+        return np.concatenate([x[:, 0] for x in getattr(features, name)]).astype(float)
+
+    edges = np.linspace(-np.pi, np.pi, 101)
+    apart = [
+        jensenshannon(*(np.histogram(column(f, name), bins=edges)[0] for f in (reference, other)))
+        for name in ("phi", "psi")
+    ]
+    assert table.backbone == pytest.approx(np.mean(apart), abs=1e-9)
+    assert math.isnan(table.side_chain) and table.all_torsions == table.backbone
+
+    def features(f: Features) -> np.ndarray:
+        phi, psi = column(f, "phi"), column(f, "psi")
+        return np.stack([np.cos(phi), np.sin(phi), np.cos(psi), np.sin(psi)], axis=1)
+
+    model = TICA(lagtime=100, scaling="kinetic_map").fit(features(reference)).fetch_model()
+    p, q = (model.transform(features(f)) for f in (reference, other))
+    low, high = np.minimum(p.min(0), q.min(0)), np.maximum(p.max(0), q.max(0))
+    one = [np.histogram(x[:, 0], bins=100, range=(low[0], high[0]))[0] for x in (p, q)]
+    assert table.tica_0 == pytest.approx(jensenshannon(*one), abs=0.004)
+    two = [np.histogram2d(x[:, 0], x[:, 1], bins=50, range=list(zip(low[:2], high[:2])))[0].ravel() for x in (p, q)]
+    assert table.tica_01 == pytest.approx(jensenshannon(*two), abs=0.01)
+    assert 0 < table.msm < 0.3
+
+
+def test_a_trajectory_has_no_distance_to_itself(real: tuple[Features, Features]) -> None:
+    reference, other = real
+    fit = peptide_protocol.fit_recipe(reference)
+    assert fit is not None
+    assert np.nan_to_num(peptide_protocol.peptide_table(fit, reference, reference).values()) == pytest.approx(
+        np.zeros(6), abs=1e-7
+    )
+    shifted = Features(**{**vars(other), "psi": [x + np.float32(0.5) for x in other.psi]})
+    wrong = peptide_protocol.peptide_table(fit, reference, shifted)
+    right = peptide_protocol.peptide_table(fit, reference, other)
+    assert (wrong.values()[[0, 2, 3, 4]] > 1.5 * right.values()[[0, 2, 3, 4]]).all(), "negative control"
+
+
+def test_candidates_of_one_length_share_what_is_fitted_on_the_reference(
+    simulate: Callable[..., Ensemble], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    fit_recipe = peptide_protocol.fit_recipe
+
+    def counted(reference: Features) -> peptide_protocol.Fit | None:
+        made.append(reference.n_frames)
+        return fit_recipe(reference, n_clusters=12, n_states=3)
+
+    def distances(evaluation: Evaluation) -> list[float]:
+        (bars,) = (c for c in evaluation.charts if getattr(c, "title", "") == "By the peptide papers' recipe")
+        return list(bars.to_dict()["candidate"])
+
+    monkeypatch.setattr(peptide_protocol, "fit_recipe", counted)
+    quick = Options(n_bootstrap=30, n_permutations=20)
+    reference, one, other, replicate = (simulate(80 + k, 1200) for k in range(4))
+    shorter = replace(other, segments=[other.segments[0][:1100]])
+    _, found, short = compare(reference, [one, other, shorter], replicate, options=quick).evaluations
+    assert made == [1200, 1100]
+    assert distances(found) == distances(compare(reference, [other], replicate, options=quick).evaluations[0])
+    assert distances(found) != distances(short)
+
+
+def test_decorrelation_of_a_torsion_that_diffuses_about_a_mean() -> None:
+    """A Gaussian angle of variance s^2 and correlation c: exactly (exp(s^2 c) - 1) / (exp(s^2) - 1)."""
+    rng = np.random.default_rng(0)
+    a, s = 0.95, 0.7
+    kicks = rng.standard_normal((2, 200_000)) * math.sqrt(1 - a * a)
+    angles = [1.0 + s * x for x in lfilter([1.0], [1.0, -a], kicks, axis=1)]
+    found = peptide_protocol.decorrelation(angles, 60)
+    exact = (np.exp(s**2 * a ** np.arange(60.0)) - 1) / (np.exp(s**2) - 1)
+    assert found[0] == pytest.approx(1.0)
+    assert found == pytest.approx(exact, abs=0.02)
+    assert np.isnan(peptide_protocol.decorrelation([np.full(100, 0.3)], 5)).all()

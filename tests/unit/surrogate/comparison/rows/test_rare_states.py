@@ -1,0 +1,86 @@
+"""Rare states of MD: counted by visits, evaluated as free energies, left out of maps; and models that miss are
+caught."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+
+from surrogate.comparison import comparison
+from surrogate.comparison.measure.distributions import RAMACHANDRAN_BINS, TORSION_BINS
+from surrogate.comparison.read.ensemble import Ensemble
+from surrogate.comparison.rows.rows import Options
+from surrogate.comparison.rows.torsion_rows import Visits, visits_of, visits_p, without_positive_phi
+
+Simulate = Callable[..., Ensemble]
+# The published recipe takes half of the time here, and no verdict rests on it.
+compare = partial(comparison.compare, options=Options(peptide_recipe=False))
+
+
+def entered(per_frame: float) -> np.ndarray:
+    """The toy's chain with phi > 0 entered so often, and left after 50 frames on average."""
+    chain = np.array([[0.88, 0.12, 0.0], [0.17, 0.83, 0.0], [0.01, 0.01, 0.98]])
+    chain[:2, 2] = per_frame
+    chain[0, 0] -= per_frame
+    chain[1, 1] -= per_frame
+    return chain
+
+
+def test_visits_begin_in_the_core_and_end_in_the_other() -> None:
+    degrees = [-80, -5, 5, -60, 10, 60, 5, -10, 70, -15, -90, -170, 175, -80, 50]
+    found = visits_of([np.radians(degrees), np.radians([55.0, 60.0]), np.radians([-60.0, 15.0])])
+    assert found == Visits(visits=3, inside=8, n_frames=19)
+
+
+def test_visits_are_compared_by_the_lengths_of_their_trajectories() -> None:
+    assert visits_p(Visits(0, 0, 1000), Visits(8, 90, 1000)) == pytest.approx(2 * 0.5**8)
+    assert visits_p(Visits(2, 0, 1000), Visits(8, 90, 4000)) == pytest.approx(1.0)
+    assert math.isnan(visits_p(Visits(0, 0, 1000), Visits(0, 0, 1000)))
+
+
+def test_maps_lose_the_bins_of_positive_phi_alone() -> None:
+    phi, psi = np.radians([-100.0, -3.0, 3.0, 170.0, np.nan]), np.radians([10.0, -170.0, 20.0, 20.0, 0.0])
+    wide = TORSION_BINS.n_total
+    counts = np.bincount(TORSION_BINS.index(phi), minlength=wide)[None]
+    left = without_positive_phi(counts, TORSION_BINS.n)
+    assert left.sum() == 3 and counts.sum() == 5
+    wide = RAMACHANDRAN_BINS.n_total
+    joint = RAMACHANDRAN_BINS.index(phi) * wide + RAMACHANDRAN_BINS.index(psi)
+    counts = np.bincount(joint, minlength=wide**2)[None]
+    left = without_positive_phi(counts, RAMACHANDRAN_BINS.n)
+    assert np.flatnonzero(left).tolist() == sorted(joint[[0, 1, 4]].tolist())
+
+
+def test_runs_of_one_simulation_agree_however_often_they_met_a_rare_state(simulate: Simulate) -> None:
+    seldom = entered(4e-4)
+    runs = [simulate(seed, 6000, transitions=seldom) for seed in range(6)]
+    met = set()
+    for k in range(0, 6, 3):
+        found = compare(runs[k], [runs[k + 1]], runs[k + 2]).evaluations[0]
+        row = found.row("free_energy:φ > 0")
+        assert row.verdict in ("agrees", "undecided"), row.statement
+        assert row.candidate.low < math.log(49) < row.candidate.high, "4e-4 * 50 of the time"
+        assert not [r.key for r in found.rows if r.verdict == "differs"], found.findings
+        assert "at φ < 0" in found.row("joint_jsd").metric and "at φ < 0" in found.row("phi_jsd").metric
+        met.add(row.candidate.value)
+    assert len(met) == 2
+
+
+@pytest.mark.parametrize(("per_frame", "said"), [(0.008, "visited"), (0.0, "never visited")])
+def test_a_state_met_much_too_often_or_never_is_named(simulate: Simulate, per_frame: float, said: str) -> None:
+    seldom = entered(8e-4)
+    reference, replicate = simulate(1, 5000, transitions=seldom), simulate(2, 5000, transitions=seldom)
+    wrong = simulate(3, 40_000, transitions=entered(per_frame))
+    found = compare(reference, [wrong], replicate).evaluations[0]
+    assert found.row("free_energy:φ > 0").verdict == "differs"
+    assert any(f"φ > 0 of ALA 2 is {said}" in f for f in found.findings), found.findings
+
+
+def test_a_state_met_often_keeps_its_share_and_its_place_in_the_map(simulate: Simulate) -> None:
+    found = compare(simulate(1), [simulate(2)], simulate(3)).evaluations[0]
+    assert found.row("population:φ > 0").unit == "%"
+    assert found.row("joint_jsd").metric == "Joint φ/ψ distance, ALA 2"

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogate.comparison.markov import equilibrium
+from systems.errors import InputError
+
+# Three states in a row, of populations .6, .3 and .1; a jump in some 200 frames.
+POPULATIONS = np.array([0.6, 0.3, 0.1])
+
+
+def chain(populations: np.ndarray = POPULATIONS, rate: float = 0.01) -> np.ndarray:
+    """A reversible matrix of neighbours, by Metropolis."""
+    n = len(populations)
+    matrix = np.zeros((n, n))
+    for i in range(n - 1):
+        matrix[i, i + 1] = rate * min(1.0, populations[i + 1] / populations[i])
+        matrix[i + 1, i] = rate * min(1.0, populations[i] / populations[i + 1])
+    return matrix + np.diag(1.0 - matrix.sum(1))
+
+
+def run(matrix: np.ndarray, starts: list[int], n_frames: int, seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    state = np.array(starts)
+    cumulative = matrix.cumsum(1)
+    out = np.empty((len(starts), n_frames), dtype=np.int64)
+    for t in range(n_frames):
+        out[:, t] = state
+        state = (rng.random(len(starts))[:, None] > cumulative[state]).sum(1)
+    return list(out)
+
+
+def averages(micro: list[np.ndarray], n: int = 3) -> np.ndarray:
+    return np.bincount(np.concatenate(micro), minlength=n) / sum(map(len, micro))
+
+
+@pytest.mark.parametrize("starts", [[0] * 32, [2] * 32, [0, 1, 2, 2] * 8])
+def test_short_replicas_tell_equilibrium_wherever_they_begin(starts: list[int]) -> None:
+    micro = run(chain(), starts, 300)
+    found = equilibrium(micro, seed=1)
+    error = found.draws.std(0)
+    assert found.method == "Markov model" and found.flat and found.ck_holds
+    assert (np.abs(found.populations - POPULATIONS) < 3.0 * error + 0.01).all()
+    assert error.max() < 0.2
+    # The negative control: their averages are wrong.
+    assert np.abs(averages(micro) - POPULATIONS).max() > 0.05
+
+
+def test_errors_hold_as_often_as_they_say() -> None:
+    inside = []
+    for seed in range(30):
+        found = equilibrium(run(chain(), [0, 1, 2, 2] * 8, 300, seed), seed=seed)
+        inside += (np.abs(found.populations - POPULATIONS) < 2.0 * found.draws.std(0)).tolist()
+    assert np.mean(inside) > 0.85
+
+
+def test_weights_give_the_populations_and_have_mean_one() -> None:
+    micro = run(chain(), [2] * 32, 300)
+    found = equilibrium(micro)
+    weights, labels = np.concatenate(found.weights), np.concatenate(micro)
+    assert weights.mean() == pytest.approx(1.0)
+    assert np.bincount(labels, weights) / weights.sum() == pytest.approx(found.populations)
+    share, draws = found.shares(micro, micro, 3)
+    assert share == pytest.approx(found.populations) and draws.shape == (50, 3)
+
+
+def test_timescales_are_those_of_the_chain() -> None:
+    matrix = chain()
+    exact = -1.0 / np.log(np.sort(np.linalg.eigvals(matrix).real)[-2])
+    found = equilibrium(run(matrix, [0, 1, 2, 2] * 8, 500))
+    assert abs(found.timescales[0] - exact) < 3.0 * found.timescale_errors[0]
+
+
+def test_replicas_that_outlast_the_slowest_process_are_averaged() -> None:
+    micro = run(chain(rate=0.2), [2] * 16, 4000)
+    found = equilibrium(micro)
+    assert found.method == "plain averages"
+    assert np.abs(found.populations - POPULATIONS).max() < 0.02
+    assert found.weights[0][0] == 0.0 and found.weights[0][-1] > 0.0  # its beginning is left out
+
+
+def test_a_state_that_was_only_begun_in_has_no_weight_and_is_named() -> None:
+    matrix = np.eye(4)
+    matrix[:3, :3] = chain()
+    found = equilibrium(run(matrix, [0, 1, 2, 3] * 8, 300))
+    (lost,) = found.unconnected
+    assert lost.fate == "only begun in" and lost.microstates == (3,) and lost.n_replicas == 8
+    assert lost.share == pytest.approx(0.25) and found.populations[3] == 0.0
+    assert found.method == "Markov model"
+
+
+def test_a_state_that_was_invented_is_left_and_has_no_weight() -> None:
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = chain()
+    matrix[3] = [0.02, 0.0, 0.0, 0.98]
+    micro = run(matrix, [3] * 32, 400)
+    found = equilibrium(micro)
+    (lost,) = found.unconnected
+    assert lost.fate == "left and never entered" and found.populations[3] == 0.0
+    assert (np.abs(found.populations[:3] - POPULATIONS) < 3.0 * found.draws.std(0)[:3] + 0.01).all()
+
+
+def test_a_state_that_is_entered_and_never_left_is_said() -> None:
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = chain()
+    matrix[2, 2] -= 0.002
+    matrix[2, 3] = 0.002
+    matrix[3, 3] = 1.0
+    found = equilibrium(run(matrix, [0, 1, 2, 2] * 8, 400))
+    assert {u.fate for u in found.unconnected} == {"entered and never left"}
+
+
+def test_states_that_are_too_coarse_are_found_out() -> None:
+    """Two states in a row of fast and slow ones, seen as two that hide the slow one: no lag in the replicas is flat."""
+    populations = np.array([0.25, 0.25, 0.25, 0.25])
+    matrix = chain(populations, 0.3)
+    matrix[1, 2] = matrix[2, 1] = 0.002
+    matrix[1, 1] = matrix[2, 2] = 1.0 - 0.3 - 0.002
+    hidden = [np.isin(m, (0, 3)).astype(np.int64) for m in run(matrix, [0, 1] * 16, 200)]
+    good = equilibrium(run(matrix, [0, 1, 2, 3] * 8, 400))
+    assert good.timescales[0] > 50.0
+    assert equilibrium(hidden).timescales[0] < 10.0  # nothing tells of what states hide: why features come from TICA
+
+
+def test_nothing_to_count_is_one_line() -> None:
+    with pytest.raises(InputError, match="longer replicas"):
+        equilibrium([np.full(10, -1)])
+
+
+def test_replicas_that_never_change_their_state_tell_no_timescale() -> None:
+    micro = [np.full(80, k % 2, dtype=np.int64) for k in range(16)]
+    found = equilibrium(micro)
+    assert not len(found.timescales) and [u.fate for u in found.unconnected] == ["only begun in"]

@@ -1,0 +1,175 @@
+"""What MD's answer says of alanine dipeptide that jumps between α, β and left-handed as we have it jump."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from surrogate.comparison.markov import equilibrium
+from surrogate.comparison.md_answer import frames_over_states, md_answer
+from surrogate.comparison.measure.torsions import find_torsions
+from surrogate.comparison.read.ensemble import Ensemble
+from systems.chemistry.graph import backbone_torsions, bonded_graph, turned
+from systems.errors import InputError
+from systems.prepare.peptide import build_peptide
+
+SCENE = build_peptide("ACE-ALA-NME")
+STATES = {"α": (-70.0, -40.0), "β": (-80.0, 140.0), "left-handed": (55.0, 40.0)}
+POPULATIONS = np.array([0.6, 0.3, 0.1])
+MATRIX = np.array([[0.99, 0.01, 0.0], [0.02, 0.97, 0.01], [0.0, 0.03, 0.97]])
+FORMS = 40
+
+
+@pytest.fixture(scope="module")
+def forms() -> np.ndarray:
+    """Frames `(3, FORMS, n_atoms, 3)` of each state, thermally spread."""
+    rng = np.random.default_rng(0)
+    graph, found = bonded_graph(SCENE), backbone_torsions(SCENE)
+    out = np.empty((3, FORMS, SCENE.n_atoms, 3), dtype=np.float32)
+    for s, centre in enumerate(STATES.values()):
+        for k in range(FORMS):
+            x = SCENE.positions_nm
+            for quad, angle in zip((found["phi"][0], found["psi"][0]), centre, strict=True):
+                now = _angle(x, quad)
+                x = turned(x, quad.tolist(), math.radians(angle + rng.normal(0, 12.0)) - now, graph)
+            out[s, k] = x
+    return out
+
+
+def _angle(x: np.ndarray, quad: np.ndarray) -> float:
+    from systems.chemistry.geometry import torsion
+
+    return float(torsion(x[None], quad[None])[0, 0])
+
+
+def jumps(matrix: np.ndarray, starts: list[int], n: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    state, cumulative = np.array(starts), matrix.cumsum(1)
+    out = np.empty((len(starts), n), dtype=np.int64)
+    for t in range(n):
+        out[:, t] = state
+        state = (rng.random(len(starts))[:, None] > cumulative[state]).sum(1)
+    return out
+
+
+def ensemble(forms: np.ndarray, states: np.ndarray, seed: int = 0) -> Ensemble:
+    rng = np.random.default_rng(seed)
+    return Ensemble("MD", [forms[row, rng.integers(FORMS, size=len(row))] for row in states], 1.0, SCENE)
+
+
+def drawn(forms: np.ndarray, populations: np.ndarray, seed: int = 5) -> Ensemble:
+    """A surrogate's rollout with these populations."""
+    rng = np.random.default_rng(seed)
+    return ensemble(forms, rng.choice(3, p=populations, size=(8, 500)), seed)
+
+
+def test_a_surrogate_with_wrong_populations_leaves_the_answer_md_s(forms: np.ndarray) -> None:
+    wrong = np.array([0.05, 0.15, 0.8])
+    starts = np.random.default_rng(1).choice(3, p=wrong, size=32)
+    md = ensemble(forms, jumps(MATRIX, starts.tolist(), 250, 2))
+    answer = md_answer(md, 300.0, surrogate=drawn(forms, wrong))
+    for state, right in zip(answer.states, POPULATIONS, strict=True):
+        assert abs(state.share - right) < 3.0 * state.error + 0.01, state
+        assert state.error < 0.2 and state.differs
+    assert not answer.missing and answer.holds
+    assert "differ" in answer.on_surrogate
+    energy = next(s for s in answer.states if s.state == "left-handed")
+    assert energy.free_energy_kj_mol == pytest.approx(2.494 * math.log(6.0), abs=3.0 * (energy.free_energy_error or 0))
+    json.dumps(answer.to_dict(), allow_nan=False)
+
+
+def test_a_right_surrogate_agrees(forms: np.ndarray) -> None:
+    md = ensemble(forms, jumps(MATRIX, [0, 0, 1, 2] * 8, 400, 3))
+    answer = md_answer(md, 300.0, surrogate=drawn(forms, POPULATIONS))
+    assert "agree" in answer.on_surrogate and len(answer.states) == 3
+
+
+def test_a_state_that_the_surrogate_misses_is_found_where_md_goes_there(forms: np.ndarray) -> None:
+    md = ensemble(forms, jumps(MATRIX, [0, 1] * 16, 300, 4))
+    answer = md_answer(md, 300.0, surrogate=drawn(forms, np.array([0.7, 0.3, 0.0])))
+    left = next(s for s in answer.states if s.state == "left-handed")
+    assert left.n_begun == 0 and left.differs and abs(left.share - 0.1) < 3.0 * left.error + 0.01
+
+
+def test_a_state_that_the_surrogate_invents_is_left_and_weighs_nothing(forms: np.ndarray) -> None:
+    matrix = np.array([[0.99, 0.01, 0.0], [0.02, 0.98, 0.0], [0.05, 0.0, 0.95]])
+    md = ensemble(forms, jumps(matrix, [2] * 24 + [0] * 8, 300, 5))
+    answer = md_answer(md, 300.0, surrogate=drawn(forms, np.array([0.2, 0.2, 0.6])))
+    left = next(s for s in answer.states if s.state == "left-handed")
+    assert left.share == 0.0 and not left.missing and left.differs
+    right = {s.state: s for s in answer.states}
+    assert abs(right["α"].share - 2 / 3) < 3.0 * right["α"].error + 0.01
+
+
+def test_a_state_that_no_md_leaves_is_missing_not_invented(forms: np.ndarray) -> None:
+    matrix = np.array([[0.99, 0.01, 0.0], [0.02, 0.98, 0.0], [0.0, 0.0, 1.0]])
+    md = ensemble(forms, jumps(matrix, [0, 1, 2, 2] * 8, 300, 6))
+    answer = md_answer(md, 300.0, surrogate=drawn(forms, POPULATIONS))
+    left = next(s for s in answer.states if s.state == "left-handed" and s.torsion.startswith("ALA"))
+    told = " ".join(answer.missing)
+    assert "not connected" in told and "ALA" in told
+    # Whichever side holds more frames has the weights; the other has none, and says so.
+    assert bool(left.missing) != all(s.missing for s in answer.states if s.state != "left-handed")
+    assert sum(float(w.sum()) for w in answer.weights) == pytest.approx(32 * 300)
+
+
+def test_weights_make_plain_histograms_right(forms: np.ndarray) -> None:
+    states = jumps(MATRIX, [2] * 32, 250, 7)
+    answer = md_answer(ensemble(forms, states), 300.0)
+    weights = np.concatenate(answer.weights)
+    share = np.bincount(states.ravel(), weights, minlength=3) / weights.sum()
+    plain = np.bincount(states.ravel(), minlength=3) / states.size
+    assert np.abs(share - POPULATIONS).max() < np.abs(plain - POPULATIONS).max()
+    (grid,) = answer.maps.values()
+    assert grid.shape == (36, 36) and grid.min() == 0.0
+
+
+def test_wells_of_a_further_torsion_are_states_with_their_shares() -> None:
+    """Butane's torsion: anti and both gauche, of known shares, named by their mean angles; one well is no state."""
+    from systems.library.named_scenes import prepare
+
+    scene = prepare("smiles:CCCC")
+    graph, rng = bonded_graph(scene), np.random.default_rng(0)
+    (quad,) = (t.quad for t in find_torsions(scene) if t.kind == "rotatable")
+    states = jumps(np.array([[0.94, 0.03, 0.03], [0.1, 0.9, 0.0], [0.1, 0.0, 0.9]]), [0, 1, 2, 0] * 4, 300, 8)
+
+    def run(centres: tuple[float, ...]) -> Ensemble:
+        forms = np.array([[turned(scene.positions_nm, list(quad), math.radians(c + rng.normal(0, 12.0))
+                                  - _angle(scene.positions_nm, np.array(quad)), graph) for _ in range(FORMS)]
+                          for c in centres], dtype=np.float32)  # fmt: skip
+        return Ensemble("MD", [forms[row, rng.integers(FORMS, size=len(row))] for row in states], 1.0, scene)
+
+    answer = md_answer(run((180.0, 65.0, -65.0)), 300.0)
+    found = {s.state: s for s in answer.states}
+    named = {int(name.removesuffix("°")): s for name, s in found.items()}
+    assert len(found) == 3 and all(min(abs(abs(k) - c) for c in (180, 65)) < 8 for k in named)
+    for k, state in named.items():
+        right = 0.625 if abs(k) > 120 else 0.1875
+        assert abs(state.share - right) < 3.0 * state.error + 0.03, (k, state)
+    assert not md_answer(run((180.0, 180.0, 180.0)), 300.0).states, "negative control"
+
+
+def test_a_molecule_without_torsions_is_one_line() -> None:
+    from systems.library.named_scenes import prepare
+
+    water = prepare("smiles:C")
+    with pytest.raises(InputError, match="no torsion turns"):
+        md_answer(Ensemble("MD", [np.repeat(water.positions_nm[None], 20, 0).astype(np.float32)], 1.0, water), 300.0)
+
+
+def test_equilibrium_takes_what_no_state_holds() -> None:
+    states = jumps(MATRIX, [0, 1] * 8, 300, 0)
+    states[:, ::50] = -1
+    assert equilibrium(list(states)).populations.sum() == pytest.approx(1.0)
+
+
+def test_starts_are_drawn_over_all_states_of_a_rollout(forms: np.ndarray) -> None:
+    rare = drawn(forms, np.array([0.95, 0.03, 0.02]))
+    frames = frames_over_states(rare, 16, seed=1)
+    known = {forms[s, k].tobytes(): s for s in range(3) for k in range(FORMS)}
+    counts = np.bincount([known[f.tobytes()] for f in frames], minlength=3)
+    assert counts.min() >= 2 and counts.sum() == 16
+    np.testing.assert_array_equal(frames, frames_over_states(rare, 16, seed=1))
