@@ -154,7 +154,7 @@ def run(
     options: RunOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """SCENE and a budget in, a evaluated trajectory out, by what pays best on this machine."""
+    """SCENE and a budget in, an evaluated trajectory out, by what pays best on this machine."""
     from surrogate import api
 
     if out is None and not options.dry_run:

@@ -130,7 +130,7 @@ def equivalent_time_by(measure: Measure, length_ps: float, seed: int = 0, n_draw
     Length and error of MD are read from geometric means over all pieces of one length (a typical piece: a rare event
     makes few pieces very wrong), made monotone by isotonic regression and interpolated on logarithmic axes. The
     interval combines the error of that mean with the candidate's own: its block bootstrap, or the scatter of MD pieces
-    of such worth where that is larger, because no trajectory knows by itself which states it has missed.
+    of such a time where that is larger, because no trajectory knows by itself which states it has missed.
     """
     first, own, second = measure.sums
     n_blocks = len(first)

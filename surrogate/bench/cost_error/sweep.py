@@ -3,8 +3,8 @@
 `surromd bench cost-error` runs it. Each setting rolls the same time; its error is that of the φ/ψ map against two held-
 out runs, its cost the processor time of this process, one thread. Before each of its parts OpenMM runs for a moment, so
 that the ratio of the two does not hang on what else the machine does. MD's own error is that of pieces of one held-out
-run against the whole of the other (`comparison.worth`): it is taken to be the same at each time step, by simulated
-time.
+run against the whole of the other (`comparison.equivalent_time`): it is taken to be the same at each time step,
+by simulated time.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class Plan(NamedTuple):
     shares: dict[Stage, float]
 
 
-# MD that evaluates itself is split by replicas, or by stages if there is one replica.
+# MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget, from many starts", {"md": 1.0}),
     "rollout": Plan(

@@ -213,7 +213,7 @@ class _Run:
         rates = by_openmm(record.rates, self.site.scene, self.site.config, why)
         self.keep(replace(record, rates=rates, simd_failed=record.rates.replicas))
         self.say(f"{why}: {name} by OpenMM")
-        if self.decision.way == "md":  # an only replica cannot evaluate itself
+        if self.decision.way == "md":  # a single replica has no other to be compared with
             self._by_md(why)
 
     def _by_md(self, why: str) -> None:

@@ -45,7 +45,7 @@ def outcome(
     if way == "md":
         said = f"{rolled} of MD, evaluated by {_length(held)}"
         said += (
-            f": worth {equivalent_time.in_words()} of MD by its {equivalent_time.measure}."
+            f": equivalent to {equivalent_time.in_words()} of MD by its {equivalent_time.measure}."
             if equivalent_time
             else f": {evaluated.status}."
         )
@@ -86,7 +86,7 @@ def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[st
     off = [s for s in told if s.differs]
     if not answer.is_sure or not told:
         use, for_what = "Not known yet whether the surrogate can be used.", "It found the states that MD began in."
-        return use, for_what, "Why: MD that evaluates it has not converged."
+        return use, for_what, "Why: the MD it is compared with has not converged."
     right = f"Right: populations of {len(told) - len(off)} of {len(told)} states."
     if off:
         wrong = ", ".join(f"{s.torsion} {s.state}" for s in off[:3]) + (", and more" if len(off) > 3 else "")
@@ -107,7 +107,7 @@ def _remedy(comparison: Comparison, costs: Costs) -> str:
     """Return what would tell more; a longer budget where its replicas outlast the slowest relaxation that was seen."""
     found, evaluated = comparison.convergence, comparison.evaluations[0]
     if found is not None and not found.converged and not found.n_replicas:
-        return f"MD that evaluates it is too short to be tested: {found.reasons[0]}."
+        return f"the MD it is compared with is too short to be tested: {found.reasons[0]}."
     if found is not None and not found.converged:
         said = f"MD, {found.verdict.rstrip('.')}; {found.remedy}"
         if found.needed_ps is None or found.needed_ps <= found.replica_ps:

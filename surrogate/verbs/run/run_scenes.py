@@ -1,4 +1,4 @@
-"""The verb `run`: a scene and a budget in, a evaluated trajectory out, by whatever way pays best on this machine."""
+"""The verb `run`: a scene and a budget in, an evaluated trajectory out, by whatever way pays best on this machine."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs
     MD
     did."""
     spent, rates = record.spent_in, _rates_and_decision(record)[0]
-    # The faster of what was measured before and what it came to: the gain is a lower bound.
+    # The faster of what was measured before and what it came to: the speed-up is a lower bound.
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))
     training_s = spent.get("train", 0.0)
     # What reading weights takes is no part of it: a longer rollout does it once, too.
@@ -345,7 +345,7 @@ def _report(site: Site, record: RunRecord) -> RunRecord:
         command=f"surromd run {record.scene!r} -o {site.folder.name}",
         foreword=Foreword(
             "\n".join(found.in_short),
-            "States by MD, what the trajectory is worth, and how the budget was spent",
+            "States by MD, its equivalent MD time, and how the budget was spent",
             [("equivalent_time", found.details), *lines, *(("note", note) for note in notes)],
             [] if answer is None else weighted_maps(answer.maps),
         ),

@@ -154,7 +154,7 @@ def test_the_verdict_says_what_the_trajectory_is_equivalent_time_and_costs(evalu
 def test_wrong_kinetics_are_equivalent_time_little_where_the_map_is_right(
     inputs: tuple[Ensemble, Ensemble, Ensemble],
 ) -> None:
-    """Negative control: shuffled frames keep the map's worth and lose that of the kinetics."""
+    """Negative control: shuffled frames keep the map's equivalent time and lose that of the kinetics."""
     reference, candidate, replicate = inputs
     frames = candidate.segments[0].copy()
     np.random.default_rng(0).shuffle(frames)
