@@ -1,4 +1,5 @@
-"""Whether the comparison's equivalent MD time is calibrated: `python docs/studies/comparison/compare_equivalent_time.py REF...
+"""Whether the comparison's equivalent MD time is calibrated: `python
+docs/studies/comparison/compare_equivalent_time.py REF...
 --lengths 500ps 1ns 5ns`.
 
 Of four or more long runs of one simulation the first is the reference, the second the replicate; pieces of the others,

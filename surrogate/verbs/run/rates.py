@@ -52,7 +52,8 @@ class Rates:
     other work shares them. `step_s`: processor seconds
     of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
     on this `platform`, `at_once` replicas on each core; `md`: in words; `expensive`: it is quantum mechanics. `rolls`:
-    of weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not run
+    of weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not
+    run
     by SIMD, where it might have been; `in_water`: in ALPB water, in which no potential learns.
     """
 
