@@ -1,10 +1,9 @@
 """Options of the verbs, each declared once: a field of a frozen dataclass whose metadata says what it does.
 
 From that declaration follow the command line, the signature and the documentation of the Python call
-(`options_as_keywords`), the
-keys of a `config` file, their checks, and the manual's tables. A name ends in its unit (`time_ps`), which the command
-line and files leave out: there a value carries it (`time = "10ns"`). Imports no library, so that the command's help is
-quick.
+(`options_as_keywords`), the keys of a `config` file, their checks, and the manual's tables. A name ends in its unit
+(`time_ps`), which the command line and files leave out: there a value carries it (`time = "10ns"`). Imports no library,
+so that the command's help is quick.
 """
 
 from __future__ import annotations

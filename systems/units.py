@@ -185,9 +185,8 @@ def quantity(name: str, value: Any, what: str = "") -> float | None:
     """Return what a setting called `name` (`time_ps`) is in the unit that its name ends in.
 
     `value` is a number in that unit, a text with its own, such as '10ns', or a quantity of `openmm.unit`; None stays
-    None. `what`: how messages call
-    it, by default as it is called. Raises UnitError for another kind of value, and for a number that is negative or not
-    finite.
+    None. `what`: how messages call it, by default as it is called. Raises UnitError for another kind of value, and for
+    a number that is negative or not finite.
     """
     if value is None:
         return None

@@ -1,6 +1,5 @@
 """The directives `definitions`, `metrics`, `flags` and `formats`: what the code says of the comparison's terms and
-metrics,
-of frames' flags and of other programs' files, as tables."""
+metrics, of frames' flags and of other programs' files, as tables."""
 
 from __future__ import annotations
 

@@ -167,9 +167,8 @@ def run_campaign(
 
     `progress` is called several times a second with what the workers said when last asked. `failed(name, reason)` is
     called when a scene or a run is given up: after `retries` further attempts, or at once where its input is at fault.
-    The others run on.
-    Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt with a summary.
-    Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
+    The others run on. Ctrl-C and SIGTERM stop the active runs between two frames, with checkpoints: KeyboardInterrupt
+    with a summary. Raises what `open_campaign` raises, and InputError when another process runs the same campaign.
     """
     with _only_process(campaign.folder), deferred_interrupt() as asked_to_stop:
         job = _Job(campaign, client, open_campaign(campaign), failed or (lambda name, reason: None))

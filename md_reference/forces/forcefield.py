@@ -117,9 +117,8 @@ def build_system(scene: Scene, spec: ForceFieldSpec, *, native_gb: bool = True) 
 
     Particles are the scene's atoms in its order; virtual sites (OPC) come after them. With `native_gb` the OBC2 term is
     OpenMM's GBSAOBCForce; without it, the CustomGBForce of implicit/obc2.xml, which gives the same energies (a test
-    holds them together) and is several times slower on small scenes.
-    Raises PreparationError when the force field has no parameters for a residue or a molecule, or does not suit the
-    scene's cell.
+    holds them together) and is several times slower on small scenes. Raises PreparationError when the force field has
+    no parameters for a residue or a molecule, or does not suit the scene's cell.
     """
     spec = resolve(scene, spec)
     if spec.force_field == MODEL:

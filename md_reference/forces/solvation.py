@@ -50,8 +50,8 @@ def solvate(scene: Scene, spec: ForceFieldSpec, box: WaterBox, *, seed: int = 0,
     100 atoms. The cell is a cube or a rhombic dodecahedron, whichever is smaller, its height at least twice the cutoff
     and 0.35 nm, and its volume that of 1 bar at `temperature_k`. The scene's atoms come first, in their order, moved to
     the middle of the cell; then waters, then ions. Which waters become ions is drawn with `seed`, from those 0.5 nm
-    from the solute and from each other where there are enough.
-    Raises PreparationError for a scene that has a cell, another solvent, or a cell of too many atoms.
+    from the solute and from each other where there are enough. Raises PreparationError for a scene that has a cell,
+    another solvent, or a cell of too many atoms.
     """
     if not spec.is_explicit:
         raise PreparationError(f"solvent {spec.solvent!r} has no molecules to add; give `solvent='tip3p'` or opc.")

@@ -192,11 +192,10 @@ def defaults() -> dict[str, Any]:
 def resolve_settings(scene: Scene, given: Mapping[str, Any], protocol: str | None = None) -> tuple[dict[str, Any], str]:
     """Return all settings of a run of `scene`, and a line about what its protocol decided, empty where nothing.
 
-    `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names a paper's.
-    Its solvent goes with its force field and is left out when the user names another one;
-    its flexible bonds are left out above a time step of 1 fs. Quantum forces have flexible bonds and natural hydrogens
-    up to that step (at 0.5 fs if only these are asked for).
-    Raises UnknownNameError, and InputError for a model system, whose settings are its own.
+    `given` holds what the user asked for, by the names of MDConfig and ForceFieldSpec; `protocol` names a paper's. Its
+    solvent goes with its force field and is left out when the user names another one; its flexible bonds are left out
+    above a time step of 1 fs. Quantum forces have flexible bonds and natural hydrogens up to that step (at 0.5 fs if
+    only these are asked for). Raises UnknownNameError, and InputError for a model system, whose settings are its own.
     """
     name = scene.provenance.get("library_name")
     return resolve_by_name(name if isinstance(name, str) else "", given, protocol)

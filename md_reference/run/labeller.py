@@ -53,10 +53,9 @@ _worker: Potential | None = None
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in
-    kJ/mol/nm; `failed`: how many more were asked for, at which the reference finds no answer; `rearranged`: those that
-    are
-    another molecule, at which it was not asked."""
+    """States `positions_nm` (n, n_atoms, 3) with their energies (n,) in kJ/mol and forces (n, n_atoms, 3) in kJ/mol/nm;
+    `failed`: how many more were asked for, at which the reference finds no answer; `rearranged`: those that are another
+    molecule, at which it was not asked."""
 
     positions_nm: FloatArray
     energies_kj_mol: FloatArray

@@ -272,13 +272,12 @@ def simulate_replicas(
     """Run `len(outs)` replicas with seeds config.seed, config.seed + 1, ..., at most one per core at a time.
 
     `scene`: what they start from, each from a state of its own unless `config.starts` is one (`starts.many_starts`); or
-    a start for each replica.
-    Each replica is a process with its share of the cores, one thread where there are as many replicas as cores: on
-    small scenes the fastest use of them. On platform simd up to sixteen replicas share a process. The platform is
-    measured once, for all, and `announce` gets the plan in one line, and the error of a replica that fails while others
-    run, which it may raise to end them too; `progress` counts the frames of all replicas.
-    Ctrl-C and SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop
-    by themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
+    a start for each replica. Each replica is a process with its share of the cores, one thread where there are as many
+    replicas as cores: on small scenes the fastest use of them. On platform simd up to sixteen replicas share a process.
+    The platform is measured once, for all, and `announce` gets the plan in one line, and the error of a replica that
+    fails while others run, which it may raise to end them too; `progress` counts the frames of all replicas. Ctrl-C and
+    SIGTERM stop them all with checkpoints: KeyboardInterrupt. When this process is killed outright they stop by
+    themselves. Raises InputError for a script that starts them outside `if __name__ == '__main__':`, SimulationError
     with the first replica's reason when the others have ended; finished replicas stay on disk.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):

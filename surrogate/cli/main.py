@@ -205,10 +205,7 @@ def reference(scene: SceneArg, *, out: OutOpt, options: ReferenceOptions, as_jso
 
 
 _CAMPAIGN = """An example of FILE, of two scenes at two temperatures (every setting of `reference` may stand in it):\n
-scenes = ["alanine-dipeptide", "pdb/*.pdb"]\n
-temperatures = ["300K", "350K"]\n
-replicas = 4\n
-time = "100ns"\n
+scenes = ["alanine-dipeptide", "pdb/*.pdb"]\n temperatures = ["300K", "350K"]\n replicas = 4\n time = "100ns"\n
 save_every = "10ps"
 """
 

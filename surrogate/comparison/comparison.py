@@ -91,8 +91,7 @@ class Evaluation:
     and replicate; `effective_samples` are the independent ones that the equal length holds of the slowest motion of any
     of the three; `speed_ratio` is simulated time per wall second over the reference's.
     `worth` says by each measure how much MD the whole candidate is worth, and `equivalent_time_words` says it in a
-    sentence
-    (empty where it cannot be told, or frames are broken, or the reference still depends on where it started).
+    sentence (empty where it cannot be told, or frames are broken, or the reference still depends on where it started).
     `left_open`: what the reference's start or length leaves open; `in_short`: use it or not, for what, why.
     """
 

@@ -33,11 +33,10 @@ class EquivalentTime:
 
     `candidate_error` is its distance to the reference; MD of `lengths_ps` `(n,)`, ascending, has `errors` `(n,)`, the
     geometric mean over pieces, which scatter between `errors_low` and `errors_high` (10 % and 90 % quantiles).
-    `bound` says where the equivalent MD time lies when the candidate is better than the longest MD at hand ("at
-    least") or worse
-    than the shortest ("less than"); an end of the interval beyond that range is None. `share` of the candidate is what
-    this much is the equivalent MD time of: all of it, or, where MD at hand ends first, the shortest parts that come as
-    near.
+    `bound` says where the equivalent MD time lies when the candidate is better than the longest MD at hand ("at least")
+    or worse than the shortest ("less than"); an end of the interval beyond that range is None. `share` of the candidate
+    is what this much is the equivalent MD time of: all of it, or, where MD at hand ends first, the shortest parts that
+    come as near.
     """
 
     key: str
@@ -114,8 +113,7 @@ def errors_by_length(measure: Measure, length_ps: float) -> tuple[FloatArray, Fl
 
 def distance_to_reference(measure: Measure, seed: int = 0, n_draws: int = 400) -> Estimate:
     """Return the candidate's distance to the reference (the root mean square of those to reference and replicate) with
-    its
-    95 % interval: block bootstrap of the candidate alone, of the squared distance."""
+    its 95 % interval: block bootstrap of the candidate alone, of the squared distance."""
     own, references = measure.sums[1], (measure.sums[0].sum(0), measure.sums[2].sum(0))
     value = float(np.mean([measure.squared(own.sum(0)[None], reference)[0] for reference in references]))
     squared = estimate(value, _own_draws(measure, references, seed, n_draws), len(own))

@@ -198,8 +198,7 @@ def copy_rows(inputs: ComparisonInput) -> Measured:
 
 def copied_from(inputs: ComparisonInput) -> tuple[str, list[str]]:
     """Return why there is nothing to evaluate, where most of the candidate's frames are the reference's own; and notes
-    on
-    frames that any two of the three have in common."""
+    on frames that any two of the three have in common."""
     ref, cand, rep = (frame_keys(s.features) for s in inputs.samples)
     if ref is None or cand is None or rep is None:
         return "", []

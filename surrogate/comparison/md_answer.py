@@ -1,8 +1,7 @@
 """MD's answer: states, free energies, maps and timescales of a molecule from many MD replicas, errors from MD alone.
 
 Torsions -> TICA (kinetic map) -> k-means -> reversible Markov model (`surrogate.comparison.markov`). What is reported
-are
-states that a chemist names: α, β and left-handed of each residue, and the wells of every other torsion.
+are states that a chemist names: α, β and left-handed of each residue, and the wells of every other torsion.
 """
 
 from __future__ import annotations

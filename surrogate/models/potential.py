@@ -282,10 +282,9 @@ def gradient_of(energy: EnergyFn) -> GradientFn:
 
 
 # Bonds to hydrogen that stay rigid while a molecule is integrated: CCMA (Eastman and Pande, J. Chem. Theory Comput. 6,
-# 434 (2010)), for many replicas at once.
-# What a correction along one bond does to the others hangs on masses and on the angles between bonds that share an
-# atom, which hardly change. So one matrix, of the molecule at rest, turns deviations of all bonds into corrections of
-# all; a few rounds meet the tolerance.
+# 434 (2010)), for many replicas at once. What a correction along one bond does to the others hangs on masses and on the
+# angles between bonds that share an atom, which hardly change. So one matrix, of the molecule at rest, turns deviations
+# of all bonds into corrections of all; a few rounds meet the tolerance.
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,14 +31,13 @@ def compare(
     """Evaluate candidates against a reference, write the report (NAME.html, .json and .md) and return the comparison.
 
     The reference, each candidate and the replicate (another run of the reference, the replicate baseline of every
-    figure) is a file, a
-    folder, a glob, a comma-separated list or a sequence of files that are replicas of each other; a single path for
-    `candidates` is one candidate, and a sequence holds one each. `top`: topology for
-    files that carry none. `dt_ps`: the time between frames, where the files do not say or say it wrongly. Of both, one
-    stands for all, or there is one for the reference, each candidate and the replicate in this order, None where the
-    file says it itself. `energies`: evaluate the potential energy of every k-th frame too, by the force field that the
-    reference's file names. A report that is there stays unless `overwrite`.
-    Raises InputError, TrajectoryError, OutOfDomainError.
+    figure) is a file, a folder, a glob, a comma-separated list or a sequence of files that are replicas of each other;
+    a single path for
+    `candidates` is one candidate, and a sequence holds one each. `top`: topology for files that carry none. `dt_ps`:
+    the time between frames, where the files do not say or say it wrongly. Of both, one stands for all, or there is one
+    for the reference, each candidate and the replicate in this order, None where the file says it itself. `energies`:
+    evaluate the potential energy of every k-th frame too, by the force field that the reference's file names. A report
+    that is there stays unless `overwrite`. Raises InputError, TrajectoryError, OutOfDomainError.
     """
     from surrogate.comparison.comparison import compare as compare
     from surrogate.comparison.read.ensemble import load_ensemble

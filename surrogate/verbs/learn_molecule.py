@@ -27,8 +27,8 @@ def learn_molecule(
     """Learn the molecule that `given` names from `options.level` and return the weights.
 
     The budget is of wall time for all of it: the molecule's preparation, answers, steps, and the verdict that the
-    caller comes to (`train_verdict.compare_training`).
-    Raises InputError for what means nothing here, PreparationError for what the level of theory refuses.
+    caller comes to (`train_verdict.compare_training`). Raises InputError for what means nothing here, PreparationError
+    for what the level of theory refuses.
     """
     began = time.monotonic()
     from md_reference.forces.spec import QUANTUM, at_level

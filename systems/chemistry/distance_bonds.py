@@ -25,9 +25,9 @@ def with_bonds_by_distance(scene: Scene, cell_nm: npt.ArrayLike | None = None) -
     """Return the scene with bonds, by covalent radii, for residues that hold an atom without any; else as it is.
 
     Two atoms are bonded when they, or images of theirs in the cell `(3, 3)` nm (rows a, b, c), are nearer than the sum
-    of their radii and 0.04 nm. Ions, rare gases and virtual sites stay alone.
-    Where residues stand in pieces, because a file's atoms are shuffled, every atom is looked at, and bonds that other
-    programs have made of the pieces are dropped where they are impossibly long.
+    of their radii and 0.04 nm. Ions, rare gases and virtual sites stay alone. Where residues stand in pieces, because a
+    file's atoms are shuffled, every atom is looked at, and bonds that other programs have made of the pieces are
+    dropped where they are impossibly long.
     """
     if scene.positions_nm.any() and _are_in_pieces(scene):
         return _all_by_distance(scene)

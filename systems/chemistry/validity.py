@@ -151,8 +151,8 @@ def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray
     stability rule of Fu et al., Forces are not enough, TMLR 2023). BOND_20_PERCENT: more than 20 % from it; the
     stricter warning, which INVALID leaves out. CLASH: atoms more than three bonds apart nearer than the geometry
     allows. CHIRALITY: a stereocentre is inverted or flat. OMEGA: a peptide or double bond has gone from cis to trans or
-    back. RING: a torsion inside a planar ring beyond 60°.
-    Raises InputError when the frames do not have the geometry's atoms.
+    back. RING: a torsion inside a planar ring beyond 60°. Raises InputError when the frames do not have the geometry's
+    atoms.
     """
     positions = np.asarray(positions_nm)
     if positions.ndim == 2:

@@ -62,9 +62,9 @@ class TrajectoryWriter(ABC):
         `chunk_idx` is the surrogate's chunk these frames came from, one number or `(n,)` (-1: none); `scalars` are
         further `(n,)` series by name, NaN in frames where they are not given. Velocities nm/ps and forces kJ/mol/nm,
         shaped as the positions, come with every frame of a file that was opened for them; `cell_nm` `(n, 3, 3)` holds
-        the box vectors of a periodic scene (its own where not given).
-        Raises InputError for frames that do not fit the scene, the times or what was appended before; StorageError
-        when the disk is full (what was complete stays readable, the writer is then closed to further frames).
+        the box vectors of a periodic scene (its own where not given). Raises InputError for frames that do not fit the
+        scene, the times or what was appended before; StorageError when the disk is full (what was complete stays
+        readable, the writer is then closed to further frames).
         """
         block = self._checked(positions_nm, time_ps, flags, chunk_idx, scalars or {})
         block = replace(

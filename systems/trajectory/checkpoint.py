@@ -153,8 +153,7 @@ def locked_outputs(
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
     Raises what `OutputLock` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another
-    file
-    lies in the place of the checkpoint, StorageError for an OSError of the run's own.
+    file lies in the place of the checkpoint, StorageError for an OSError of the run's own.
     """
     with ExitStack() as stack:
         for out in outs:

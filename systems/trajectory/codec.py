@@ -48,8 +48,8 @@ def open_writer(
     what it records stays, new keys of `record` are added, and an append that a crash interrupted is cut off. `record`
     must be JSON-able. `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell
     of a periodic scene is kept in any case. `run_id`: whose file it is. The writer holds the file's claim
-    (systems.files.whole_file), unless its caller does (`claimed`).
-    Raises InputError for an unknown suffix, column or record; TrajectoryError when the file exists (and neither
+    (systems.files.whole_file), unless its caller does (`claimed`). Raises InputError for an unknown suffix, column or
+    record; TrajectoryError when the file exists (and neither
     `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or written by another
     process; StorageError when the folder is missing, not writable or full.
     """
@@ -174,8 +174,8 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
     """Write the frames of replicas into one file, in the order of `paths`, and return its path.
 
     Kept are positions, cells, flags, chunks and scalars, and velocities and forces where all replicas and the format
-    hold them. Times are each replica's own, moved behind those before it.
-    Raises InputError where the replicas differ in atoms or save interval, TrajectoryError, StorageError.
+    hold them. Times are each replica's own, moved behind those before it. Raises InputError where the replicas differ
+    in atoms or save interval, TrajectoryError, StorageError.
     """
     with ExitStack() as stack:
         readers = [stack.enter_context(open_trajectory(path)) for path in paths]
@@ -362,8 +362,7 @@ DIFFERENCE_COLUMN = "energy_difference_kj_mol"
 
 def reweighting(differences_kj_mol: FloatArray, temperature_k: float) -> tuple[FloatArray, float]:
     """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the reference, and how
-    many
-    effective frames they leave (Kish: 1 / sum w^2).
+    many effective frames they leave (Kish: 1 / sum w^2).
 
     `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent
     frames are assumed; correlation in time lessens the number further.

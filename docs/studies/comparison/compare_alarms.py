@@ -2,9 +2,8 @@
 20ns`.
 
 Runs of one simulation are cut into pieces. Each piece is evaluated once as the candidate, against a piece of another
-run
-as the reference and one of a third as the replicate: nothing is wrong with any of them, so that every word worse than
-"undecided" is a false alarm. At a significance of 5 % over all rows, Holm-corrected, at most one in twenty is due.
+run as the reference and one of a third as the replicate: nothing is wrong with any of them, so that every word worse
+than "undecided" is a false alarm. At a significance of 5 % over all rows, Holm-corrected, at most one in twenty is due.
 
 `--intervals` counts instead how many of the pieces' 95 % intervals of relaxation times hold the time that all runs
 together give: that of the integrated autocorrelation of every cos psi or, without one, of every rotatable torsion.

@@ -32,10 +32,9 @@ def forecast_errors(predicted: Floats, ref: Floats) -> tuple[npt.NDArray[np.floa
     """Return ADE and FDE of every trajectory, `(n,)` each, in the unit of the positions.
 
     `predicted` (K, n, n_frames, n_particles, 3) samples, `reference` (n, n_frames, n_particles, 3). The displacement
-    error
-    is the Euclidean distance of a particle from where it was; ADE is its mean over frames and particles, FDE its mean
-    over particles at the last frame, both the mean over the K samples (not the best of them), as in GeoTDM (Han 2024)
-    and LaM-SLidE, section 4.3. Raises ValueError for shapes that do not fit.
+    error is the Euclidean distance of a particle from where it was; ADE is its mean over frames and particles, FDE its
+    mean over particles at the last frame, both the mean over the K samples (not the best of them), as in GeoTDM (Han
+    2024) and LaM-SLidE, section 4.3. Raises ValueError for shapes that do not fit.
     """
     if predicted.ndim != 5 or predicted.shape[1:] != ref.shape or ref.shape[-1] != 3:
         raise ValueError(f"samples {predicted.shape} do not fit the reference {ref.shape}")

@@ -95,9 +95,8 @@ PAPER_STEPS = 94_000
 
 @dataclass(frozen=True, eq=False)
 class Jump:
-    """States `x`, `v` (b, n, 3) of systems of one size, `types` (b, n), `pairs` (b, n, n), and positions `reference`
-    of a
-    later frame, or of all `(b, n_new, n, 3)`."""
+    """States `x`, `v` (b, n, 3) of systems of one size, `types` (b, n), `pairs` (b, n, n), and positions `reference` of
+    a later frame, or of all `(b, n_new, n, 3)`."""
 
     x: Tensor
     v: Tensor

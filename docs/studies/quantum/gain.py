@@ -5,14 +5,11 @@
         [-o docs/results/tables/potential_speed_up.json]
 
 Reference and replicate are chains of `corrected_md.py`; equivalent MD time ends at the length of one of them. FOLDER
-gets the
-rollout,
-annealed first, and as much MD by GFN2-xTB, a process a core, as tells its speed: nothing else should run. What is there
-is not made again. Chains that turn back now and then forget more slowly than MD does: a length of theirs is as much
-less MD as their torsions take longer to relax than those of the rollout, which moves as MD does. Speed-up: equivalent
-MD time over
-the MD that all cores make in the wall time of training (with its answers of GFN2-xTB) and of the part of the rollout
-that comes so near, with the 95 % interval of the equivalent MD time.
+gets the rollout, annealed first, and as much MD by GFN2-xTB, a process a core, as tells its speed: nothing else should
+run. What is there is not made again. Chains that turn back now and then forget more slowly than MD does: a length of
+theirs is as much less MD as their torsions take longer to relax than those of the rollout, which moves as MD does.
+Speed-up: equivalent MD time over the MD that all cores make in the wall time of training (with its answers of GFN2-xTB)
+and of the part of the rollout that comes so near, with the 95 % interval of the equivalent MD time.
 """
 
 from __future__ import annotations

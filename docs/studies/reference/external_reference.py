@@ -84,10 +84,9 @@ def summarise(psi_rad: Sequence[FloatArray], lag_ps: float, alpha: tuple[float, 
     """Return occupancies of beta and alphaR, the mean psi in each (degrees) and the relaxation time of cos psi (ps).
 
     Each is a mean over trajectories. The mean psi within a basin settles within picoseconds: it compares the force
-    fields far more sharply than the occupancies, of which 10 ns hold some twenty independent samples.
-    The relaxation time is the integrated autocorrelation time up to the first zero crossing (evaluate.kinetics), of
-    each
-    trajectory about its own mean.
+    fields far more sharply than the occupancies, of which 10 ns hold some twenty independent samples. The relaxation
+    time is the integrated autocorrelation time up to the first zero crossing (comparison.kinetics), of each trajectory
+    about its own mean.
     """
     from surrogate.comparison.measure.kinetics import zero_crossing
 

@@ -5,9 +5,8 @@
 One model is trained on alanine dipeptide (or another peptide with phi and psi) for all spacings of frames up to
 `--longest-lag-ps`. At each of some lags it is started from frames of a trajectory that it never saw, which are in
 equilibrium, so that all it makes should be, too, and should forget where it started as fast as MD does. Beside it: MD
-itself, continued from the same frames, which is the replicate baseline of every figure, and the model told the
-shortest lag whatever
-is asked, which shows what the lag is worth to it. What is finished in FOLDER is not done again.
+itself, continued from the same frames, which is the replicate baseline of every figure, and the model told the shortest
+lag whatever is asked, which shows what the lag is worth to it. What is finished in FOLDER is not done again.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 Figures are Jensen-Shannon distances of 50 bins (36 x 36 of joint maps), means over all torsions of a peptide: phi, psi
 and chi, each folded by its symmetry. The replicate baseline is the mean over pairs of independent MD runs; a source's
-figure is the
-mean over each of its runs against each of MD's, of equal length and as many frames. The library draws each residue's
-torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat on joint maps
-of neighbours, or it has learned nothing of pairs. A phi > 0 that MD enters fewer than ten times in all leaves the maps
-of all sources: how often it is visited is chance, and a matter of free energies (`peptide_gates seeds`).
+figure is the mean over each of its runs against each of MD's, of equal length and as many frames. The library draws
+each residue's torsions together from MD of its monomer ACE-X-NME, independent of the neighbours: what a model must beat
+on joint maps of neighbours, or it has learned nothing of pairs. A phi > 0 that MD enters fewer than ten times in all
+leaves the maps of all sources: how often it is visited is chance, and a matter of free energies (`peptide_gates
+seeds`).
 """
 
 from __future__ import annotations

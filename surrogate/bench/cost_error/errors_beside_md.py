@@ -103,8 +103,7 @@ def compare_frames(
 
 def compare_reference(ref: ReferenceForces, *, seed: int = 0) -> dict[str, Any]:
     """Return what stands beside the rollouts: the errors of MD of each length, the replicate baseline (the two runs
-    against each
-    other), and the reference's own autocorrelation and relaxation time."""
+    against each other), and the reference's own autocorrelation and relaxation time."""
     found = joint_measure(ref.reference, ref.replicate, ref.replicate, ref.baseline.torsions)
     equivalent_time = None if found is None else equivalent_time_by(*found, seed)
     if equivalent_time is None:

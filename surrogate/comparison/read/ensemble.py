@@ -192,9 +192,9 @@ def load_ensemble(
     those, named in `kept`. Without a template the first file's scene is it, less water and single ions. Molecules of a
     periodic file are made whole. A file whose time jumps is cut there into segments. `lag_ps` overrides the times in
     the files. `top` is the topology for formats that hold none. Files beyond the first `in_memory_bytes` of all
-    coordinates together are left where they are and read block by block.
-    Raises InputError (no files, nothing known of the topology, no times without `lag_ps`, replicas with different lags
-    or atoms), OutOfDomainError (another molecule) and TrajectoryError (a damaged file, uneven time).
+    coordinates together are left where they are and read block by block. Raises InputError (no files, nothing known of
+    the topology, no times without `lag_ps`, replicas with different lags or atoms), OutOfDomainError (another molecule)
+    and TrajectoryError (a damaged file, uneven time).
     """
     if not paths:
         raise InputError("No trajectory file was given.")

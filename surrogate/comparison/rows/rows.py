@@ -106,10 +106,10 @@ class Row:
     """One metric of one candidate, between the reference and its replicate.
 
     `form` says how it is evaluated: a "distance" to the reference stands beside the replicate's, and `ratio` is to that
-    replicate baseline; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share"
-    is the part of
-    frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against reference
-    and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over all rows.
+    replicate baseline; an "observable" is compared with the reference's own value, and `ratio` is to that; a "share" is
+    the part of frames that pass a check. `statement` puts the deviation in words. `p_value` tests the candidate against
+    reference and replicate together, `p_replicate` the replicate against the reference; `p_corrected` is Holm's over
+    all rows.
     `kind` and `time_scale` are those of the `Metric` that measured it.
     """
 
@@ -143,8 +143,7 @@ class Sample:
     """One ensemble as it enters the statistics: features, their blocks, bootstrap weights `(n_draws, n_blocks)`.
 
     Tests use all blocks. What depends on the length itself (a histogram's distance, the replicate baseline) uses the
-    first `n_equal`
-    blocks alone, which are as long as those of the other trajectories.
+    first `n_equal` blocks alone, which are as long as those of the other trajectories.
     """
 
     features: Features

@@ -181,8 +181,7 @@ def _squared_steps(inputs: ComparisonInput, sample: Sample) -> list[FloatArray]:
 
 def _step_row(inputs: ComparisonInput, states: Sequence[Sequence[IntArray]]) -> Row:
     """The root mean square step, as if every trajectory were in the states of the slowest motion as often as the
-    reference:
-    a wrong time between frames shows here first.
+    reference: a wrong time between frames shows here first.
 
     Only states that all three hold count: what one run alone has met, and steps in otherwise, is no wrong time.
     """

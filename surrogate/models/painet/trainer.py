@@ -23,9 +23,8 @@ from systems.errors import InputError
 class PainetTraining:
     """The optimisation. `noise`: standard deviation of what is added to the state a training window starts from, as a
     share of what positions and velocities change by over a chunk, so that the model learns to come back from its own
-    errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after
-    one chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the
-    last
+    errors (Sanchez-Gonzalez 2020). `pushforward`: share of windows that start where the model itself arrives after one
+    chunk from the reference, with no gradient through that chunk (Brandstetter 2022). `velocity_weight`: of the last
     frame's velocity beside the positions, each in units of its own change over a chunk.
 
     `every_frame`: velocities of all predicted frames count, not the last's alone, and each frame is measured by itself:

@@ -36,8 +36,7 @@ _DIMENSIONS = 6
 # No frame counts more than so many average ones: a cell hardly visited would otherwise be drawn over and over.
 _LARGEST = 20.0
 # How many jumps between any two frames each run stands for, its beginning and its end; a frame's probabilities to take
-# part grow
-# with this power of its place in its run.
+# part grow with this power of its place in its run.
 _JUMPS_A_RUN, _LATE = 2.0, 2
 _CONVERGED, _MOST_ITERATIONS = 1e-6, 20_000
 _CLUSTER_SEED = 1
@@ -397,12 +396,11 @@ def _distinct(ahead: Tensor, longest: int) -> Tensor:
 
 
 # Windows from which the probabilities of changes of states are learned: what is rare is drawn more often than it
-# occurs.
-# What a torsion in a rare state does next may be learned from as many windows as there are: its probabilities are
-# conditional on
-# the state that it starts from, however often windows start there. Changes that are rare themselves may be drawn more
-# often, too, if each then counts less in the loss, in proportion, and so may windows chosen for another torsion's sake:
-# the loss stays what it was, but no longer rests on the few batches that happen to hold such a change.
+# occurs. What a torsion in a rare state does next may be learned from as many windows as there are: its probabilities
+# are conditional on the state that it starts from, however often windows start there. Changes that are rare themselves
+# may be drawn more often, too, if each then counts less in the loss, in proportion, and so may windows chosen for
+# another torsion's sake: the loss stays what it was, but no longer rests on the few batches that happen to hold such a
+# change.
 
 _POOL = 16_384
 # Changes are to be in this share of the windows that could hold them; nothing is drawn more than so much too often.

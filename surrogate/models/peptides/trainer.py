@@ -51,14 +51,12 @@ from surrogate.models.weights import Weights, load_weights, provenance_of, read_
 from surrogate.training.loop import ProgressFn, Stage, StageConfig, train_stages
 from systems.errors import InputError
 
-# The probabilities of entering phi > 0, set to those of leaving it and to how likely it is.
-# Runs from chosen starts show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries,
-# but only as well weighted as a few frames are, and a rate that is three times too high shows in no loss: nearly every
-# window holds no entry. What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella
-# sampling),
-# and in equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a
-# level of each
-# residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
+# The probabilities of entering phi > 0, set to those of leaving it and to how likely it is. Runs from chosen starts
+# show hundreds of exits from phi > 0 and hardly an entry. Read backwards, exits are entries, but only as well weighted
+# as a few frames are, and a rate that is three times too high shows in no loss: nearly every window holds no entry.
+# What is known well are the probabilities of leaving and the free energy of phi > 0 (umbrella sampling), and in
+# equilibrium as many frames enter as leave. So after training the probabilities of entering are moved, by a level of
+# each residue's type and of its neighbours', to where this holds in the mean over the frames of all training peptides.
 
 # Frames of either side by which probabilities are told, drawn anew by this seed, and how long after them.
 _SIDE_FRAMES, _SIDE_SEED = 1000, 0
@@ -91,8 +89,7 @@ class Phi:
 @torch.no_grad()
 def balance_entries(model: PeptideSlide, subjects: Sequence[PeptideSubject]) -> None:
     """Move the probabilities of entering phi > 0 of `model` to where detailed balance holds in the mean over
-    `subjects`, whose
-    weights say how likely phi > 0 is; those without weights play no part."""
+    `subjects`, whose weights say how likely phi > 0 is; those without weights play no part."""
     n_types = len(model.token_mean)
     phis = [phi for subject in subjects for phi in told_phis(model, subject)]
     if not phis:

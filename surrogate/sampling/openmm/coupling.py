@@ -156,8 +156,7 @@ def _cannot(weights: Weights) -> str:
 
 
 # Whether a frame's energy is one that the reference has: against MD's energies for models of frames, against the
-# reference's
-# own energy of the same frame for a learned potential.
+# reference's own energy of the same frame for a learned potential.
 
 
 # A potential's energy is wrong where it is off by so many times its mean absolute error at held-out states, most of

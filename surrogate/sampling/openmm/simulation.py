@@ -173,8 +173,7 @@ class Simulation:
 
     `scene` and `weights` are what the command line takes, or a Scene and loaded weights.
     `force` runs a scene that leaves the training domain where that is possible; `deviations` then says how. `lag_ps`:
-    the time of a step, of weights that were trained for several.
-    Raises OutOfDomainError, InputError, WeightsError.
+    the time of a step, of weights that were trained for several. Raises OutOfDomainError, InputError, WeightsError.
     """
 
     @options_as_keywords(SimulationOptions)

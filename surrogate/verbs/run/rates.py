@@ -49,12 +49,11 @@ class Rolls:
 @dataclass(frozen=True)
 class Rates:
     """What was measured. `stretch`: wall seconds of a second of processor time with all `cores` in use, 1 where no
-    other work shares them. `step_s`: processor seconds
-    of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all cores in a second of wall time, by the fastest way:
-    on this `platform`, `at_once` replicas on each core; `md`: in words; `expensive`: it is quantum mechanics. `rolls`:
-    of weights that cover the scene, None where none do; `coverage`: why these, or none. `without_simd`: why MD is not
-    run
-    by SIMD, where it might have been; `in_water`: in ALPB water, in which no potential learns.
+    other work shares them. `step_s`: processor seconds of a step of OpenMM's on one core; `md_ps_per_s`: of MD on all
+    cores in a second of wall time, by the fastest way: on this `platform`, `at_once` replicas on each core; `md`: in
+    words; `expensive`: it is quantum mechanics. `rolls`: of weights that cover the scene, None where none do;
+    `coverage`: why these, or none. `without_simd`: why MD is not run by SIMD, where it might have been; `in_water`: in
+    ALPB water, in which no potential learns.
     """
 
     n_atoms: int

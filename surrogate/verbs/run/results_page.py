@@ -23,28 +23,11 @@ def write_results(folder: Path, results: list[dict[str, Any]]) -> None:
     heads = "".join(f"<th>{head}</th>" for head in _HEADS)
     rows = "\n".join(_row(result) for result in results)
     n_failed = sum(bool(result["failed"]) for result in results)
-    page = f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{len(results)} molecules</title>
-<style>
-{style}
-</style>
-</head>
-<body>
-<h1>{len(results)} molecules, {n_failed} failed</h1>
-<table class="stack">
-<thead><tr>{heads}</tr></thead>
-<tbody>
-{rows}
-</tbody>
-</table>
-</body>
-</html>
+    page = f"""<!doctype html> <html lang="en"> <head> <meta charset="utf-8"> <meta http-equiv="Content-Security-Policy"
+content="default-src 'none'; style-src 'unsafe-inline'"> <meta name="viewport" content="width=device-width,
+initial-scale=1"> <meta name="color-scheme" content="light dark"> <title>{len(results)} molecules</title> <style>
+{style} </style> </head> <body> <h1>{len(results)} molecules, {n_failed} failed</h1> <table class="stack">
+<thead><tr>{heads}</tr></thead> <tbody> {rows} </tbody> </table> </body> </html>
 """
     create_whole(folder / PAGE_NAME, page)
 

@@ -35,10 +35,9 @@ class StageEntry:
 @dataclass(frozen=True)
 class Outcome:
     """What came of a run. `in_short`: use MD's answer or not, for what, why, `headline`: the same in one line;
-    `details`: how much MD the surrogate is equivalent to, and what would tell more; `on_surrogate`: what MD's
-    answer says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of MD it was compared
-    with, `rolled_ps` that was evaluated, replicas together; `equivalent_time` in words, `speed_up` over as much wall
-    time of
+    `details`: how much MD the surrogate is equivalent to, and what would tell more; `on_surrogate`: what MD's answer
+    says of the surrogate, `converged`: whether the answer passed its tests; `held_out_ps` of MD it was compared with,
+    `rolled_ps` that was evaluated, replicas together; `equivalent_time` in words, `speed_up` over as much wall time of
     the fastest MD here as a lower bound, None where it cannot be told."""
 
     headline: str

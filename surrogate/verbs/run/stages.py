@@ -273,8 +273,7 @@ def _rolled(site: Site, record: RunRecord) -> RunRecord | None:
 
 def costs_of(record: RunRecord, comparison: Comparison, held_ps: float) -> Costs:
     """Return what the trajectory that a comparison evaluates has cost, beside what `held_ps` of the run's own held-out
-    MD
-    did."""
+    MD did."""
     spent, rates = record.spent_in, _rates_and_decision(record)[0]
     # The faster of what was measured before and what it came to: the speed-up is a lower bound.
     md_ps_per_s = max(rates.md_ps_per_s, held_ps / spent.get("held-out md", math.inf))

@@ -121,8 +121,8 @@ class Samples:
 
 def domain_of(scene: Scene, samples: Samples, moving: list[Any], config: PotentialConfig) -> TrainingDomain:
     """Return what the weights cover: the reference's quieter samples say what frames look like; runs of cheap MD,
-    `moving`
-    (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own rate."""
+    `moving` (n, n_atoms, 3) each, how far they move from one to the next, hot ones since hydroxyls turn at their own
+    rate."""
     conditions = {
         "force_field": "gfn2-xtb", "solvent": "vacuum", "temperature_k": config.temperature_k,
         "friction_per_ps": config.friction_per_ps, "timestep_ps": config.timestep_ps,

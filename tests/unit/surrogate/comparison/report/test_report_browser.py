@@ -222,10 +222,9 @@ def test_viewer_plays_both_trajectories(browser: Browser, page: Path, name: str)
 def test_viewer_names_faults_and_draws_no_broken_frame(browser: Browser, page: Path) -> None:
     browser.open(page, WIDTHS["desktop"])
     show = """(() => {{ const v = document.querySelectorAll('.viewer')[1], s = v.querySelector('[data-viewer=frame]');
-      const c = v.querySelector('[data-viewer=clip]'); c.value = '1'; c.dispatchEvent(new Event('change'));
-      s.value = '{}'; s.dispatchEvent(new Event('input'));
-      return [v.querySelector('[data-viewer=fault]').textContent, v.querySelector('[data-viewer=time]').textContent];
-    }})()"""
+    const c = v.querySelector('[data-viewer=clip]'); c.value = '1'; c.dispatchEvent(new Event('change')); s.value =
+    '{}'; s.dispatchEvent(new Event('input')); return [v.querySelector('[data-viewer=fault]').textContent,
+    v.querySelector('[data-viewer=time]').textContent]; }})()"""
     fault, when = browser.run(show.format(80))
     assert "candidate: cannot be drawn" in fault and "not finite" in fault
     assert when == "81 ps, chunk 2"

@@ -227,9 +227,8 @@ def _middles(model: PeptideSlide, chain: ChainFeatures) -> torch.Tensor:
 
 def test_a_chunk_is_drawn_again_where_it_disobeys_and_rows_do_not_depend_on_others() -> None:
     """With numbers that scatter widely about the middles of states, many frames disobey; with the probabilities of
-    changes at
-    nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the end of
-    their states, and a row alone is drawn as it is in a batch."""
+    changes at nothing more of them stay in the given states after drawing again, or where torsions are mirrored at the
+    end of their states, and a row alone is drawn as it is in a batch."""
     from surrogate.models.peptides import chains as settling
     from surrogate.models.peptides import model as module
 
