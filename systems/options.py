@@ -23,7 +23,6 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import content
-from systems.files.schema import parsed
 from systems.units import format_quantity, is_openmm_quantity, openmm_number, parser_of, quantity, stem_of, unit_of
 
 T = TypeVar("T")
@@ -341,6 +340,8 @@ def flag_of(name: str) -> str:
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return a TOML file's record. Raises InputError when it is missing or malformed."""
     try:
+        from systems.files.schema import parsed  # loads NumPy
+
         return dict(parsed(content(Path(path)).decode(), tomllib.loads))
     except FileNotFoundError:
         raise InputError(f"configuration {path} does not exist.") from None

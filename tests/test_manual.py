@@ -62,7 +62,7 @@ def test_the_figure_reads_a_table_of_the_sweep(repository: Path) -> None:
     }  # fmt: skip
     measured = {
         "config": {"time_ps": 20_000.0, "threads": 1, "lag_ps": None}, "machine": {"name": "mine"},
-        "md": {"length_ps": 1e5, "floor": 0.058, "errors": [0.6]},
+        "md": {"length_ps": 1e5, "replicate_baseline": 0.058, "errors": [0.6]},
         "rows": [setting, {"label": "timed", "weights": "w"}],
     }  # fmt: skip
     record = from_bench.cost_error(measured)

@@ -30,7 +30,6 @@ from systems.scene import Scene
 from systems.units import format_time_ps
 
 if TYPE_CHECKING:
-    from surrogate.models.potential import Potential
     from surrogate.models.propagator import Propagator
 from surrogate.models.weights import TrainingDomain, Weights
 

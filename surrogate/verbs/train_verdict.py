@@ -202,6 +202,8 @@ def _advice(weights: Weights, stages: dict[str, list[dict[str, str]]], rolled: _
 
     found = _nearer_weights(weights)
     n_frames = sum(int(source.get("n_frames", 0)) for source in weights.provenance.get("sources", ()))
+    from surrogate.models.potential import Potential
+
     if isinstance(weights.model, Potential):
         n_frames = 0  # it learned from states, which need be no MD
     rows = list(stages.values())[-1] if stages else []

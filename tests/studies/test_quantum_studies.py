@@ -10,10 +10,10 @@ from typing import Any
 
 import corrected_md
 import energy_conservation
+import gain
 import numpy as np
 import pytest
 import rivals
-import speed_up
 import torch
 import torsion_profiles
 import torsion_states
@@ -158,9 +158,9 @@ def test_speed_up_is_equivalent_time_over_what_the_time_buys() -> None:
     equivalent_time = EquivalentTime(
         "rotors", "distribution", "rotors", 4_000.0, 1_000.0, None, "at least", 0.1, (1e3, 4e3), (2.0, 1.0), (), ()
     )
-    assert speed_up.speed_up_words(equivalent_time, 800.0) == "at least 5 [1.2, ...]"
-    assert speed_up.speed_up_words(replace(equivalent_time, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
-    assert speed_up.speed_up_words(replace(equivalent_time, low_ps=None), 800.0) == "at least 5"
+    assert gain.speed_up_words(equivalent_time, 800.0) == "at least 5 [1.2, ...]"
+    assert gain.speed_up_words(replace(equivalent_time, bound="", high_ps=6_000.0), 2_000.0) == "2 [0.5, 3]"
+    assert gain.speed_up_words(replace(equivalent_time, low_ps=None), 800.0) == "at least 5"
 
 
 def test_chains_that_forget_slowly_are_less_md() -> None:
@@ -170,9 +170,9 @@ def test_chains_that_forget_slowly_are_less_md() -> None:
         )
 
     evaluated: Any = SimpleNamespace(rows=[row(0.8, 0.4), row(0.8, 0.6), row(8.0, 0.1, "torsion"), row(1.0, 3.0)])
-    assert speed_up.pace(evaluated) == pytest.approx(0.5)
+    assert gain.pace(evaluated) == pytest.approx(0.5)
     evaluated.rows = [row(0.4, 0.8)]
-    assert speed_up.pace(evaluated) == 1.0
+    assert gain.pace(evaluated) == 1.0
 
 
 def test_states_of_a_torsion_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -83,7 +83,7 @@ def plot_effective(result: dict[str, Any], path: Path, sound_percent: float, for
         )
     front = [points[k] for k in pareto_front([(one["rate"], one["distance"]) for one in points])]
     axes.plot([one["rate"] for one in front], [one["distance"] for one in front], "-", color="grey", lw=0.8, zorder=0)
-    replicate_baseline = result["md"]["floor"]
+    replicate_baseline = result["md"]["replicate_baseline"]
     axes.axhline(replicate_baseline, color="black", lw=0.8, alpha=0.5)
     axes.annotate(f"two runs of {1e-3 * result['md']['length_ps']:g} ns", (0.01, replicate_baseline),
                   xycoords=("axes fraction", "data"), va="bottom", fontsize=8)  # fmt: skip

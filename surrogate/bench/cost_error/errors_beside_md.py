@@ -116,7 +116,7 @@ def compare_reference(ref: ReferenceForces, *, seed: int = 0) -> dict[str, Any]:
         "errors": list(equivalent_time.errors),
         "errors_low": list(equivalent_time.errors_low),
         "errors_high": list(equivalent_time.errors_high),
-        "floor": equivalent_time.errors[-1],
+        "replicate_baseline": equivalent_time.errors[-1],
         "correlation": [pair[0] for pair in kinetic],
         "relaxation_ps": [pair[1] for pair in kinetic],
         "slowest": slowest_torsion(samples),

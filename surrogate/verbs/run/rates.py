@@ -192,7 +192,7 @@ def rollout_rate(scene: Scene, weights: Weights, temperature_k: float, stretch: 
             progress=lambda done, total, note: seen.append((time.monotonic(), time.process_time())),
             flush_every_s=3600.0,
         )
-        if not weights.model.integrates:
+        if not isinstance(weights.model, Potential):
             relaxation_ps = _slowest_ps(files)
     # As of MD the fastest batch counts: the first chunk makes what all others use again, the last one is flushed. Where
     # other work interrupts them all, processor time tells what a chunk takes; on several cores by itself, wall time.

@@ -84,7 +84,9 @@ def test_a_true_rollout_is_equivalent_time_its_length_and_a_wrong_one_little(
     of_md = compare_reference(reference)
     for key in ("correlation", "relaxation_ps"):
         assert right[key]["value"] == pytest.approx(of_md[key][0]["value"], rel=0.15), key
-    assert of_md["floor"] == of_md["errors"][-1] < of_md["errors"][0] and of_md["lengths_ps"][-1] == N_FRAMES
+    assert (
+        of_md["replicate_baseline"] == of_md["errors"][-1] < of_md["errors"][0] and of_md["lengths_ps"][-1] == N_FRAMES
+    )
     # Negative controls: one state alone; frames in another order; a tenth of the frames torn.
     stuck, equivalent_time = compare_frames(np.repeat(frames[None, :10], 300, axis=1), reference)
     assert stuck["jsd"]["value"] > 3 * right["jsd"]["value"] and equivalent_time.bound == "less than"

@@ -88,7 +88,7 @@ def test_a_page_leaves_broken_molecules_out_of_the_front() -> None:
     md = {
         "slowest": {"torsion": 0, "name": "cos ψ", "tau_ps": 25.0, "samples": 4000.0},
         "cost": [{"label": "OpenMM, 4 fs", "way": "ours", "cpu_s_per_ns": {"mean": 8.0}}],
-        "lengths_ps": [1e3, 1e5], "errors": [0.3, 0.05], "floor": 0.05, "length_ps": 1e5,
+        "lengths_ps": [1e3, 1e5], "errors": [0.3, 0.05], "replicate_baseline": 0.05, "length_ps": 1e5,
     }  # fmt: skip
     row = {
         "weights": "w", "label": "fitted 4", "effective_per_s": 50.0, "jsd": {"value": 0.1}, "first_chunks_s": 2.0,

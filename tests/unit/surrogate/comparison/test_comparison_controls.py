@@ -224,7 +224,7 @@ def test_fifty_kelvin_show_in_the_width_of_bonds(inputs: ComparisonInput, alanin
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_wrong_time_axis_shows_in_the_relaxation_time(simulate: Callable[..., Ensemble], factor: float) -> None:
     longer = (simulate(71, 40_000), simulate(72, 40_000), simulate(73, 40_000))
-    found = compare(longer, frames_of(longer), lag_ps=factor)
+    found = evaluate(longer, frames_of(longer), lag_ps=factor)
     assert found.row("tic0_timescale").verdict == "differs"
     row = found.row("correlation_time")
     assert row.verdict == "differs"

@@ -85,7 +85,7 @@ def test_folders_that_are_not_a_runs_are_left_alone(tmp_path: Path) -> None:
 def test_without_ambertools_a_run_ends_in_one_line_and_peptides_are_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for place in ("gaff", "ambertools"):
+    for place in ("gaff", "programs"):
         monkeypatch.setattr(f"md_reference.forces.small_molecules.{place}.find_ambertools", lambda: None)
     monkeypatch.setenv("SURROMD_CACHE", str(tmp_path / "cache"))
     for resume in (False, True):
