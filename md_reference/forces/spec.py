@@ -8,12 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from systems.errors import InputError, PreparationError, UnknownNameError, nearest
 from systems.options import check_options, option
-from systems.scene import Scene
 from systems.units import parse_mass_da
+
+if TYPE_CHECKING:
+    from systems.scene import Scene
 
 PROTEIN_FORCE_FIELDS = ("ff14SB", "ff19SB", "ff99SB-ILDN", "charmm36")
 QUANTUM = "gfn2-xtb"

@@ -98,9 +98,7 @@ def test_an_nmr_entry_is_rolled_out_as_downloaded(tmp_path: Path) -> None:
     assert molecule_key(scene) == molecule_key(ALA2)
     assert scene.provenance["repairs"] == ["2 models in the file: the first is taken"]
     assert scene.positions_nm * 10 == pytest.approx(_models()[0], abs=6e-4)
-    result = run(
-        "rollout", str(path), "--weights", "alanine-dipeptide", "--time", "100ps", "-o", str(out), "--seed", "1"
-    )
+    result = run("rollout", str(path), "--weights", "alanine-dipeptide", "--time", "1ns", "-o", str(out), "--seed", "1")
     assert result.exit_code == 0, result.stderr
     assert "2 models in the file: the first is taken" in result.stderr
 

@@ -109,8 +109,13 @@ def plot(result: dict[str, Any], path: Path, form: str = "svg") -> None:
         if style == "-":
             axes.fill_between(x, md["errors_low"], md["errors_high"], color="black", alpha=0.1, lw=0)
     axes.axhline(md["replicate_baseline"], color="black", lw=0.8, alpha=0.5)
-    axes.annotate(f"two runs of {1e-3 * md['length_ps']:g} ns", (0.01, md["replicate_baseline"]), xycoords=("axes fraction", "data"),
-                  va="bottom", fontsize=8)  # fmt: skip
+    axes.annotate(
+        f"two runs of {1e-3 * md['length_ps']:g} ns",
+        (0.01, md["replicate_baseline"]),
+        xycoords=("axes fraction", "data"),
+        va="bottom",
+        fontsize=8,
+    )
     evaluated = _evaluated(result)
     for solver in dict.fromkeys(row["solver"] for row in evaluated):
         axes.plot([], [], "o", color=_colour(solver), label=solver or "surrogate")

@@ -51,7 +51,7 @@
         }
       }
       found.sort((p, q) => p - q);
-      return Math.max(0.1, found[Math.replicate baseline(0.95 * (found.length - 1))] || 0);
+      return Math.max(0.1, found[Math.floor(0.95 * (found.length - 1))] || 0);
     };
     const extent = farthest((x, y, z) => Math.hypot(x, y, z));
     const reach = Math.max(farthest((x, y) => Math.abs(y)), 0.6 * extent);

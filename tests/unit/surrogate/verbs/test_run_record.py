@@ -242,7 +242,9 @@ def test_where_md_was_the_better_choice_it_is_said() -> None:
 def test_md_claims_no_speed_up() -> None:
     found = told("md", equivalent_time())
     assert found.speed_up is None
-    assert found.details.startswith("16 replicas of 3.1 ns of MD, evaluated by 32 replicas of 380 ps: worth 10 ns")
+    assert found.details.startswith(
+        "16 replicas of 3.1 ns of MD, evaluated by 32 replicas of 380 ps: equivalent to 10 ns"
+    )
     assert "No equivalent MD time is told" in told("rollout", None).details
 
 

@@ -42,7 +42,9 @@ def references(
     for k in range(2):
         paths.append(folder / f"r{k}.h5")
         with open_writer(paths[-1], alanine_dipeptide, record) as writer:
-            writer.append(harmonic_frames.positions_nm(np.arange(400 * k, 400 * (k + 1))), np.arange(400) + 1.0)
+            writer.append(
+                harmonic_frames.positions_nm(np.arange(400 * k, 400 * (k + 1))), 10.0 * (np.arange(400) + 1.0)
+            )
     return paths
 
 
