@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 from md_reference.forces.spec import QUANTUM, ForceFieldSpec
 from systems.errors import InputError, UnknownNameError, nearest
 from systems.files.outside import check_disk
-from systems.library import named_scenes
-from systems.library.named_scenes import find_protocol
 from systems.options import option
 from systems.units import format_time_ps, whole_steps
 
@@ -248,12 +246,14 @@ def _of_quantum(asked: Mapping[str, Any]) -> dict[str, Any]:
 
 def _decisive(name: str, protocol: str | None) -> tuple[dict[str, Any], tuple[str, str]]:
     """Return the settings that come before the program's defaults, and how they and their source are called."""
+    from systems.library import named_scenes  # loads NumPy, for which help need not wait
+
     own = named_scenes.own_settings(name) if named_scenes.knows(name) else {}
     if protocol is None:
         return own, ("by the system's own settings", named_scenes.source_of_settings(name) if own else "")
     if own:
         raise InputError(f"{name} brings its own law and its own settings; leave `protocol` out.")
-    found = find_protocol(protocol)
+    found = named_scenes.find_protocol(protocol)
     return dict(found.settings), (f"by protocol {found.name}", found.source)
 
 
