@@ -27,7 +27,7 @@ from systems.errors import InputError, SimulationError
 from systems.trajectory.codec import open_trajectory
 
 # As if a second of MD made a hundredth of a ps: runs end by their length, not by the clock.
-RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("alanine-dipeptide", 1.0, 0.25))
+RATES = Rates(22, 1, 1.0, False, "OBC2", 5e-3, 0.004, 0.1, "trained on it", Rolls("peptides", 1.0, 0.25))
 BUDGET_S = 400.0
 OPENMM, SIMD = RATES, replace(RATES, platform="simd", at_once=16, md_ps_per_s=0.8)
 needs_compiler = pytest.mark.skipif(not (shutil.which("g++") or shutil.which("c++")), reason="no C++ compiler")
