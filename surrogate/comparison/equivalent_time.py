@@ -237,7 +237,7 @@ def _crossing(log_error: float, log_lengths: FloatArray, curve: FloatArray) -> f
 def headline(
     found: Sequence[EquivalentTime], cost_ratio: Callable[[EquivalentTime], float | None], length_ps: float
 ) -> str:
-    """Return 'Equivalent MD time 38 ns [25 ns, 60 ns] of MD by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns
+    """Return 'Equivalent MD time 38 ns [25 ns, 60 ns] by its φ/ψ map, at 1/900 of its cost; by its kinetics 3 ns
     [...].'
 
     `cost_ratio(worth)`: the cost of that much MD over that of the share of the candidate which is worth it, None when a
@@ -247,7 +247,7 @@ def headline(
     first = next((w for w in found if w.kind == "distribution"), None)
     if first is None:
         return ""
-    text = f"Equivalent MD time {first.in_words()} of MD by its {first.measure}"
+    text = f"Equivalent MD time {first.in_words()} by its {first.measure}"
     ratio = cost_ratio(first)
     if ratio is not None and first.bound != "less than":
         part = (
@@ -276,7 +276,7 @@ def equivalent_time_charts(found: Sequence[EquivalentTime]) -> list[LineChart]:
         charts.append(
             LineChart(
                 section="equivalent_time",
-                title=f"Equivalent MD time by {w.measure}: {w.in_words()} of MD",
+                title=f"Equivalent MD time by {w.measure}: {w.in_words()}",
                 caption="Distance to the reference of reference MD of each length (typical piece; band: 10 to 90 % of "
                 "the pieces) and of the candidate. Where the lines cross, MD is as good as the candidate.",
                 x_label=f"length of MD / {unit}",

@@ -256,4 +256,4 @@ def _sorted(rows: Sequence[Row]) -> tuple[list[str], list[str], list[str]]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return "; ".join(names)
