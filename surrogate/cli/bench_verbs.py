@@ -68,7 +68,7 @@ def stress(
     options: StressOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """How WEIGHTS stand long rollouts, odd inputs, other arithmetic and settings, beside OpenMM itself."""
+    """Stress-test WEIGHTS: long rollouts, unusual inputs, precision, solvers, beside OpenMM."""
     from surrogate.bench.stress.trials import choose_config, stress_weights
 
     quiet = options.quiet or as_json

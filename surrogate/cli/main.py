@@ -138,7 +138,7 @@ def demo(
     *,
     options: DemoOptions,
 ) -> None:
-    """The whole way on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
+    """Demonstration on alanine dipeptide: OpenMM, a rollout with shipped weights, the comparison."""
     from surrogate import api
 
     result = api.demo(out, options=options)
@@ -154,7 +154,7 @@ def run(
     options: RunOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """SCENE and a budget in, an evaluated trajectory out, by what pays best on this machine."""
+    """Simulate SCENE within a wall-time budget, by MD and a surrogate, and evaluate the result."""
     from surrogate import api
 
     if out is None and not options.dry_run:
@@ -170,7 +170,7 @@ def systems(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="System to describe.")] = None,
     as_json: JsonOpt = False,
 ) -> None:
-    """List the library of named scenes, or describe one."""
+    """List the systems of the library, or describe one."""
     from surrogate import api
 
     found = api.systems(name)
@@ -185,7 +185,7 @@ def systems(
 @app.command()
 @with_options
 def plan(scene: SceneArg, *, options: PlanOptions, as_json: JsonOpt = False) -> None:
-    """What a reference run of SCENE will do, what it skips, why, and what that saves."""
+    """Show what a reference run of SCENE will do, what it skips and how long it takes."""
     from surrogate import api
 
     summary = api.plan(scene, options=options)
@@ -223,7 +223,7 @@ def campaign(
     options: CampaignOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run it again to go on."""
+    """Simulate many scenes, temperatures and replicas with OpenMM, on Dask; run again to continue."""
     from surrogate import api
 
     result = api.campaign(file, out, options=options)
@@ -250,7 +250,7 @@ def windows(
     options: WindowsOptions,
     as_json: JsonOpt = False,
 ) -> None:
-    """Turn reference trajectories into training data: one compact file."""
+    """Convert reference trajectories into one compact training file."""
     from surrogate import api
 
     print_written([api.windows(references, out, options=options)], as_json, options.quiet)
@@ -271,7 +271,7 @@ def train(
     ] = False,
     as_json: JsonOpt = False,
 ) -> None:
-    """Train a surrogate that suits the reference trajectories, or a potential of a molecule's quantum forces."""
+    """Train a surrogate on reference trajectories, or a potential of one molecule on quantum forces."""
     from surrogate import api
 
     if explain:
@@ -291,7 +291,7 @@ def train(
 def rollout(
     scene: SceneArg, *, weights: WeightsOpt = None, out: OutOpt, options: RolloutOptions, as_json: JsonOpt = False
 ) -> None:
-    """Roll SCENE forward with a trained surrogate, in chunks."""
+    """Generate a trajectory of SCENE with a trained surrogate."""
     from surrogate import api
 
     print_written(api.rollout(scene, weights, out, options=options), as_json, options.quiet)
@@ -321,7 +321,7 @@ def compare(
     options: CompareShown,
     as_json: JsonOpt = False,
 ) -> None:
-    """Evaluate trajectories against a reference: is it right, how wrong is it, what did it cost?"""
+    """Compare trajectories with a reference: accuracy, error bars, verdict, cost."""
     from surrogate import api
 
     result = api.compare(reference, candidates, out, options=options)
@@ -345,7 +345,7 @@ def info(
     ] = None,
     as_json: JsonOpt = False,
 ) -> None:
-    """What a file is and where it came from; of weights and a scene, whether they cover it."""
+    """Describe a file and its origin; with weights and a SCENE, whether they cover it."""
     from surrogate import api
 
     found = api.info(path, scene)
