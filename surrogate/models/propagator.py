@@ -137,7 +137,7 @@ class Propagator(nn.Module, ABC):
             noise: `(b, *noise_shape(n_atoms))`.
             solver_steps, solver: of a model with `solvers`; None is the first of them.
             last_velocities_nm_ps: `(b, n_atoms, 3)`, nm/ps, what the chunk before ended in, where it had velocities;
-                None where a rollout begins, and a model that carries velocities draws them from its noise.
+            None where a rollout begins, and a model that carries velocities draws them from its noise.
         """
 
 
