@@ -28,7 +28,7 @@ from systems.scene import FloatArray
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 SPEC = ForceFieldSpec("ff14SB", "tip3p")
-STEP_PS, NVE_PS, EVERY, OPENMM_RUNS = 0.002, 100.0, 500, 6
+STEP_PS, NVE_PS, EVERY, OPENMM_RUNS = 0.002, 100.0, 500, 3
 BATH_STEP_PS, WARM_PS, NVT_PS = 0.004, 20.0, 40.0
 
 
