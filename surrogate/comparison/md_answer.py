@@ -34,6 +34,8 @@ _CLUSTERED_FRAMES = 10_000
 _MAP_BINS = 36
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
+# What a surrogate is taken to be off by in the population of a state: weights keep no such number.
+MODEL_ERROR = 0.1
 # A state that has a smaller share of a rollout is no reason to begin there.
 _DRAWN_SHARE = 2e-3
 
@@ -92,10 +94,24 @@ class Answer:
         return self.holds and bool(self.timescales_ps or not self.missing)
 
     @property
+    def is_by_surrogate(self) -> bool:
+        """Whether the surrogate's populations are the better answer for now: MD's errors are larger than what a
+        surrogate is taken to be off by, and MD contradicts it nowhere."""
+        both = [s for s in self.states if s.surrogate is not None and not s.missing]
+        if not both or any(s.differs for s in both):
+            return False
+        by_md, rolled = (math.sqrt(sum(e * e for e in errors) / len(both))
+                         for errors in ([s.error for s in both], [s.surrogate_error or 0.0 for s in both]))  # fmt: skip
+        return by_md > math.hypot(MODEL_ERROR, rolled)
+
+    @property
     def in_short(self) -> tuple[str, str, str]:
         """Three lines: whether to use it, for what and what is missing, why."""
         told = [s for s in self.states if not s.missing]
-        if not self.is_sure:
+        if self.is_by_surrogate:
+            use = "Use the surrogate's populations for now, not MD's."
+            what = f"For {len(told)} states, to about {100 * MODEL_ERROR:.0f} % (assumed); MD does not contradict them."
+        elif not self.is_sure:
             use, what = "Do not use MD's populations yet.", f"They show which states there are: {len(self.states)}."
         else:
             widest = 100 * max((s.error for s in told), default=0.0)
@@ -108,7 +124,10 @@ class Answer:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
             slow = f"; the slowest process takes {format_time_ps(self.timescales_ps[0], 2)}{error}"
         length = f"{self.n_replicas} replicas of {format_time_ps(self.replica_ps, 2)}"
-        not_yet = "" if self.is_sure else " and has not converged"
+        if self.is_by_surrogate:
+            not_yet = f" and off by up to {100 * max(s.error for s in told):.2g} %"
+        else:
+            not_yet = "" if self.is_sure else " and has not converged"
         return use, what + missing, f"Why: MD is {length}, weighed by {self.tests}{not_yet}{slow}."
 
     @property
@@ -144,6 +163,7 @@ class Answer:
         maps = {k: [[x if math.isfinite(x) else None for x in row] for row in m.tolist()] for k, m in self.maps.items()}
         own = {
             "in_short": list(self.in_short),
+            "populations_by": "surrogate" if self.is_by_surrogate else "MD",
             "on_surrogate": self.on_surrogate,
             "states": states,
             "maps_kj_mol": maps,

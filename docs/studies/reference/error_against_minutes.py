@@ -1,14 +1,18 @@
 """Error of the final answer against minutes: `surromd run`, MD from one start, MD from many, a rollout alone.
 
-    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 30ns] [--replicas 16]
+    python docs/studies/reference/error_against_minutes.py reference FOLDER [--time 30ns] [--replicas 32]
     python docs/studies/reference/error_against_minutes.py runs FOLDER [--minutes 1 3 10]
+    python docs/studies/reference/error_against_minutes.py rivals FOLDER [--minutes 10]
     python docs/studies/reference/error_against_minutes.py table FOLDER [-o TABLE.json] [--figure FIGURE.svg]
 
 `reference` makes FOLDER/NAME/run_000.h5 and on, SIMD replicas from many starts, frames 10 ps apart, a batch of every
-molecule before the next. `runs` spends each budget in four ways in FOLDER/NAME/MINUTESmin. What is there is left alone,
-and what was stopped goes on. `table` lays all beside the reference: mean Jensen-Shannon distance of
-torsions (50 bins), root mean square error of free energies of states, how many 95 % intervals of populations, and of
-equivalent MD time, hold, and whether the verdict is right or "not converged".
+molecule before the next. `runs` spends each budget by `surromd run` in FOLDER/NAME/MINUTESmin, on the cores it may use:
+it alone needs a quiet machine (`taskset -c 0` for one core). `rivals` makes MD from one start (NAME/one) and a rollout
+(NAME/rollout) as long as the whole budget buys by the rates that the runs measured, reports and preparation for
+nothing. MD from many starts is a batch of the reference, beside the others. What is there is left alone, and what was
+stopped goes on. `table` lays all beside the reference: mean Jensen-Shannon distance of torsions (50 bins), root mean
+square error of free energies of states, how many 95 % intervals of populations, and of equivalent MD time, hold, and
+whether the verdict is right or "not converged".
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import math
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +44,9 @@ from surrogate.verbs.options import ReferenceOptions
 from surrogate.verbs.reference import resolve_run
 from surrogate.verbs.run.run_record import RUN_NAME
 from surrogate.verbs.run.run_result import RunResult
-from surrogate.verbs.run.stage_clock import Clock
-from systems.errors import OutOfDomainError, SurromdError
+from systems.errors import SurromdError
 from systems.library.named_scenes import prepare
+from systems.trajectory.checkpoint import checkpoint_path
 from systems.units import GAS_CONSTANT_KJ_MOL_K, format_time_ps, parse_time_ps
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,7 +67,7 @@ MOLECULES = {
     "chignolin": "chignolin",
 }
 WAYS = {"run": "surromd run", "one": "MD from one start", "many": "MD from many starts", "rollout": "rollout alone"}
-KELVIN, SEED, EVERY_PS, BINS = 300.0, 5_000, 10.0, 50
+KELVIN, SEED, EVERY_PS, BINS, LEFT_OUT_PS = 300.0, 5_000, 10.0, 50, 5_000.0
 # A state with a smaller share is left out of free energies; one that is never visited counts as so rare.
 RARE, NEVER = 0.01, 1e-3
 ENOUGH_R_HAT, HELD = 1.05, 0.95
@@ -85,58 +89,71 @@ def make_reference(folder: Path, names: Sequence[str], time_ps: float, replicas:
             said(f"{name}: {first + size} replicas of {format_time_ps(time_ps)}")
 
 
-def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float], weights: str | None) -> None:
-    """Spend every budget in every way."""
+def make_runs(folder: Path, names: Sequence[str], minutes: Sequence[float]) -> None:
+    """Run every molecule with every budget; a run that is there is gone on with, unless it is done."""
     for budget in sorted(minutes):
         for name in names:
-            place, budget_s = folder / name / f"{budget:g}min", 60.0 * budget
-            spent(place / "run", name, budget_s, weights=weights)
-            for way in ("one", "many"):
-                spent(place / way, name, budget_s, way="md", starts=way, weights=weights)
-            rolled(place, name, budget_s)
+            out = folder / name / f"{budget:g}min"
+            is_there = (out / RUN_NAME).is_file()
+            if is_there and RunResult.of(out)["outcome"]:
+                continue
+            try:
+                sm.run(MOLECULES[name], out, budget_s=60.0 * budget, quiet=True, resume=is_there)
+            except SurromdError as error:  # its line of the table stays empty, and the next time it goes on
+                said(f"{out}: {error}")
             said(f"{name}: {budget:g} min")
 
 
-def spent(out: Path, name: str, budget_s: float, **how: Any) -> None:
-    """Run a molecule, or go on, unless that is done. Weights that are named are left out where they do not cover it."""
-    is_there = (out / RUN_NAME).is_file()
-    if is_there and RunResult.of(out)["outcome"]:
-        return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if is_there and "weights" in how:
-        how["weights"] = RunResult.of(out)["settings"]["weights"]
-    try:
-        sm.run(MOLECULES[name], out, budget_s=budget_s, quiet=True, resume=is_there, **how)
-    except OutOfDomainError:
-        sm.run(MOLECULES[name], out, budget_s=budget_s, quiet=True, overwrite=True, **(how | {"weights": None}))
-    except SurromdError as error:  # its line of the table stays empty, and the next time it goes on
-        said(f"{out}: {error}")
+def make_rivals(folder: Path, names: Sequence[str], most_minutes: float) -> None:
+    """Make MD from one start and a rollout of the lengths that this machine makes in the longest budget, by the rates
+    that the runs measured; a shorter budget is the first part of these."""
+    for name in names:
+        rates = [rates_of(folder / name, m) for m in budgets(folder / name) if m <= most_minutes]
+        if not rates:
+            continue
+        longest = max(md_length_ps(r, m) for r, m in rates)
+        place = folder / name / "one"
+        place.mkdir(exist_ok=True)
+        options = ReferenceOptions(
+            time_ps=EVERY_PS * math.ceil(longest / EVERY_PS), save_every_ps=EVERY_PS, seed=SEED + 900, platform="simd",
+            starts="one", quiet=True,
+        )  # fmt: skip
+        scene, config, _ = resolve_run(prepare(MOLECULES[name]), options, {"time_ps": options.time_ps}, quiet=True)
+        simulate_replicas(scene, config, [place / f"run_{k:03d}.h5" for k in range(n_replicas())], resume=True)
+        rolls = rates[-1][0]["rolls"]
+        if rolls:
+            every_ps = max(EVERY_PS, rolls["lag_ps"])
+            time_ps = every_ps * math.ceil(max(rolled_length_ps(r, m) for r, m in rates) / every_ps)
+            out = folder / name / "rollout" / "rolled.h5"
+            out.parent.mkdir(exist_ok=True)
+            sm.rollout(
+                MOLECULES[name], rolls["weights"], out, time_ps=time_ps, save_every_ps=every_ps,
+                replicas=rolls["replicas"], seed=SEED, resume=True, quiet=True,
+            )  # fmt: skip
+        said(f"{name}: rivals")
 
 
-def rolled(place: Path, name: str, budget_s: float) -> None:
-    """Roll for the whole budget with the weights that the run took; nothing where no weights cover the molecule."""
-    rates = RunResult.of(place / "run")["rates"]
-    rolls = rates["rolls"] if rates else None
-    done = place / "rollout" / "done"
-    if rolls is None or done.exists():
-        return
-    done.parent.mkdir(parents=True, exist_ok=True)
-    clock = Clock(budget_s, 0.0, lambda _: None)
-    every_ps = rolls["lag_ps"]
-    time_ps = every_ps * math.ceil(3.0 * budget_s * rolls["ps_per_s"] / rolls["replicas"] / every_ps)
-    clock.work(
-        "rollout",
-        budget_s,
-        lambda: sm.rollout(
-            MOLECULES[name], rolls["weights"], done.parent / "rolled.h5", time_ps=time_ps, save_every_ps=every_ps,
-            replicas=rolls["replicas"], seed=SEED, resume=True, quiet=True,
-        ),
-    )  # fmt: skip
-    done.write_text(f"{clock.spent_s:.1f} s\n")
+def budgets(place: Path) -> list[float]:
+    """Return the budgets, in minutes, of the runs of a molecule that are done."""
+    found = [p for p in place.glob("*min") if (p / RUN_NAME).is_file() and RunResult.of(p)["outcome"]]
+    return sorted(float(p.name[:-3]) for p in found)
+
+
+def rates_of(place: Path, minutes: float) -> tuple[dict[str, Any], float]:
+    return RunResult.of(place / f"{minutes:g}min")["rates"], minutes
+
+
+def md_length_ps(rates: dict[str, Any], minutes: float) -> float:
+    """Return how long each of sixteen replicas comes to be when the whole budget goes into MD."""
+    return 60.0 * minutes * float(rates["md_ps_per_s"]) / n_replicas()
+
+
+def rolled_length_ps(rates: dict[str, Any], minutes: float) -> float:
+    return 60.0 * minutes * float(rates["rolls"]["ps_per_s"]) / float(rates["rolls"]["replicas"])
 
 
 @dataclass(frozen=True, eq=False)
-class ReferenceForces:
+class LongMD:
     """Long MD of one molecule: its angles, its own answer, and whether it has forgotten where it began."""
 
     files: list[Path]
@@ -148,20 +165,37 @@ class ReferenceForces:
     replicate_baseline: float
 
     @classmethod
-    def of(cls, folder: Path) -> ReferenceForces | None:
-        """Return what a folder of replicas tells, None for fewer than four."""
-        files = sorted(folder.glob("run_*.h5"))
-        if len(files) < 4:
-            return None
-        ensemble = load_ensemble(files)
+    def of(cls, files: Sequence[Path]) -> LongMD:
+        """Return what files of replicas tell; the first part of each is left out, as hot starts are to be forgotten."""
+        whole = load_ensemble(files)
+        ensemble = stretch(whole, round(LEFT_OUT_PS / whole.lag_ps), None)
         baseline = Baseline.of(ensemble, parent=ensemble.scene, kept=ensemble.kept)
         angles = measured(baseline, ensemble)
         halves = ({k: x[: len(x) // 2] for k, x in angles.items()}, {k: x[len(x) // 2 :] for k, x in angles.items()})
         r_hat = tested_reference([ensemble]).r_hat
-        return cls(files, baseline, ensemble, angles, md_answer(ensemble, KELVIN), r_hat, torsion_distance(*halves))
+        answer = md_answer(ensemble, KELVIN)
+        return cls(list(files), baseline, ensemble, angles, answer, r_hat, torsion_distance(*halves))
 
-    def of_files(self, files: Sequence[Path]) -> Angles:
-        return measured(self.baseline, load_ensemble(files, template=self.ensemble.scene))
+    def load(self, files: Sequence[Path], first_ps: float | None = None) -> Ensemble:
+        """Return other files of the molecule, or what is first in each."""
+        found = load_ensemble(files, template=self.ensemble.scene)
+        return found if first_ps is None else stretch(found, 0, max(2, round(first_ps / found.lag_ps)))
+
+    def errors(self, of: Ensemble, weights: Sequence[FloatArray] | None = None) -> tuple[float, float]:
+        """Return the distance of torsions, and the error of free energies in kJ/mol."""
+        angles = measured(self.baseline, of)
+        return torsion_distance(self.angles, angles, weights), energy_error(self.angles, angles, weights)
+
+
+def stretch(ensemble: Ensemble, first: int, last: int | None) -> Ensemble:
+    """Return frames `first` to `last` of each segment."""
+    return replace(
+        ensemble,
+        segments=[np.asarray(s[first:last]) for s in ensemble.segments],
+        flags=None if ensemble.flags is None else [f[first:last] for f in ensemble.flags],
+        chunk_idx=None if ensemble.chunk_idx is None else [c[first:last] for c in ensemble.chunk_idx],
+        changed=None if ensemble.changed is None else [c[first:last] for c in ensemble.changed],
+    )
 
 
 def measured(baseline: Baseline, ensemble: Ensemble) -> Angles:
@@ -225,7 +259,7 @@ def intervals_held(told: dict[str, Any], ref: Answer) -> tuple[int, int]:
     return held, total
 
 
-def equivalent_time_held(result: RunResult, ref: ReferenceForces) -> bool | None:
+def equivalent_time_held(result: RunResult, ref: LongMD) -> bool | None:
     """Return whether the equivalent MD time that a run tells of its rollout holds what long MD tells of it, None where
     it tells none."""
     told = of_distribution(json.loads((result.folder / "report.json").read_text("utf-8"))["evaluations"][0])
@@ -248,55 +282,72 @@ def of_distribution(evaluated: dict[str, Any]) -> dict[str, Any] | None:
     return next((w for w in evaluated["equivalent_time"] if w["kind"] == "distribution"), None)
 
 
-def row(name: str, minutes: float, place: Path, ref: ReferenceForces) -> dict[str, Any]:
-    """Return a line of the table; a way that was not gone has no error."""
+def row(name: str, minutes: float, place: Path, ref: LongMD, batches: list[LongMD]) -> dict[str, Any]:
+    """Return a line of the table; a way that is not there has no error."""
+    result = RunResult.of(place / f"{minutes:g}min")
+    rates = result["rates"]
+    md_ps = md_length_ps(rates, minutes)
+    found: dict[str, tuple[float, float]] = {}
+    weighted = [sm.frame_weights(f) for f in result.md] if result.answer else None
+    found["run"] = ref.errors(ref.load(result.md), weighted)
+    if one := finished(place / "one"):
+        found["one"] = ref.errors(ref.load(one, md_ps))
+    if len(batches) > 1:  # of the reference itself, beside the rest of it
+        own = batches[0].load(batches[1].files, md_ps)
+        found["many"] = batches[0].errors(own, own_weights(own))
+    if rates["rolls"] and (rolled := finished(place / "rollout")):
+        found["rollout"] = ref.errors(ref.load(rolled, rolled_length_ps(rates, minutes)))
     line: dict[str, Any] = {
-        "molecule": name,
-        "minutes": minutes,
-        "R-hat": round(ref.r_hat, 3) if math.isfinite(ref.r_hat) else None,
-        "reference's halves": round(ref.replicate_baseline, 4),
-    }
-    for way in WAYS:
-        if way == "rollout":
-            files = sorted((place / way).glob("rolled*.h5")) if (place / way / "done").exists() else []
-            weights = None
-        else:
-            is_done = (place / way / RUN_NAME).is_file() and RunResult.of(place / way)["outcome"]
-            files = RunResult.of(place / way).md if is_done else []
-            weights = None if way == "one" else [sm.frame_weights(f) for f in files]
-        if not files:
-            continue
-        angles = ref.of_files(files)
-        line[f"{way}: distance"] = round(torsion_distance(ref.angles, angles, weights), 4)
-        error = energy_error(ref.angles, angles, weights)
-        line[f"{way}: kJ/mol"] = round(error, 3) if math.isfinite(error) else None
-    if "run: distance" in line:
-        result = RunResult.of(place / "run")
-        held, total = intervals_held(result.answer, ref.answer)
-        line |= {"way": result["decision"]["way"], "intervals held": held, "of": total}
-        line["equivalent MD time held"] = equivalent_time_held(result, ref)
-        if not result["outcome"]["converged"]:
-            line["verdict"] = "not converged"
-        else:
-            line["verdict"] = "right" if held >= HELD * total - 1.0 else "wrong"
+        "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
+        "R-hat": rounded(ref.r_hat), "reference's halves": rounded(ref.replicate_baseline),
+    }  # fmt: skip
+    for way, (distance_, kj_mol) in found.items():
+        line |= {f"{way}: distance": rounded(distance_), f"{way}: kJ/mol": rounded(kj_mol)}
+    held, total = intervals_held(result.answer, ref.answer)
+    line |= {"intervals held": held, "of": total, "equivalent MD time held": equivalent_time_held(result, ref)}
+    if not result["outcome"]["converged"]:
+        line["verdict"] = "not converged"
+    else:
+        line["verdict"] = "right" if held >= HELD * total - 1.0 else "wrong"
     return line
 
 
-def make_table(folder: Path, out: Path | None, figure: Path | None) -> None:
+def rounded(value: float) -> float | None:
+    return float(f"{value:.4g}") if math.isfinite(value) else None
+
+
+def own_weights(md: Ensemble) -> Sequence[FloatArray] | None:
+    """Return the weights that MD's own transitions give its frames, None where they tell none."""
+    try:
+        return md_answer(md, KELVIN).weights
+    except SurromdError:
+        return None
+
+
+def finished(place: Path) -> list[Path]:
+    """Return the trajectories of a folder that are done."""
+    return [p for p in sorted(place.glob("*.h5")) if not checkpoint_path(p).exists()]
+
+
+def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Path | None) -> None:
     """Lay all runs beside the references, print and write the table and the figure."""
     rows = []
-    for name in MOLECULES:
-        ref = ReferenceForces.of(folder / name)
-        if ref is None:
+    size = n_replicas()
+    for name in names:
+        files = finished(folder / name)
+        if len(files) < size or not budgets(folder / name):
             continue
+        parts = [files[k : k + size] for k in range(0, len(files) - size + 1, size)]
+        ref = LongMD.of(files)
+        batches = [LongMD.of(part) for part in parts] if len(parts) > 1 else [ref]
         warning = "" if ref.r_hat < ENOUGH_R_HAT else ", not converged itself"
         length = f"{len(ref.files)} replicas of {format_time_ps(ref.answer.replica_ps)}"
         said(f"{name}: {length}, split R-hat {ref.r_hat:.3f}{warning}")
-        for place in sorted((folder / name).glob("*min"), key=lambda p: float(p.name[:-3])):
-            rows.append(row(name, float(place.name[:-3]), place, ref))
+        for minutes in budgets(folder / name):
+            rows.append(row(name, minutes, folder / name, ref, batches))
             said("  " + ", ".join(f"{k} {v}" for k, v in rows[-1].items()))
     if not rows:
-        raise SystemExit(f"{folder} holds no reference of four replicas with runs beside it.")
+        raise SystemExit(f"{folder} holds no reference of {size} replicas with runs beside it.")
     table = {
         "command": "python docs/studies/reference/error_against_minutes.py table FOLDER",
         "machine": machine_name(),
@@ -375,23 +426,25 @@ def said(line: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    parts = {name: verbs.add_parser(name) for name in ("reference", "runs", "table")}
+    parts = {name: verbs.add_parser(name) for name in ("reference", "runs", "rivals", "table")}
     for part in parts.values():
         part.add_argument("folder", type=Path)
         part.add_argument("--molecules", nargs="+", choices=sorted(MOLECULES), default=list(MOLECULES))
     parts["reference"].add_argument("--time", type=lambda text: parse_time_ps(text, "--time"), default=30_000.0)
-    parts["reference"].add_argument("--replicas", type=int, default=16)
+    parts["reference"].add_argument("--replicas", type=int, default=32)
     parts["runs"].add_argument("--minutes", nargs="+", type=float, default=[1.0, 3.0, 10.0])
-    parts["runs"].add_argument("--weights", help="of the rollouts, where those that cover a molecule are not wanted")
+    parts["rivals"].add_argument("--minutes", type=float, default=10.0)
     parts["table"].add_argument("-o", "--out", type=Path)
     parts["table"].add_argument("--figure", type=Path)
     given = parser.parse_args()
     if given.verb == "reference":
         make_reference(given.folder, given.molecules, given.time, given.replicas)
     elif given.verb == "runs":
-        make_runs(given.folder, given.molecules, given.minutes, given.weights)
+        make_runs(given.folder, given.molecules, given.minutes)
+    elif given.verb == "rivals":
+        make_rivals(given.folder, given.molecules, given.minutes)
     else:
-        make_table(given.folder, given.out, given.figure)
+        make_table(given.folder, given.molecules, given.out, given.figure)
 
 
 if __name__ == "__main__":

@@ -25,15 +25,15 @@ class Plan(NamedTuple):
 # MD without a surrogate is compared with itself: it is split by replicas, or by stages if there is one replica.
 PLANS: dict[Way, Plan] = {
     "md": Plan("MD for the whole budget, from many starts", {"md": 1.0}),
-    "rollout": Plan(
-        "a rollout finds the states, MD from its frames weighs them", {"rollout": 0.15, "held-out md": 0.85}
-    ),
+    "rollout": Plan("a rollout finds the states, MD from its frames weighs them", {"rollout": 0.1, "held-out md": 0.9}),
     "potential": Plan(
         "a potential that learns from GFN2-xTB finds the states, MD weighs them",
         {"train": 0.6, "rollout": 0.1, "held-out md": 0.3},
     ),
 }
 _BY_STAGES: dict[Stage, float] = {"md": 0.5, "held-out md": 0.5}
+# Where MD cannot come as near in its time as the rollout does, it only tests that, in no less than half of it.
+_MOST_ROLLED = 0.5
 MD_STAGES: tuple[Stage, ...] = ("md", "held-out md")
 LEAST_BUDGET_S = 20.0
 # Of a budget: what is planned with, for stages take a while to stop.
@@ -48,8 +48,6 @@ LEAST_TRAINING_S = 240.0
 _REPORT_SHARE, _READING_S = 0.15, (3.0, 0.055, 7e-7)
 _LEAST_FRAMES, _MOST_FRAMES = 4_000, 400_000
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# What a rollout is taken to be off by in the population of a state until MD has told: weights keep no such number.
-MODEL_ERROR = 0.1
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def decide(
     comparison_s = min(0.5 * budget_s, max(_REPORT_SHARE * budget_s, at_all_s + _LEAST_FRAMES * of_frame_s))
     most = int(min(_MOST_FRAMES, max(_LEAST_FRAMES, (comparison_s - at_all_s) / of_frame_s)))
     left_s = budget_s - comparison_s
-    shares = _BY_STAGES if chosen == "md" and rates.replicas == 1 else PLANS[chosen].shares
+    shares = _shares(rates, chosen, budget_s, left_s)
     stages = [PlannedStage(name, left_s * share) for name, share in shares.items()]
     found = Decision(chosen, why, (*stages, PlannedStage("report", comparison_s)), 0.0, 0.0, 0.0, 0.0)
     md = [md_ps(rates, found, name) for name in shares if name in MD_STAGES]
@@ -112,6 +110,24 @@ def decide(
         expected_md_ps=sum(md),
         expected_rollout_ps=rolled_ps,
     )
+
+
+def _shares(rates: Rates, way: Way, budget_s: float, left_s: float) -> dict[Stage, float]:
+    """Return the shares of what the report leaves; a rollout that MD cannot better goes on until what it samples is
+    known to half of what the model is off by."""
+    from surrogate.comparison.md_answer import MODEL_ERROR
+
+    if way == "md" and rates.replicas == 1:
+        return _BY_STAGES
+    shares = PLANS[way].shares
+    if way != "rollout" or rates.rolls is None:
+        return shares
+    errors = expected_errors(rates, budget_s)
+    if errors["a rollout alone"] >= errors["MD from rollout frames"]:
+        return shares
+    enough_s = 2.0 * rates.relaxation_ps / MODEL_ERROR**2 / rates.rolls.ps_per_s
+    rolled = min(_MOST_ROLLED, max(shares["rollout"], enough_s / left_s))
+    return {"rollout": rolled, "held-out md": 1.0 - rolled}
 
 
 def least_budget_s(rates: Rates) -> float:
@@ -171,7 +187,7 @@ def _interval(rates: Rates, way: Way, least_ps: float) -> float:
 
 
 def expected_errors(
-    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float = MODEL_ERROR
+    rates: Rates, budget_s: float, relaxation_ps: float | None = None, model_error: float | None = None
 ) -> dict[str, float]:
     """Return the error to expect of the population of a state at the end of a budget, by each way to spend it.
 
@@ -179,8 +195,12 @@ def expected_errors(
     relaxation times apart: Mueller-Krumbhaar and Binder, J. Stat. Phys. 8, 1 (1973)) of a `length` of all replicas
     together, and the mean of what is left of where they began, `t` being a replica's length over the relaxation time.
     `start` is 1/2 from one structure and 1/4 from starts spread evenly over two states, the means over all populations
-    that the states may have; from frames of a rollout it is that rollout's own error, its `model_error` included.
+    that the states may have; from frames of a rollout it is that rollout's own error, `model_error` (0.1 unless
+    given) included.
     """
+    from surrogate.comparison.md_answer import MODEL_ERROR
+
+    model_error = MODEL_ERROR if model_error is None else model_error
     relaxation_ps = max(rates.relaxation_ps if relaxation_ps is None else relaxation_ps, 1e-3)
     seconds = (1.0 - _REPORT_SHARE) * budget_s
 

@@ -57,7 +57,7 @@ def outcome(
         said += _speed_up_words(equivalent_time, speed_up, costs)
     lines = evaluated.in_short if answer is None else answer.in_short
     on_surrogate = answer.on_surrogate if answer else ""
-    if answer is not None and on_surrogate and not answer.is_sure:
+    if answer is not None and on_surrogate and not answer.is_sure and not answer.is_by_surrogate:
         on_surrogate = "MD has not converged, and cannot say whether the surrogate's populations are right."
     return Outcome(
         headline=" ".join(lines),
@@ -81,6 +81,8 @@ def lines_of(way: Way, evaluated: Evaluation, answer: Answer | None) -> tuple[st
     if answer is None or evaluated.status == "broken":
         return evaluated.in_short
     if way == "md":
+        return answer.in_short
+    if answer.is_by_surrogate:
         return answer.in_short
     told = [s for s in answer.states if s.surrogate is not None and not s.missing]
     off = [s for s in told if s.differs]

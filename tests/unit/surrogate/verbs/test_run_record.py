@@ -184,6 +184,20 @@ def test_an_answer_that_does_not_hold_is_not_to_be_used() -> None:
     assert told("rollout", None).in_short == ("Use it.", "Right: all.", "Why: so."), "no torsion turns"
 
 
+def test_where_md_is_too_short_to_do_better_the_surrogate_s_populations_are_the_answer() -> None:
+    vague = (state(error=0.18), state(state="β", error=0.18))
+    short = answer(holds=False, states=vague)
+    found = told("rollout", None, answer=short)
+    assert found.in_short[0] == "Use the surrogate's populations for now, not MD's." and not found.converged
+    assert "to about 10 % (assumed)" in found.in_short[1] and "off by up to 18 %" in found.in_short[2]
+    assert lines_of("rollout", evaluation(None), short) == short.in_short
+    assert short.to_dict()["populations_by"] == "surrogate" and answer().to_dict()["populations_by"] == "MD"
+    contradicted = answer(holds=False, states=(*vague, state(state="left-handed", share=0.01, surrogate=0.3)))
+    assert not contradicted.is_by_surrogate, "what MD contradicts is no answer"
+    assert not answer(states=tuple(replace(s, surrogate_error=0.2) for s in vague)).is_by_surrogate, "nor what is vague"
+    assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).is_by_surrogate
+
+
 def test_a_longer_budget_is_named_only_where_its_replicas_outlast_what_is_slow() -> None:
     short = told("rollout", None, of=SHORT)
     assert "replicas of 3.8 ns or more would tell: a budget of about 10 min." in short.details
