@@ -25,6 +25,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 _N_DRAWS = 50
+# Of the likelihood's fixed point: change of log populations in a step at its end, most steps, and longest jumps, in
+# steps and in log populations.
+_STEP_TOLERANCE, _MOST_STEPS, _FURTHEST, _LONGEST_JUMP = 1e-9, 5_000, 1e6, 20.0
 _LAGS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 # A lag leaves each replica four pairs that do not overlap.
 _LAGS_A_REPLICA = 4
@@ -201,22 +204,50 @@ def _components(counts: FloatArray) -> IntArray:
 
 
 def _fit(counts: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
-    """Return transition matrix and stationary distribution of the largest connected set, and its states."""
-    from deeptime.markov.msm import MaximumLikelihoodMSM
-
+    """Return transition matrix and stationary distribution of the largest connected set, and its states; None where
+    there is none, or the estimate does not converge."""
     kept = np.flatnonzero((_components(counts) == 0) & (counts.sum(0) + counts.sum(1) > 0))
     if not len(kept):
         return None
     if len(kept) == 1:
         return np.ones((1, 1)), np.ones(1), kept
-    try:
-        estimator = MaximumLikelihoodMSM(reversible=True, allow_disconnected=False, maxiter=100_000, maxerr=1e-7)
-        model = estimator.fit(counts[np.ix_(kept, kept)]).fetch_model()
-    except (RuntimeError, ValueError, AssertionError, np.linalg.LinAlgError):
+    found = reversible(counts[np.ix_(kept, kept)])
+    return None if found is None else (*found, kept)
+
+
+def reversible(counts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the reversible transition matrix `(n, n)` of greatest likelihood, and its stationary distribution `(n,)`,
+    of counts that connect all states both ways; None where it is not found.
+
+    The flux is x_ij = (c_ij + c_ji) / (c_i / x_i + c_j / x_j) with x_i its sum over j (Prinz et al., equation 30), here
+    by fixed-point iteration in log x, sped up by squared extrapolation (Varadhan and Roland, Scand. J. Stat. 35, 335
+    (2008)): some hundred times fewer steps than deeptime's where states are hardly connected.
+    """
+    both, out = counts + counts.T, counts.sum(1)
+
+    def step(y: FloatArray) -> FloatArray:
+        w = out * np.exp(-y)
+        z = (both / (w[:, None] + w[None])).sum(1)
+        return np.asarray(np.log(z / z.sum()))
+
+    y = np.log(both.sum(1) / both.sum())
+    for _ in range(_MOST_STEPS):
+        first = step(y)
+        second = step(first)
+        r, v = first - y, second - 2.0 * first + y
+        if float(np.abs(r).max()) < _STEP_TOLERANCE:
+            break
+        further = min(max(1.0, float(np.linalg.norm(r) / max(np.linalg.norm(v), 1e-300))), _FURTHEST)
+        jumped = step(y + 2.0 * further * r + further**2 * v)
+        # A jump too far is none.
+        good = bool(np.isfinite(jumped).all()) and np.abs(jumped - second).max() < _LONGEST_JUMP
+        y = jumped if good else second
+    else:
         return None
-    if model.n_states != len(kept):
-        return None
-    return np.asarray(model.transition_matrix), np.asarray(model.stationary_distribution), kept
+    w = out * np.exp(-y)
+    flux = both / (w[:, None] + w[None])
+    total = flux.sum(1)
+    return flux / total[:, None], total / total.sum()
 
 
 def _timescales(matrix: FloatArray, stationary: FloatArray, lag: int, most: int = 5) -> tuple[FloatArray, FloatArray]:

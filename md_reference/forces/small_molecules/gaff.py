@@ -248,12 +248,22 @@ def _without_template(scene: Scene) -> list[str]:
     return [f"{scene.residue_names[r]} {scene.residue_ids[r]}" for r in found]
 
 
-def _parametrise(scene: Scene) -> Entry:
+def rough_parameters(scene: Scene) -> str:
+    """Return GAFF2 with Gasteiger's charges as AMBER prmtop text, in about a second and never kept: for states to ask
+    a better reference about. Raises PreparationError as `parameters`."""
+    refuse(scene)
+    return _parametrise(scene, "gas").ordered_as(scene)
+
+
+def _parametrise(scene: Scene, charges: str = "bcc") -> Entry:
     tools = ambertools()
     with scratch_folder("surromd-gaff-") as folder:
         try:
-            with announced(scene) as waiting:
-                notes = _charges_and_types(scene, folder, waiting)
+            if charges == "gas":
+                notes = _charges_and_types(scene, folder, charges=charges)
+            else:
+                with announced(scene) as waiting:
+                    notes = _charges_and_types(scene, folder, waiting)
             _missing_terms(scene, folder)
             text = _assemble(folder)
         except PreparationError as error:
@@ -265,7 +275,7 @@ def _parametrise(scene: Scene) -> Entry:
     made.fields["CHARGE"] = [q - residual * CHARGE_UNIT / scene.n_atoms for q in made.fields["CHARGE"]]
     source = {
         "force_field": f"GAFF2 {tools.gaff2_version}",
-        "charges": "AM1-BCC",
+        "charges": "AM1-BCC" if charges == "bcc" else "Gasteiger",
         "program": f"AmberTools {tools.version}",
         "residual_charge_e": round(residual, 6),
         "notes": notes,
@@ -273,15 +283,17 @@ def _parametrise(scene: Scene) -> Entry:
     return Entry(scene, made.text(), source)
 
 
-def _charges_and_types(scene: Scene, folder: Path, waiting: Callable[[float], None] | None = None) -> list[str]:
-    """Run antechamber: atom types, bond types and AM1-BCC charges into `typed.mol2`; return what was unusual."""
+def _charges_and_types(
+    scene: Scene, folder: Path, waiting: Callable[[float], None] | None = None, charges: str = "bcc"
+) -> list[str]:
+    """Run antechamber: atom types, bond types and charges into `typed.mol2`; return what was unusual."""
     (folder / "input.sdf").write_text(_sdf(scene))
-    arguments = ["-i", "input.sdf", "-fi", "sdf", "-o", "typed.mol2", "-fo", "mol2", "-at", "gaff2", "-c", "bcc"]
+    arguments = ["-i", "input.sdf", "-fi", "sdf", "-o", "typed.mol2", "-fo", "mol2", "-at", "gaff2", "-c", charges]
     arguments += ["-nc", str(int(scene.formal_charges.sum())), "-m", "1", "-rn", "MOL", "-s", "2", "-dr", "no"]
     printed = run("antechamber", arguments, folder, waiting=waiting)
     if not (folder / "typed.mol2").exists():
         raise PreparationError(f"antechamber failed: {complaint(printed)}")
-    if not _rearranged(scene, folder / "sqm.pdb"):
+    if charges == "gas" or not _rearranged(scene, folder / "sqm.pdb"):
         return []
     # AM1-BCC wants the AM1 minimum; where that is another molecule (a proton that hops), the scene's own geometry.
     keywords = "qm_theory='AM1', maxcyc=0, scfconv=1.d-10, ndiis_attempts=700,"

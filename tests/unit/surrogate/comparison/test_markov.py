@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogate.comparison.markov import equilibrium
+from surrogate.comparison.markov import equilibrium, reversible
 from systems.errors import InputError
 
 # Three states in a row, of populations .6, .3 and .1; a jump in some 200 frames.
@@ -132,3 +132,23 @@ def test_replicas_that_never_change_their_state_tell_no_timescale() -> None:
     micro = [np.full(80, k % 2, dtype=np.int64) for k in range(16)]
     found = equilibrium(micro)
     assert not len(found.timescales) and [u.fate for u in found.unconnected] == ["only begun in"]
+
+
+@pytest.mark.parametrize("coupling", [1.0, 1e-3])
+def test_the_likeliest_reversible_matrix_is_deeptime_s(coupling: float) -> None:
+    """Two groups of states, well and hardly connected; detailed balance, and no likelier matrix nearby."""
+    from deeptime.markov.msm import MaximumLikelihoodMSM
+
+    rng = np.random.default_rng(3)
+    counts = rng.integers(5, 200, (12, 12)).astype(float)
+    counts[:6, 6:] = counts[6:, :6] = 0.0
+    counts[2, 7], counts[7, 2] = np.ceil(3.0 * coupling), np.ceil(40.0 * coupling)
+    found = reversible(counts)
+    assert found is not None
+    matrix, stationary = found
+    right = MaximumLikelihoodMSM(reversible=True, maxiter=1_000_000, maxerr=1e-13).fit(counts).fetch_model()
+    np.testing.assert_allclose(stationary, right.stationary_distribution, rtol=1e-5)
+    np.testing.assert_allclose(matrix, right.transition_matrix, atol=1e-6)
+    flux = stationary[:, None] * matrix
+    np.testing.assert_allclose(flux, flux.T, atol=1e-15)
+    assert not np.allclose(matrix, counts / counts.sum(1)[:, None], atol=1e-3), "these counts alone are not reversible"

