@@ -34,6 +34,8 @@ _CLUSTERED_FRAMES = 10_000
 _MAP_BINS = 36
 # Shares are given no smaller error than counting leaves, and differ when they are so many errors apart.
 _APART, _LEAST_APART = 2.5, 0.02
+# Few transitions tell too small an error: of MD that has not converged a difference is no contradiction before this.
+_CONTRADICTS = 4.0
 # What a surrogate is taken to be off by in the population of a state: weights keep no such number.
 MODEL_ERROR = 0.1
 # A state that has a smaller share of a rollout is no reason to begin there.
@@ -62,10 +64,14 @@ class StateEnergy:
     @property
     def differs(self) -> bool:
         """Whether the surrogate's share is outside the errors."""
+        return self.is_apart(_APART)
+
+    def is_apart(self, n_errors: float) -> bool:
+        """Whether the surrogate's share is so many errors away."""
         if self.surrogate is None or self.missing:
             return False
         error = math.hypot(self.error, self.surrogate_error or 0.0)
-        return abs(self.surrogate - self.share) > max(_APART * error, _LEAST_APART)
+        return abs(self.surrogate - self.share) > max(n_errors * error, _LEAST_APART)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +104,7 @@ class Answer:
         """Whether the surrogate's populations are the better answer for now: MD's errors are larger than what a
         surrogate is taken to be off by, and MD contradicts it nowhere."""
         both = [s for s in self.states if s.surrogate is not None and not s.missing]
-        if not both or any(s.differs for s in both):
+        if not both or any(s.is_apart(_APART if self.is_sure else _CONTRADICTS) for s in both):
             return False
         by_md, rolled = (math.sqrt(sum(e * e for e in errors) / len(both))
                          for errors in ([s.error for s in both], [s.surrogate_error or 0.0 for s in both]))  # fmt: skip

@@ -192,8 +192,12 @@ def test_where_md_is_too_short_to_do_better_the_surrogate_s_populations_are_the_
     assert "to about 10 % (assumed)" in found.in_short[1] and "off by up to 18 %" in found.in_short[2]
     assert lines_of("rollout", evaluation(None), short) == short.in_short
     assert short.to_dict()["populations_by"] == "surrogate" and answer().to_dict()["populations_by"] == "MD"
-    contradicted = answer(holds=False, states=(*vague, state(state="left-handed", share=0.01, surrogate=0.3)))
-    assert not contradicted.is_by_surrogate, "what MD contradicts is no answer"
+    for holds, surrogate, is_by in ((False, 0.3, False), (False, 0.19, True), (True, 0.19, False)):
+        more = state(state="left-handed", share=0.01, error=0.05, surrogate=surrogate)
+        found_ = answer(holds=holds, states=(*vague, more))
+        assert found_.is_by_surrogate == is_by, (
+            "what MD contradicts is no answer"
+        )
     assert not answer(states=tuple(replace(s, surrogate_error=0.2) for s in vague)).is_by_surrogate, "nor what is vague"
     assert not answer(states=tuple(replace(s, surrogate=None) for s in vague)).is_by_surrogate
 
