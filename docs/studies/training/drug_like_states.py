@@ -42,7 +42,7 @@ from systems.errors import PreparationError, SurromdError
 from systems.files.whole_file import create_whole
 from systems.library.named_scenes import prepare
 from systems.prepare.molecule import to_rdkit
-from systems.scene import Scene
+from systems.scene import ATOMIC_NUMBERS, Scene
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -212,7 +212,8 @@ def label(place: tuple[int, Entry, Path, int]) -> str:
         return f"{number} {entry.smiles}: left out: {said}"
     arrays = {
         "positions_nm": np.array(kept, dtype=np.float32), "energies_kj_mol": np.array(energies),
-        "forces_kj_mol_nm": np.array(forces, dtype=np.float32),
+        "forces_kj_mol_nm": np.array(forces, dtype=np.float32), "bonds": scene.bonds,
+        "numbers": np.array([ATOMIC_NUMBERS[e] for e in scene.elements]), "charges": scene.formal_charges,
     }  # fmt: skip
 
     def write(temporary: Path) -> None:
