@@ -167,10 +167,11 @@ def print_errors(given: argparse.Namespace) -> None:
     model.eval()
     for split in ("test", "train"):
         rows = np.array([errors_of(model, one, 80) for one in load(given.folder, [split], 60)])
-        middle = np.median(rows, 0)
-        said(f"{split}: {len(rows)} molecules, force {rows[:, 0].mean():.3f} (median {middle[0]:.3f}, worst "
-             f"{rows[:, 0].max():.2f}) kcal/mol/Å, energy {rows[:, 1].mean():.4f} kcal/mol an atom, "
-             f"spread {middle[2]:.3f}, its correlation with errors {np.corrcoef(rows[:, 0], rows[:, 2])[0, 1]:.2f}")  # fmt: skip
+        force, energy, spread = rows.T
+        related = np.corrcoef(force, spread)[0, 1]
+        said(f"{split}: {len(rows)} molecules, force {force.mean():.3f} (median {np.median(force):.3f}, worst "
+             f"{force.max():.2f}) kcal/mol/Å, energy {energy.mean():.4f} kcal/mol an atom; spread "
+             f"{np.median(spread):.3f}, whose correlation with the error is {related:.2f}")  # fmt: skip
 
 
 def said(line: str) -> None:
