@@ -361,13 +361,14 @@ def test_md17_goes_the_whole_way_to_the_table(tmp_path: Path) -> None:
         assert (row.ade, row.fde) == (by_name[row.method].ade, by_name[row.method].fde)
 
 
-def test_the_paper_size_runs_in_calls_until_its_epochs_are_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("form", "more_than"), [("--paper-size", 5_000_000), ("--paper-form", 1_500_000)])
+def test_the_paper_size_and_form_run_in_calls_until_their_epochs_are_done(
+    form: str, more_than: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The command for a GPU, with batches and epochs for a CPU; sizes are the published ones."""
+    """The commands with fewer steps and smaller batches; sizes are theirs."""
     monkeypatch.setattr(forecaster_training, "PAPER_SIZES", replace(forecaster_training.PAPER_SIZES, batches=(4, 2)))
     monkeypatch.setattr(forecaster_training, "PAPER_STEPS", 4)
-    asked = ["n-body-charged", "--method", "lam-slide", "--paper-size", "--device", "cpu", "--call", "0.001s"]
+    asked = ["n-body-charged", "--method", "lam-slide", form, "--device", "cpu", "--call", "0.001s"]
     asked += ["--solver-steps", "1", "-o", str(tmp_path), "--workers", "1", "--quiet"]
     asked += ["--train", "4", "--validation", "2", "--test", "2"]
     ended = []
@@ -383,7 +384,7 @@ def test_the_paper_size_runs_in_calls_until_its_epochs_are_done(
         rows = list(csv.DictReader(handle))
     assert {row["stage"]: int(row["step"]) for row in rows} == {"autoencoder": 2, "flow": 2}
     record = json.loads((tmp_path / "n-body-charged.json").read_text())
-    assert record["rows"][0]["n_parameters"] > 5_000_000
+    assert record["rows"][0]["n_parameters"] > more_than
 
 
 @pytest.mark.parametrize(

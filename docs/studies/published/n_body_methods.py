@@ -115,7 +115,7 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
     model = set_forecaster(settings, train.n_particles)
     held = validation.first(min(100, len(validation)))
     seen = [(torch.from_numpy(view.to_model(s.positions_nm)).float(), torch.from_numpy(s.types)) for s in (train, held)]
-    sizes = PAPER_SIZES if settings.paper_size else StageSizes()
+    sizes = PAPER_SIZES if settings.paper_size or settings.paper_form else StageSizes()
     seconds = train_lam_slide_on_windows(model, turned_windows(*seen[0]), [seen[1]], training, sizes)
     model.eval()
     device = torch.device(settings.device)
@@ -139,14 +139,16 @@ def lam_slide(train: ParticleSet, validation: ParticleSet, settings: Settings) -
 
 
 def set_forecaster(settings: Settings, n_particles: int) -> LamSlide:
-    """Return LaM-SLidE with a set of latents: of sizes for a CPU, or of the published ones (Table 10)."""
+    """Return LaM-SLidE with a set of latents: joined in a token, for a CPU; of the paper's form, a token for each latent
+    of each frame and random identifiers, of half its width and latents; or of the published sizes (Table 10)."""
     from surrogate.models.lam_slide.network import AutoencoderConfig
 
     code = AutoencoderConfig(identifier_pool=n_particles, latent_dim=32, n_octaves=3, type_weight=0.1)
-    if settings.paper_size:
-        code = replace(code, identifier_pool=max(10, n_particles), n_latents=16, n_heads=2, head_dim=16,
+    if settings.paper_size or settings.paper_form:
+        n_latents, width = (16, 256) if settings.paper_size else (8, 128)
+        code = replace(code, identifier_pool=max(10, n_particles), n_latents=n_latents, n_heads=2, head_dim=16,
                        identifier_dim=128, n_decoder_layers=1, latent_noise=0.0, random_identifiers=1.0)  # fmt: skip
-        return latent_forecaster(settings, code, latents_per_token=1, width=256, n_layers=6, plain_flow=True)
+        return latent_forecaster(settings, code, latents_per_token=1, width=width, n_layers=6, plain_flow=True)
     code = replace(code, n_latents=2, width=64)
     return latent_forecaster(settings, code, latents_per_token=2, width=128, n_layers=4, plain_flow=True)
 

@@ -78,7 +78,7 @@ def run(chosen: argparse.Namespace) -> list[str]:
 
 def _settings(chosen: argparse.Namespace, of_molecules: bool) -> Settings:
     steps = chosen.steps
-    if chosen.paper_size and not of_molecules and steps is None:
+    if (chosen.paper_size or chosen.paper_form) and not of_molecules and steps is None:
         steps = forecaster_training.PAPER_STEPS
     settings = Settings(
         folder=chosen.out or Path(f"surromd-{chosen.task}"),
@@ -86,6 +86,7 @@ def _settings(chosen: argparse.Namespace, of_molecules: bool) -> Settings:
         steps=steps,
         call_s=None if chosen.call is None else parse_wall_s(chosen.call, "--call"),
         paper_size=chosen.paper_size,
+        paper_form=chosen.paper_form,
         seed=chosen.seed,
         resume=chosen.resume,
         device=choose_device(chosen.device),
@@ -119,6 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--md17-ethanol", type=Path, help="md17: an .npz of MD17's own ethanol to forecast as well")
     add("--call", help="end at the first saved state after so long; the same with --resume goes on")
     add("--paper-size", action="store_true", help="LaM-SLidE of the published sizes (n-body: and epochs), for a GPU")
+    add("--paper-form", action="store_true", help="n-body: LaM-SLidE as published but for 8 latents and width 128")
     add("--solver-steps", type=int, default=10, help="LaM-SLidE's; 1 gives its mean forecast instead of samples")
     add("--workers", type=int, help="n-body: processes that simulate [one a core]")
     add("--device", default="auto", help="where to train: auto, cpu or cuda")
