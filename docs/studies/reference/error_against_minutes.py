@@ -67,6 +67,7 @@ MOLECULES = {
     "chignolin": "chignolin",
 }
 WAYS = {"run": "surromd run", "one": "MD from one start", "many": "MD from many starts", "rollout": "rollout alone"}
+HALVES = "reference's halves"
 KELVIN, SEED, EVERY_PS, BINS, LEFT_OUT_PS = 300.0, 5_000, 10.0, 50, 5_000.0
 ENOUGH_R_HAT, HELD = 1.05, 0.95
 # A rollout is no longer: what it is off by then is the model's.
@@ -311,7 +312,7 @@ def row(name: str, minutes: float, place: Path, ref: LongMD, batches: list[LongM
         found["rollout"] = ref.errors(ref.load(rolled, rolled_length_ps(rates, minutes)))
     line: dict[str, Any] = {
         "molecule": name, "minutes": minutes, "way": result["decision"]["way"],
-        "R-hat": rounded(ref.r_hat), "reference's halves": rounded(ref.replicate_baseline),
+        "R-hat": rounded(ref.r_hat), HALVES: rounded(ref.replicate_baseline),
     }  # fmt: skip
     for way, (distance_, populations) in found.items():
         line |= {f"{way}: distance": rounded(distance_), f"{way}: populations": rounded(populations)}
@@ -366,12 +367,12 @@ def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Pat
         raise SystemExit(f"{folder} holds no reference of {size} replicas with runs beside it.")
     table = {
         "command": "python docs/studies/reference/error_against_minutes.py table FOLDER",
-        "machine": machine_name(),
-        "note": "Distance: mean Jensen-Shannon distance of torsions (natural logarithm, its root), 50 bins. "
-        "Populations: root mean square error of all states of torsions in per cent; stated: what the run says of its "
-        "own. Of each molecule against long SIMD MD from many starts, whose halves are so far apart.",
-        "summary": summary(rows),
-        "rows": rows,
+        "machine": f"{machine_name()}, one core used",
+        "note": "Mean Jensen-Shannon distance of torsions (root, natural logarithm, 50 bins) from long SIMD MD from "
+        "many starts, whose halves are so far apart; populations: root mean square error over all states of torsions, "
+        "and what the run states of it. " + "; ".join(summary(rows)) + ".",
+        "columns": COLUMNS,
+        "rows": [cells(r) for r in rows],
     }  # fmt: skip
     for line in summary(rows):
         said(line)
@@ -379,6 +380,25 @@ def make_table(folder: Path, names: Sequence[str], out: Path | None, figure: Pat
         out.write_text(json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n", "utf-8")
     if figure is not None:
         draw(rows, figure)
+
+
+COLUMNS = [
+    "molecule, minutes", "reference: split R-hat, halves", *WAYS.values(), "populations off, %", "stated, %", "by",
+    "intervals hold", "verdict",
+]  # fmt: skip
+
+
+def cells(r: dict[str, Any]) -> list[str]:
+    """Return a line of the manual's table."""
+
+    def shown(value: float | None) -> str:
+        return "" if value is None else f"{value:.3g}"
+
+    return [
+        f"{r['molecule']}, {r['minutes']:g}", f"{shown(r['R-hat'])}, {shown(r[HALVES])}",
+        *(shown(r.get(f"{way}: distance")) for way in WAYS), shown(r["run: populations"]), shown(r["stated"]),
+        r["populations by"], f"{r['intervals held']} of {r['of']}", r["verdict"],
+    ]  # fmt: skip
 
 
 def summary(rows: list[dict[str, Any]]) -> list[str]:
@@ -426,7 +446,7 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
         low, middle, high = (np.array([np.quantile(v, q) for _, v in points]) for q in (0.25, 0.5, 0.75))
         axes.plot(at, middle, "o-", color=f"C{k}", label=words)
         axes.fill_between(at, low, high, color=f"C{k}", alpha=0.15, linewidth=0)
-    replicate_baseline = float(np.median([r["reference's halves"] for r in rows]))
+    replicate_baseline = float(np.median([r[HALVES] for r in rows]))
     axes.axhline(replicate_baseline, color="0.6", linestyle=":", label="two halves of the reference")
     axes.set(xscale="log", yscale="log", xlabel="budget / min", ylabel="mean distance of torsions to long MD")
     axes.set_xticks(minutes, [f"{m:g}" for m in minutes])
