@@ -124,7 +124,7 @@ class Answer:
             use = "Use MD's answer" + (", but for what it did not connect." if self.missing else ".")
             what = f"For populations and free energies of {len(told)} states, each to {widest:.2g} % or better"
             what += " (one standard error)" + (", and relaxation times." if self.timescales_ps else ".")
-        missing = f" Missing: {'; '.join(self.missing)}." if self.missing else ""
+        missing = f" Missing: {'; '.join(self.missing)}." if self.missing and not self.is_by_surrogate else ""
         slow = ""
         if self.timescales_ps:
             error = f" ± {format_time_ps(self.timescale_errors_ps[0], 2)}" if self.timescale_errors_ps else ""
