@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import bonded_images, images_of_whole
+from systems.chemistry.distance_bonds import bonded_images, images_of_whole
 from systems.chemistry.geometry import near_pairs, signed_volumes
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import links_residues

@@ -273,7 +273,7 @@ def to_mdtraj(
     """
     import mdtraj
 
-    from systems.chemistry.cell import lengths_and_angles
+    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     lengths, angles = (None, None) if cells is None else lengths_and_angles(cells)
@@ -293,7 +293,7 @@ def to_mdanalysis(
     import MDAnalysis
     from MDAnalysis.coordinates.memory import MemoryReader
 
-    from systems.chemistry.cell import lengths_and_angles
+    from systems.chemistry.distance_bonds import lengths_and_angles
 
     scene, positions, times, cells = _read(source, start, stop, stride)
     gaps = np.diff(times)

@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import lengths_and_angles, read_cells
+from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import write_whole
 from systems.scene import Scene

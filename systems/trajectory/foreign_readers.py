@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import read_cells
+from systems.chemistry.distance_bonds import read_cells
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.trajectory.base import TrajectoryReader
 from systems.trajectory.foreign_scenes import (

@@ -20,8 +20,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from systems.chemistry.cell import lengths_and_angles
-from systems.chemistry.cell import read_cells as cells_of
+from systems.chemistry.distance_bonds import lengths_and_angles
+from systems.chemistry.distance_bonds import read_cells as cells_of
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.outside import UNREADABLE
 from systems.files.whole_file import Checksums, check_frames_read, frame_checksums, refuse_existing

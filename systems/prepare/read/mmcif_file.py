@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from systems.chemistry.cell import cell_of
+from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.element_data import element_symbol
 from systems.errors import InputError, first_line, listed
 from systems.prepare.read.records import AtomRecord, StructureFile, coordinates

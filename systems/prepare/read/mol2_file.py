@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from systems.chemistry.bond_orders import bent_carbons, lewis_structure
-from systems.chemistry.cell import bonded_images, cell_of, images_of_whole
-from systems.chemistry.distance_bonds import bonds_by_distance
+from systems.chemistry.distance_bonds import bonded_images, bonds_by_distance, cell_of, images_of_whole
 from systems.chemistry.element_data import element_symbol, ion_symbol, is_element, is_lone_ion
 from systems.chemistry.residues import canonical_heavy_name, template_for
 from systems.errors import InputError, PreparationError

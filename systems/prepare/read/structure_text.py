@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from systems.chemistry.cell import cell_of
+from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.element_data import element_symbol, repeats_name
 from systems.chemistry.residues import is_water_name, template_for
 from systems.errors import InputError, listed

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from systems.chemistry.cell import cell_of
+from systems.chemistry.distance_bonds import cell_of
 from systems.chemistry.graph import molecule_key
 from systems.errors import PreparationError, SurromdError
 from systems.library import named_scenes
