@@ -263,8 +263,8 @@ def bonded_images(
 
 
 def _near_images(positions_nm: FloatArray, cell_nm: FloatArray, reach_nm: float) -> tuple[IntArray, FloatArray]:
-    """Return the pairs i < j `(n, 2)`, ascending, whose nearest images may be within `reach_nm`, and how far apart these
-    are `(n,)` nm; every width of the cell must be more than twice that."""
+    """Return the pairs i < j `(n, 2)`, ascending, whose nearest images may be within `reach_nm`, and how far apart
+    these are `(n,)` nm; every width of the cell must be more than twice that."""
     from scipy.spatial import cKDTree
 
     widths, inverse = _widths(cell_nm), np.linalg.inv(cell_nm)

@@ -322,10 +322,12 @@ def load(name: str) -> Scene:
 
 @cache
 def _shipped(file: str) -> Scene:
-    from systems.prepare.structure import scene_from_file
+    from systems.prepare.records import scene_from_records
+    from systems.prepare.structure_text import read_structure
 
-    path = Path(str(files("systems.library") / "data" / f"{file}.pdb"))
-    return scene_from_file(path, name=file, provenance={})
+    # Its CONECT records hold every bond.
+    found = read_structure(Path(str(files("systems.library") / "data" / f"{file}.pdb")))
+    return scene_from_records(found.atoms, np.array(found.conect, dtype=np.int64), name=file, provenance={})
 
 
 def _load(entry: Entry) -> Scene:
@@ -410,9 +412,9 @@ def prepare(spec: str, options: Preparation) -> Scene:
     with the caps NME and ACE.
     Raises UnknownNameError, InputError or PreparationError, each in one line.
     """
-    from systems.prepare.read.mol2_file import is_peptide_mol2
-    from systems.prepare.read.mol_file import SUFFIXES
-    from systems.prepare.read.records import suffix_of
+    from systems.prepare.mol2_file import is_peptide_mol2
+    from systems.prepare.molecule import SUFFIXES
+    from systems.prepare.records import suffix_of
     from systems.prepare.structure_file import prepare_file
 
     options.refuse_contradictions()

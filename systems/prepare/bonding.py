@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.distance_bonds import refuse_long_bonds
 from systems.chemistry.element_data import covalent_radius_nm, is_lone_ion, is_metal
 from systems.chemistry.geometry import near_pairs
-from systems.chemistry.residues import canonical_heavy_name, component, known_template, template_for
+from systems.chemistry.residues import (
+    PH_OF_FEWEST,
+    ResidueTemplate,
+    canonical_heavy_name,
+    component,
+    hydrogens_of,
+    known_template,
+    template_for,
+)
 from systems.errors import PreparationError, listed
-from systems.prepare.protonation import note_missing
-from systems.prepare.read.records import AtomRecord, Bonding, Residue
-from systems.prepare.structure import atom_label
+from systems.prepare.records import AtomRecord, Bonding, Residue, by_residue
+from systems.scene import FloatArray, IntArray, neighbours_of
 
 _PEPTIDE_NM = 0.20
 _DISULFIDE_NM = 0.25
@@ -48,8 +55,7 @@ def find_bonds(
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
         if d < _COINCIDENT_NM:
             raise PreparationError(
-                f"{atom_label(atoms[i])} and {atom_label(atoms[j])} stand on one point ({d * 10:.2f} Å apart); "
-                "remove one of them."
+                f"{atoms[i].label} and {atoms[j].label} stand on one point ({d * 10:.2f} Å apart); remove one of them."
             )
     residues = _residues(atoms)
     ions = {i for r in residues if are_ions([atoms[i] for i in r.atoms]) for i in r.atoms}
@@ -60,9 +66,7 @@ def find_bonds(
         if residue.heavy and residue.template is not None:
             names = [*residue.template.bonds, *([("C", "OXT")] if "OXT" in residue.heavy else [])]
             bonds |= {_pair(residue.heavy[a], residue.heavy[b]) for a, b in names if {a, b} <= set(residue.heavy)}
-    refuse_long_bonds(
-        [a.element for a in atoms], x, np.array(sorted(bonds), dtype=np.int64), lambda i: atom_label(atoms[i])
-    )
+    refuse_long_bonds([a.element for a in atoms], x, np.array(sorted(bonds), dtype=np.int64), lambda i: atoms[i].label)
     peptide = _peptide_bonds(near, length, of_atom)
     bonds |= {_pair(c, n) for c, n in peptide}
     metals = {i for i in ions if is_metal(atoms[i].element)}
@@ -75,14 +79,14 @@ def find_bonds(
     bonds |= _disulfides(atoms, near, length, bonds, of_atom)
     bonds |= _links_of_components(atoms, near, length, of_atom, ions)
     bonded = np.array(sorted(bonds), dtype=np.int64).reshape(-1, 2)
-    note_missing(residues, atoms, bonded)
+    _note_missing(residues, atoms, bonded)
     for i, error in strays.items():
         if not of_atom[i].missing:
             raise error
     if strays:
-        notes.append(f"hydrogens left out whose atoms are missing: {listed([atom_label(atoms[i]) for i in strays])}")
+        notes.append(f"hydrogens left out whose atoms are missing: {listed([atoms[i].label for i in strays])}")
     unmade = [
-        f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({10 * np.linalg.norm(x[i] - x[j]):.2f} Å)"
+        f"{atoms[i].label} - {atoms[j].label} ({10 * np.linalg.norm(x[i] - x[j]):.2f} Å)"
         for i, j in conect
         if _pair(i, j) not in bonds and not {i, j} & metals
     ]
@@ -99,11 +103,8 @@ def _pair(i: int, j: int) -> tuple[int, int]:
 
 
 def _residues(atoms: Sequence[AtomRecord]) -> list[Residue]:
-    groups: dict[tuple[str, str, str], list[int]] = {}
-    for i, atom in enumerate(atoms):
-        groups.setdefault(atom.residue_key, []).append(i)
     residues = []
-    for key, members in groups.items():
+    for key, members in by_residue(atoms).items():
         residue = Residue(key, members, known_template(key[2]))
         if residue.template is not None:
             heavy: dict[str, int] = {}
@@ -124,9 +125,7 @@ def _residues(atoms: Sequence[AtomRecord]) -> list[Residue]:
     return residues
 
 
-def _peptide_bonds(
-    near: npt.NDArray[np.int64], length: npt.NDArray[np.float64], of_atom: dict[int, Residue]
-) -> set[tuple[int, int]]:
+def _peptide_bonds(near: IntArray, length: FloatArray, of_atom: dict[int, Residue]) -> set[tuple[int, int]]:
     best: dict[int, tuple[float, int]] = {}
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
         if d >= _PEPTIDE_NM or of_atom[i] is of_atom[j]:
@@ -140,7 +139,7 @@ def _peptide_bonds(
 
 def _accepted_conect(
     atoms: Sequence[AtomRecord],
-    x: npt.NDArray[np.float64],
+    x: FloatArray,
     conect: Sequence[tuple[int, int]],
     of_atom: dict[int, Residue],
     metals: set[int],
@@ -162,7 +161,7 @@ def _accepted_conect(
             broken += [(i, j)] if of_atom[i] is of_atom[j] else []
         else:
             accepted.add(_pair(i, j))
-    refuse_long_bonds([a.element for a in atoms], x, np.array(broken, dtype=np.int64), lambda i: atom_label(atoms[i]))
+    refuse_long_bonds([a.element for a in atoms], x, np.array(broken, dtype=np.int64), lambda i: atoms[i].label)
     if to_metals:
         notes.append(f"{to_metals} CONECT bonds to metal ions are ignored: ions coordinate")
     return accepted
@@ -186,8 +185,8 @@ def _free_atoms(residues: list[Residue], bonds: set[tuple[int, int]], notes: lis
 
 def _bonds_by_distance(
     atoms: Sequence[AtomRecord],
-    near: npt.NDArray[np.int64],
-    length: npt.NDArray[np.float64],
+    near: IntArray,
+    length: FloatArray,
     free: set[int],
     ions: set[int],
     known: set[tuple[int, int]],
@@ -198,26 +197,24 @@ def _bonds_by_distance(
     found = set()
     apart, amides = [], []
     for (i, j), d in zip(near.tolist(), length.tolist(), strict=True):
-        if d < _AMIDE_NM and not {i, j} & free and (i, j) not in known and _are_amide(atoms[i], atoms[j]):
+        apart_ends = atoms[i].residue_key != atoms[j].residue_key
+        is_amide = apart_ends and {atoms[i].element, atoms[j].element} == {"C", "N"}
+        if d < _AMIDE_NM and is_amide and not {i, j} & free and (i, j) not in known:
             found.add((i, j))
-            amides.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+            amides.append(f"{atoms[i].label} - {atoms[j].label} ({d * 10:.2f} Å)")
         if (i in free or j in free) and not {i, j} & ions and "H" not in (atoms[i].element, atoms[j].element):
             reach = covalent_radius_nm(atoms[i].element) + covalent_radius_nm(atoms[j].element) + _TOLERANCE_NM
             if d >= reach:
                 continue
-            if atoms[i].residue_key == atoms[j].residue_key or links_residues(atoms[i], atoms[j], d):
+            if not apart_ends or links_residues(atoms[i], atoms[j], d):
                 found.add((i, j))
             elif (i, j) not in known:
-                apart.append(f"{atom_label(atoms[i])} - {atom_label(atoms[j])} ({d * 10:.2f} Å)")
+                apart.append(f"{atoms[i].label} - {atoms[j].label} ({d * 10:.2f} Å)")
     if amides:
         notes.append(f"side chains bonded by distance: {listed(amides)}")
     if apart:
         notes.append(f"near and not bonded, as no CONECT or LINK record says so: {listed(apart, 3)}")
     return found
-
-
-def _are_amide(first: AtomRecord, second: AtomRecord) -> bool:
-    return first.residue_key != second.residue_key and {first.element, second.element} == {"C", "N"}
 
 
 def links_residues(first: AtomRecord, second: AtomRecord, length_nm: float) -> bool:
@@ -250,7 +247,7 @@ def _note_bonds_across_ends(
 
 def _hydrogen_bonds_to_parents(
     atoms: Sequence[AtomRecord],
-    x: npt.NDArray[np.float64],
+    x: FloatArray,
     bonds: set[tuple[int, int]],
     of_atom: dict[int, Residue],
     free: set[int],
@@ -279,7 +276,7 @@ def _hydrogen_bonds_to_parents(
             parent, distance = int(heavy[k]), float(gap)
         if distance > _HYDROGEN_NM:
             nearest = f"{distance * 10:.2f} Å from the nearest heavy atom" if parent >= 0 else "alone"
-            error = PreparationError(f"Hydrogen {atom_label(atom)} is {nearest}; correct or remove it.")
+            error = PreparationError(f"Hydrogen {atom.label} is {nearest}; correct or remove it.")
             if not of_atom[i].heavy or template_for(of_atom[i].key[2]) is None:
                 raise error
             strays[i] = error
@@ -290,8 +287,8 @@ def _hydrogen_bonds_to_parents(
 
 def _links_of_components(
     atoms: Sequence[AtomRecord],
-    near: npt.NDArray[np.int64],
-    length: npt.NDArray[np.float64],
+    near: IntArray,
+    length: FloatArray,
     of_atom: dict[int, Residue],
     ions: set[int],
 ) -> set[tuple[int, int]]:
@@ -309,17 +306,69 @@ def _links_of_components(
 
 def _disulfides(
     atoms: Sequence[AtomRecord],
-    near: npt.NDArray[np.int64],
-    length: npt.NDArray[np.float64],
+    near: IntArray,
+    length: FloatArray,
     bonds: set[tuple[int, int]],
     of_atom: dict[int, Residue],
 ) -> set[tuple[int, int]]:
-    degree: dict[int, int] = {}
-    for pair in bonds:
-        for i in pair:
-            degree[i] = degree.get(i, 0) + 1
+    degree = Counter(i for pair in bonds for i in pair)
     return {
         (i, j)
         for (i, j), d in zip(near.tolist(), length.tolist(), strict=True)
-        if d < _DISULFIDE_NM and all(of_atom[k].heavy.get("SG") == k and degree.get(k, 0) == 1 for k in (i, j))
+        if d < _DISULFIDE_NM and all(of_atom[k].heavy.get("SG") == k and degree[k] == 1 for k in (i, j))
     }
+
+
+# ---- what is missing ------------------------------------------------------------------------------------------------
+
+
+def _note_missing(residues: list[Residue], atoms: Sequence[AtomRecord], bonds: IntArray) -> None:
+    """Fill `missing` and `lacks_hydrogens` of the residues that are known by their names."""
+    neighbours = neighbours_of(bonds, len(atoms))
+    skeleton = [[j for j in around if atoms[j].element != "H"] for around in neighbours]
+
+    def hydrogens(i: int) -> int:
+        return len(neighbours[i]) - len(skeleton[i])
+
+    for residue in residues:
+        template, heavy = residue.template, residue.heavy
+        if template is None or not heavy:
+            continue
+        links = links_of(residue, skeleton)
+        absent = [a for a in template.heavy if a not in heavy and a not in template.optional]
+        residue.missing = [a for a in absent if not _has_left(template, a, links, absent)]
+        needed = {a: max(0, n - links.get(a, 0)) for a, n in template.hydrogens.items()}
+        found = component(residue.key[2]) if template_for(residue.key[2]) is None else None
+        if found is not None:
+            if found.kind == "nucleotide" and "P" in heavy and "P" not in links and "OP3" not in heavy:
+                residue.missing.append("OP3")
+            there = {*heavy, *residue.missing}
+            needed = Counter(h[1] for h in hydrogens_of(found, there, links_of(residue, neighbours), ph=PH_OF_FEWEST))
+        if template.is_amino_acid and {"N", "C"} <= set(heavy):
+            joined_c = any(atoms[j].element == "N" and j not in residue.atoms for j in neighbours[heavy["C"]])
+            joined_n = any(atoms[j].element == "C" and j not in residue.atoms for j in neighbours[heavy["N"]])
+            if not joined_c and "OXT" not in heavy and not hydrogens(heavy["C"]):
+                residue.missing.append("OXT")
+            if found is None:
+                needed["N"] = (1 if joined_n else 2) - (template.name == "PRO")
+            if template.name == "CYS" and residue.key[2].upper() != "CYM":
+                needed["SG"] = 0 if "SG" in links or "SG" not in heavy else 1
+        residue.lacks_hydrogens = any(hydrogens(heavy[a]) < n for a, n in needed.items() if a in heavy)
+        if template.name == "HIS" and {"ND1", "NE2"} <= set(heavy):
+            residue.lacks_hydrogens |= not (hydrogens(heavy["ND1"]) or hydrogens(heavy["NE2"]))
+
+
+def links_of(residue: Residue, neighbours: Sequence[Sequence[int]]) -> dict[str, int]:
+    """Return how many bonds each heavy atom of a residue, by its name in the template, has to other residues."""
+    own = set(residue.atoms)
+    counts = {name: sum(j not in own for j in neighbours[i]) for name, i in residue.heavy.items()}
+    return {name: n for name, n in counts.items() if n}
+
+
+def _has_left(template: ResidueTemplate, name: str, links: Mapping[str, int], absent: Sequence[str]) -> bool:
+    """Whether an absent atom has made place for a bond to another residue: an oxygen of an acid that is an amide."""
+    around = [b if a == name else a for a, b in template.bonds if name in (a, b)]
+    if len(around) != 1 or name[0] not in "NO" or around[0] in ("C", "CA"):
+        return False
+    rivals = [a for a in absent if (around[0], a) in template.bonds or (a, around[0]) in template.bonds]
+    return len(rivals) <= links.get(around[0], 0)

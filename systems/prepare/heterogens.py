@@ -10,14 +10,12 @@ from itertools import groupby
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 
 from systems.chemistry.residues import is_water_name, template_for
 from systems.errors import PreparationError, listed
 from systems.prepare.bonding import are_ions
-from systems.prepare.read.records import AtomRecord, Bonding
-
-FloatArray = npt.NDArray[np.float64]
+from systems.prepare.records import AtomRecord, Bonding, ResidueKey, by_residue
+from systems.scene import FloatArray, IntArray
 
 WATER_BOND_ANGSTROM = 1.3
 _OH_ANGSTROM = 0.9572
@@ -28,7 +26,7 @@ _DIRECTIONS = 64
 
 def complete_waters(
     waters: Sequence[AtomRecord], others: Sequence[AtomRecord], notes: list[str]
-) -> tuple[list[AtomRecord], npt.NDArray[np.int64]]:
+) -> tuple[list[AtomRecord], IntArray]:
     """Return the waters as oxygen and two hydrogens each, in the file's order, and their bonds `(n_bonds, 2)`.
 
     A hydrogen belongs to the nearest oxygen, within 1.3 Å. Oxygens without their two are given new ones, turned away
@@ -139,7 +137,7 @@ def resolve_solvent(
     """
     runs = [list(run) for _, run in groupby(kept, key=lambda i: atoms[i].residue_key)]
     runs = [run for run in runs if not is_water_name(atoms[run[0]].residue_name)]
-    named: dict[tuple[str, str, str], list[int]] = {}  # all oxygens may stand before all hydrogens
+    named: dict[ResidueKey, list[int]] = {}  # all oxygens may stand before all hydrogens
     for i in kept:
         if is_water_name(atoms[i].residue_name):
             named.setdefault(atoms[i].residue_key, []).append(i)
@@ -197,8 +195,8 @@ def agent_atoms(atoms: Sequence[AtomRecord], ligands: Sequence[int], notes: list
     """Indices of those ligands that are agents of crystallisation, buffers and counter-ions, by name and by elements;
     `notes` says which are left out."""
     found, names = [], []
-    for _, run in groupby(sorted(ligands, key=lambda i: atoms[i].residue_key), key=lambda i: atoms[i].residue_key):
-        members = list(run)
+    for _, run in sorted(by_residue([atoms[i] for i in ligands]).items()):
+        members = [ligands[k] for k in run]
         count = Counter(atoms[i].element for i in members if atoms[i].element != "H")
         heavy = "".join(f"{e}{n if n > 1 else ''}" for e, n in sorted(count.items()))
         if _AGENTS.get(atoms[members[0]].residue_name.upper()) == heavy:
@@ -232,10 +230,8 @@ def resolve_ligands(
 
 def refuse_bare_ligands(atoms: Sequence[AtomRecord], ligands: Sequence[int]) -> None:
     """A ligand with carbon and no hydrogen is one whose hydrogens the file leaves out. Raises PreparationError."""
-    by_residue: dict[tuple[str, str, str], set[str]] = {}
-    for i in ligands:
-        by_residue.setdefault(atoms[i].residue_key, set()).add(atoms[i].element)
-    for (chain, number, name), elements in by_residue.items():
+    for (chain, number, name), members in by_residue([atoms[i] for i in ligands]).items():
+        elements = {atoms[ligands[k]].element for k in members}
         if ("C" in elements and "H" not in elements) or (elements == {"O"} and template_for(name) is None):
             raise PreparationError(
                 f"{name} {chain}{number} has no hydrogens, which a ligand must bring; add them (its SDF from the "

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from systems.errors import InputError, SurromdError, TrajectoryError
 from systems.files.whole_file import create_whole, refuse_existing, storage_error, write_whole
-from systems.prepare.read.structure_text import encode
+from systems.prepare.structure_text import encode
 from systems.scene import Scene
 from systems.trajectory.base import TrajectoryWriter, check_same_topology
 from systems.trajectory.frame_store import CELLS, FRAMES, FrameBlock, FrameStore, create_store

@@ -21,7 +21,7 @@ from systems.chemistry.distance_bonds import with_bonds_by_distance
 from systems.chemistry.element_data import atomic_weight_da, element_symbol
 from systems.errors import InputError, TrajectoryError, first_line
 from systems.files.schema import parsed
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.structure_text import read_structure
 from systems.scene import Scene
 
 _NM = {"nanometer": 1.0, "nm": 1.0, "angstrom": 0.1, "a": 0.1, "å": 0.1, "bohr": 0.0529177210903, "pm": 1e-3}

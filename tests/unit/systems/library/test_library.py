@@ -39,8 +39,9 @@ def test_the_groups_hold_every_name_once() -> None:
 def test_molecules_are_what_their_smiles_says(name: str) -> None:
     from rdkit import Chem
     from rdkit.Chem.rdMolDescriptors import CalcMolFormula
+    from rdkit_of_scene import to_rdkit
 
-    from systems.prepare.molecule import scene_from_smiles, to_rdkit
+    from systems.prepare.molecule import scene_from_smiles
 
     scene = named_scenes.load(name)
     formula, n_atoms = MD17[name]

@@ -14,7 +14,7 @@ from systems.chemistry.graph import molecule_key
 from systems.errors import PreparationError, SurromdError
 from systems.library import named_scenes
 from systems.library.named_scenes import prepare
-from systems.prepare.read.structure_text import read_structure
+from systems.prepare.structure_text import read_structure
 from systems.scene import Scene
 from systems.trajectory.companion_writer import pdb_text
 
