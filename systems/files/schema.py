@@ -12,6 +12,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NotRequired,
     Self,
     TypeVar,
     Union,
@@ -97,6 +98,8 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
         return value
     if is_typeddict(hint):
         return _table(value, hint, where)
+    if origin is NotRequired:
+        return fitted(value, args[0], where)
     if origin is Annotated and args[1] is ...:
         return value if isinstance(value, float) else fitted(value, args[0], where)
     if origin is Annotated:

@@ -18,8 +18,15 @@ import numpy.typing as npt
 from systems.errors import InputError, TrajectoryError
 from systems.files.whole_file import OutputLock, journal_path
 from systems.scene import PARTICLE, Scene
-from systems.trajectory.base import TrajectoryReader, TrajectoryWriter, check_same_topology
-from systems.trajectory.frame_store import WEIGHTS, FrameBlock, FrameStore, open_hdf5
+from systems.trajectory.base import (
+    WEIGHTS,
+    FrameBlock,
+    FrameStore,
+    TrajectoryReader,
+    TrajectoryWriter,
+    check_same_topology,
+    open_hdf5,
+)
 from systems.units import GAS_CONSTANT_KJ_MOL_K
 
 __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "open_trajectory", "open_writer"]
@@ -68,9 +75,9 @@ def open_writer(
         raise InputError(
             f"{path}: trajectories are written as .h5, .dcd or .xtc, not {path.suffix or 'without a suffix'!r}."
         )
+    from systems.trajectory.companion_writer import XtcWriter
     from systems.trajectory.dcd_file import DcdWriter
     from systems.trajectory.hdf5_file import Hdf5Writer
-    from systems.trajectory.xtc_file import XtcWriter
 
     lock = None if locked else OutputLock(path)
     how: dict[str, Any] = {"append": append, "overwrite": overwrite, "run_id": run_id}
@@ -119,48 +126,29 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
     InputError when a topology is needed, or does not fit.
     """
-    path = Path(path)
-    top = None if top is None else Path(top)
-    is_hdf5 = path.suffix.lower() in _HDF5
-    if is_hdf5:
-        from systems.trajectory.hdf5_file import Hdf5Reader, is_plain_h5md
+    from systems.trajectory import companion_writer, dcd_file, foreign_readers, hdf5_file
+    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format
 
-        if not is_plain_h5md(path):
-            return Hdf5Reader(path, top)
-    if is_hdf5 or path.suffix.lower() == ".h5md":
-        from systems.trajectory.hdf5_file import H5mdReader
-
-        return H5mdReader(path, top)
-    if path.suffix.lower() == ".dcd":
-        from systems.trajectory.dcd_file import DcdReader
-
-        return DcdReader(path, top)
-    if path.suffix.lower() == ".xtc":
-        from systems.trajectory.companion_writer import is_our_topology, topology_path
-        from systems.trajectory.xtc_file import XtcReader, is_ours
-
-        if is_ours(path):
-            return XtcReader(path, top)
-        top = topology_path(path) if top is None and is_our_topology(topology_path(path)) else top
-    if path.suffix.lower() == ".traj":
-        from systems.trajectory.xyz_file import AseReader
-
-        return AseReader(path, top)
-    from systems.trajectory.foreign_scenes import XYZ_SUFFIXES
-
+    path, top = Path(path), None if top is None else Path(top)
+    suffix = path.suffix.lower()
+    if suffix in _HDF5 and not hdf5_file.is_plain_h5md(path):
+        return hdf5_file.Hdf5Reader(path, top)
+    if suffix in (*_HDF5, ".h5md"):
+        return foreign_readers.H5mdReader(path, top)
+    if suffix == ".dcd":
+        return dcd_file.DcdReader(path, top)
+    if suffix == ".xtc":
+        if companion_writer.is_ours(path):
+            return companion_writer.XtcReader(path, top)
+        pdb = companion_writer.topology_path(path)
+        top = pdb if top is None and companion_writer.is_our_topology(pdb) else top
+    if suffix == ".traj":
+        return foreign_readers.AseReader(path, top)
     if path.name.lower().endswith(XYZ_SUFFIXES):
-        from systems.trajectory.xyz_file import XyzReader
-
-        return XyzReader(path, top)
-    from systems.trajectory.foreign_scenes import is_mdtraj_format
-
+        return foreign_readers.XyzReader(path, top)
     if is_mdtraj_format(path):
-        from systems.trajectory.foreign_readers import MdtrajReader
-
-        return MdtrajReader(path, top)
-    from systems.trajectory.foreign_readers import MdanalysisReader
-
-    return MdanalysisReader(path, top)
+        return foreign_readers.MdtrajReader(path, top)
+    return foreign_readers.MdanalysisReader(path, top)
 
 
 # ---- several replicas in one file -----------------------------------------------------------------------------------
