@@ -14,7 +14,7 @@ import textwrap
 import tomllib
 import types
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from inspect import get_annotations
 from operator import attrgetter
@@ -148,7 +148,7 @@ class Option:
 
     @property
     def shown_default(self) -> str:
-        """The default as the help states it; empty where there is none to state."""
+        """The default as the help states it; empty where there is none to state, or it must be given."""
         if self.said.unset or self.required or self.default is None or self.default is False or self.default == ():
             return self.said.unset
         if self.unit and not isinstance(self.default, str):
@@ -289,40 +289,6 @@ def _meant(key: str, section: str, known: Mapping[str, Option]) -> str:
 def part_of(settings: Any, kind: type[T]) -> T:
     """Return the dataclass `kind` of the fields that `settings`, which has all of them, holds."""
     return kind(**{f.name: getattr(settings, f.name) for f in fields(cast(Any, kind)) if f.init})
-
-
-@dataclass(frozen=True)
-class OptionRow:
-    """An option as a table of the manual shows it. `flag` is empty for those of a `config` file alone, whose table
-    `section` is; `name` is the keyword in Python, `key` the name in a file."""
-
-    name: str
-    flag: str
-    key: str
-    section: str
-    unit: str
-    default: str
-    choices: tuple[str, ...]
-    help: str
-
-
-def option_rows(kind: type) -> list[OptionRow]:
-    """Return the options of a dataclass as rows of a table; 'required' stands for the default of those without."""
-    if not is_dataclass(kind):
-        raise TypeError(f"{kind!r} is no dataclass of options")
-    return [
-        OptionRow(
-            name=found.name,
-            flag=", ".join(found.flags),
-            key=found.key,
-            section=found.section,
-            unit=found.unit,
-            default="required" if found.required else found.shown_default,
-            choices=found.said.choices,
-            help=found.help,
-        )
-        for found in options_of(kind).values()
-    ]
 
 
 def flag_of(name: str) -> str:

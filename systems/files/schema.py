@@ -145,9 +145,10 @@ def fitted(value: Any, hint: Any, where: str) -> Any:
 
 
 def _table(value: Any, hint: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict) or not hint.__required_keys__ <= value.keys():
-        raise ValueError(f"{where} must be a table of {', '.join(hint.__annotations__)}, not {_shown(value)}")
     known = _hints(hint)
+    needed = {key for key in hint.__required_keys__ if get_origin(known[key]) is not NotRequired}
+    if not isinstance(value, dict) or not needed <= value.keys():
+        raise ValueError(f"{where} must be a table of {', '.join(known)}, not {_shown(value)}")
     return {key: fitted(v, known.get(key, Any), f"{where}.{key}") for key, v in value.items()}
 
 
