@@ -35,11 +35,9 @@ from systems.trajectory.base import (
     Float32Array,
     Float64Array,
     FrameBlock,
-    FrameStore,
     TrajectoryReader,
     TrajectoryWriter,
     add_column,
-    check_same_topology,
     create_store,
     damage_reported,
     open_hdf5,
@@ -156,51 +154,42 @@ class CompanionWriter(TrajectoryWriter):
     def __init__(
         self, path: Path, scene: Scene, record: dict[str, Any], *, append: bool, overwrite: bool, run_id: str = ""
     ) -> None:
-        self.path, self.scene, self._fd = path, scene, -1
+        self._fd = -1
         self._pdb, self._meta = companions(path)
         if not append:
-            self._create(record, overwrite, run_id)
+            self._create(path, scene, record, overwrite, run_id)
         if not self._meta.exists():
             raise TrajectoryError(f"{path} has no {self._meta.name} beside it and cannot be continued.")
-        self._store = FrameStore(self._meta)
+        super().__init__(path, self._meta, scene, record, append=append)
         try:
-            check_same_topology(path, self._store.scene, scene)
-            self._adopt()
-            self.n_frames, self.last_time_ps = self._store.n_frames, self._store.last_time_ps
-            new = {key: value for key, value in record.items() if key not in self._store.record}
-            if append and new:
-                self._store.update_record(new)
-            try:
-                self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-                self._set_length(self.n_frames)
-            except OSError as error:
-                raise storage_error(path, error, "nothing was changed") from error
-        except BaseException:
+            self._fd = os.open(path, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
+            self._set_length(self.n_frames)
+        except OSError as error:
             self.close()
-            raise
+            raise storage_error(path, error, "nothing was changed") from error
 
-    def _create(self, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
-        for file in (self.path, self._meta):
+    def _create(self, path: Path, scene: Scene, record: dict[str, Any], overwrite: bool, run_id: str) -> None:
+        for file in (path, self._meta):
             refuse_existing(file, overwrite)
         for suffix in SUFFIXES:
-            other = self.path.with_suffix(suffix)
-            if suffix != self.path.suffix.lower() and other.exists() and self._meta.exists():
+            other = path.with_suffix(suffix)
+            if suffix != path.suffix.lower() and other.exists() and self._meta.exists():
                 raise TrajectoryError(f"{self._meta} is the record of {other.name}; choose another name.")
-        topology = topology_bytes(self.scene)
-        refuse_other_topology(self.path, topology, overwrite=overwrite)
-        made = [file for file in (self._meta, self._pdb, self.path) if not file.exists()]
+        topology = topology_bytes(scene)
+        refuse_other_topology(path, topology, overwrite=overwrite)
+        made = [file for file in (self._meta, self._pdb, path) if not file.exists()]
         try:
             create_store(
                 self._meta,
-                self.scene,
+                scene,
                 record,
                 self._lay_out,
                 overwrite=overwrite,
                 run_id=run_id,
-                checksums=(FRAMES,) if self.scene.cell_nm is None else (FRAMES, CELLS),
+                checksums=(FRAMES,) if scene.cell_nm is None else (FRAMES, CELLS),
             )
-            write_topology(self.path, topology)
-            create_whole(self.path, self._head())
+            write_topology(path, topology)
+            create_whole(path, self._head(scene))
         except SurromdError:
             for file in made:
                 with suppress(OSError):
@@ -212,12 +201,8 @@ class CompanionWriter(TrajectoryWriter):
         """Make the columns of `NAME.meta.h5` that this format needs."""
 
     @abstractmethod
-    def _head(self) -> bytes:
+    def _head(self, scene: Scene) -> bytes:
         """Return what a file without frames holds."""
-
-    @abstractmethod
-    def _adopt(self) -> None:
-        """Learn how the file is laid out. Raises TrajectoryError where it is not ours, or lacks recorded frames."""
 
     @abstractmethod
     def _encoded(self, block: FrameBlock) -> tuple[bytes, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
@@ -234,8 +219,8 @@ class CompanionWriter(TrajectoryWriter):
         """Make the header say so many frames, where there is one: one small write, which is atomic. Raises OSError."""
 
     def _append(self, block: FrameBlock) -> None:
-        self._refuse_closed()
-        self._store.check_flags(block)
+        with self._open():
+            self._check_flags(block)
         kind = self.path.suffix[1:].upper()
         if block.velocities_nm_ps is not None or block.forces_kj_mol_nm is not None:
             raise InputError(
@@ -251,13 +236,13 @@ class CompanionWriter(TrajectoryWriter):
             self._restate(self.n_frames + len(block))
             os.ftruncate(self._fd, start + len(data))
             os.fsync(self._fd)
-            self._store.append(block, columns, stored)
+            self._store(block, columns, stored)
         except BaseException as error:
             # Taking space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
             self._forgotten(self.n_frames)
             with suppress(OSError):
                 self._set_length(self.n_frames)
-            failed = self._store.failed(error) if isinstance(error, OSError) else error
+            failed = self.failed(error) if isinstance(error, OSError) else error
             self.close()
             raise failed from error
 
@@ -279,14 +264,12 @@ class CompanionWriter(TrajectoryWriter):
         os.ftruncate(self._fd, self._offset(n_frames))
 
     def truncate(self, n_frames: int) -> None:
-        self._refuse_closed()
-        self._store.truncate(n_frames)
+        super().truncate(n_frames)
         self._forgotten(n_frames)
         try:
             self._set_length(n_frames)
         except OSError as error:
-            raise self._store.failed(error) from error
-        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+            raise self.failed(error) from error
 
     def close(self) -> None:
         if self._fd >= 0:
@@ -338,13 +321,13 @@ class XtcWriter(CompanionWriter):
         add_column(file, "time", 0, "<f8")
         add_column(file, ENDS, 0, "<i8")
 
-    def _head(self) -> bytes:
+    def _head(self, scene: Scene) -> bytes:
         return b""
 
     def _adopt(self) -> None:
-        if ENDS not in self._store.file:
+        if ENDS not in self.file:
             raise TrajectoryError(f"{self._meta} is not the record of {self.path.name}; choose another name.")
-        self._ends = self._store.file[ENDS][: self._store.n_frames]
+        self._ends = self.file[ENDS][: self.n_frames]
         _check_size(self.path, self._ends, completed=False)
 
     def _offset(self, n_frames: int) -> int:
@@ -366,7 +349,7 @@ class XtcWriter(CompanionWriter):
 
     def _steps(self, time_ps: Float64Array) -> npt.NDArray[np.int32]:
         """Return the steps `(n,)` that go with times: of the integrator where the record states it, else frames."""
-        timestep = self._store.record.get("timestep_ps")
+        timestep = self.record.get("timestep_ps")
         if isinstance(timestep, int | float) and timestep > 0 and time_ps[-1] / timestep < 2**31 - 1:
             return np.rint(time_ps / timestep).astype(np.int32)
         return np.arange(self.n_frames, self.n_frames + len(time_ps), dtype=np.int32)

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from systems.chemistry.distance_bonds import lengths_and_angles, read_cells
 from systems.errors import TrajectoryError
 from systems.files.whole_file import write_whole
+from systems.scene import Scene
 from systems.trajectory.base import CELLS, ENDS, FRAMES, Float32Array, Float64Array, FrameBlock, add_column, open_hdf5
 from systems.trajectory.companion_writer import (
     CompanionReader,
@@ -243,17 +244,16 @@ class DcdWriter(CompanionWriter):
     def _lay_out(self, file: h5py.File) -> None:
         add_column(file, "time", 0, "<f8")
 
-    def _head(self) -> bytes:
-        header = header_bytes(0, 0, 1, 0.0, has_cell=self.scene.cell_nm is not None)
-        return header + title_bytes(self.scene.n_atoms)
+    def _head(self, scene: Scene) -> bytes:
+        return header_bytes(0, 0, 1, 0.0, has_cell=scene.cell_nm is not None) + title_bytes(scene.n_atoms)
 
     def _adopt(self) -> None:
         layout = DcdLayout.read(self.path)
         is_ours = layout.is_ours(self.scene.n_atoms, has_cell=self.scene.cell_nm is not None)
-        if not is_ours or ENDS in self._store.file:
+        if not is_ours or ENDS in self.file:
             raise TrajectoryError(f"{self.path} was not written by surromd and cannot be continued; take another name.")
-        _check_against_meta(self.path, layout, self._store.n_frames, completed=False)
-        self._layout, self._first_times = layout, self._store.first_times_ps()
+        _check_against_meta(self.path, layout, self.n_frames, completed=False)
+        self._layout, self._first_times = layout, self.first_times_ps()
 
     def _offset(self, n_frames: int) -> int:
         return self._layout.offset(n_frames)
@@ -272,7 +272,7 @@ class DcdWriter(CompanionWriter):
     def _restate(self, n_frames: int) -> None:
         first, nsavc, timestep_ps = 0, 1, 0.0
         if len(self._first_times):
-            first, nsavc, timestep_ps = step_fields(self._first_times, self._store.record)
+            first, nsavc, timestep_ps = step_fields(self._first_times, self.record)
         write_whole(self._fd, header_bytes(n_frames, first, nsavc, timestep_ps, has_cell=self._layout.has_cell), 0)
 
     def _written(self, block: FrameBlock, columns: dict[str, npt.NDArray[Any]]) -> None:

@@ -33,11 +33,9 @@ from systems.trajectory.base import (
     Float32Array,
     Float64Array,
     FrameBlock,
-    FrameStore,
     TrajectoryReader,
     TrajectoryWriter,
     add_column,
-    check_same_topology,
     create_store,
     damage_reported,
     open_hdf5,
@@ -150,7 +148,6 @@ class Hdf5Writer(TrajectoryWriter):
         columns: Sequence[str] = (),
         run_id: str = "",
     ) -> None:
-        self.path, self.scene = path, scene
         check_wanted(columns, path)
         topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
         if not append:
@@ -166,37 +163,29 @@ class Hdf5Writer(TrajectoryWriter):
                 run_id=run_id,
                 checksums=names,
             )
-        self._store = FrameStore(path)
+        super().__init__(path, path, scene, record, append=append)
         try:
-            check_same_topology(path, self._store.scene, scene)
-            if "coordinates" not in self._store.file:
-                raise TrajectoryError(f"{path} holds no coordinates; it is the companion of a DCD file.")
             write_topology(path, topology)
-            new = {key: value for key, value in record.items() if key not in self._store.record}
-            if append and new:
-                self._store.update_record(new)
         except BaseException:
-            self._store.close()
+            self.close()
             raise
-        self.n_frames, self.last_time_ps = self._store.n_frames, self._store.last_time_ps
+
+    def _adopt(self) -> None:
+        if "coordinates" not in self.file:
+            raise TrajectoryError(f"{self.path} holds no coordinates; it is the companion of a DCD file.")
 
     def _append(self, block: FrameBlock) -> None:
-        self._refuse_closed()
-        timestep_ps = self._store.record.get("timestep_ps")
+        timestep_ps = self.record.get("timestep_ps")
         if isinstance(timestep_ps, int | float) and timestep_ps > 0:
             step = np.rint(block.time_ps / timestep_ps).astype(np.int64)
         else:
             step = np.arange(self.n_frames, self.n_frames + len(block), dtype=np.int64)
-        extra = extra_values(self._store.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
+        with self._open():
+            extra = extra_values(self.file, block, self.scene.cell_nm, f"{self.path}, after frame {self.n_frames}")
         stored = {FRAMES: block.positions_nm, **{name: extra[name] for name in PER_ATOM if name in extra}}
         if EDGES in extra:
             stored[CELLS] = extra[EDGES]
-        self._store.append(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
-
-    def truncate(self, n_frames: int) -> None:
-        self._refuse_closed()
-        self._store.truncate(n_frames)
-        self.n_frames, self.last_time_ps = n_frames, self._store.last_time_ps
+        self._store(block, {"coordinates": block.positions_nm, f"{_POSITION}/step": step, **extra}, stored)
 
 
 class Hdf5Reader(TrajectoryReader):

@@ -296,7 +296,7 @@ def test_a_reader_beside_a_journal_leaves_nothing_open(
         writer.append(frames, [1.0, 2.0, 3.0])
         if unfinished:
             whole = path.read_bytes()
-            writer._store._atomic._keep(len(whole), [(0, whole[:8])])
+            writer._atomic._keep(len(whole), [(0, whole[:8])])
         with open_trajectory(path) as reader:
             assert reader.n_frames == 3
         held = [fd for fd in list(Path("/proc/self/fd").iterdir()) if fd.exists() and fd.samefile(path)]
