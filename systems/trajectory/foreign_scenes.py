@@ -138,7 +138,8 @@ def scene_from_mdtraj_topology(
         raise InputError(f"{source or name}: {topology.n_atoms} atoms in the topology, positions {positions.shape}.")
     atoms, residues = list(topology.atoms), list(topology.residues)
     rows = sorted(
-        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), _order(b)) for b in topology.bonds
+        (min(b.atom1.index, b.atom2.index), max(b.atom1.index, b.atom2.index), float(b.order or b.type or 0))
+        for b in topology.bonds
     )
     symbols = list(elements) if elements is not None else [a.element.symbol if a.element else "VS" for a in atoms]
     bonds = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
@@ -157,7 +158,7 @@ def scene_from_mdtraj_topology(
         residue_of_atom=np.array([a.residue.index for a in atoms], dtype=np.int64),
         residue_names=tuple(r.name for r in residues),
         residue_ids=tuple(map(str, numbers)),
-        chain_of_residue=tuple(_chain_id(r.chain) for r in residues),
+        chain_of_residue=tuple(str(r.chain.chain_id or chr(ord("A") + r.chain.index % 26)) for r in residues),
         bonds=bonds,
         bond_orders=orders,
         formal_charges=charges,
@@ -204,10 +205,11 @@ def scene_from_structure(top: Path, *, name: str) -> Scene:
     import mdtraj
 
     if not is_mdtraj_format(top) or top.suffix.lower() in (".xyz", ".gsd"):
-        topology = _bare_topology(top)
-        if topology is None:
-            return scene_from_universe(top, name=name)
-        return scene_from_mdtraj_topology(topology, np.zeros((topology.n_atoms, 3)), name=name, source=top.name)
+        if top.suffix.lower() in (".psf", ".prmtop", ".parm7", ".top"):
+            with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
+                bare = mdtraj.load_topology(str(top))
+                return scene_from_mdtraj_topology(bare, np.zeros((bare.n_atoms, 3)), name=name, source=top.name)
+        return scene_from_universe(top, name=name)
     try:
         structure = mdtraj.load(str(top))
     except Exception as error:  # each MDTraj reader raises its own kinds
@@ -278,17 +280,6 @@ def scene_from_universe(top: Path, *, name: str) -> Scene:
     return with_orders(with_bonds_by_distance(scene))
 
 
-def _bare_topology(top: Path) -> Any:
-    """Return MDTraj's topology of a file without positions (PSF, prmtop), None when MDTraj does not read it."""
-    import mdtraj
-
-    if top.suffix.lower() not in (".psf", ".prmtop", ".parm7", ".top"):
-        return None
-    with contextlib.suppress(Exception):  # MDAnalysis is asked next, and says what is wrong
-        return mdtraj.load_topology(str(top))
-    return None
-
-
 def is_mdtraj_format(path: Path) -> bool:
     """Whether MDTraj has a reader for files of this suffix that needs no topology of the caller's beyond `top`."""
     from mdtraj.formats.registry import FormatRegistry
@@ -331,17 +322,6 @@ def _mass_da(symbol: str, atom: Any) -> float:
         return atomic_weight_da(symbol)
     except KeyError:  # an element without a table entry, or a virtual site
         return float(atom.element.mass) if atom.element is not None else 0.0
-
-
-def _order(bond: Any) -> float:
-    if bond.order is not None:
-        return float(bond.order)
-    return 0.0 if bond.type is None else float(bond.type)
-
-
-def _chain_id(chain: Any) -> str:
-    given = getattr(chain, "chain_id", None)
-    return str(given) if given else chr(ord("A") + chain.index % 26)
 
 
 def bonds_completed(scene: Scene, cells_nm: npt.NDArray[np.float64] | None) -> Scene:
