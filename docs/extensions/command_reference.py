@@ -61,7 +61,7 @@ def file_rows(words: list[str]) -> list[tuple[str, str]]:
     rows = options_of(VERB_OPTIONS[words[0]]).values() if words[0] in VERB_OPTIONS else ()
     found = []
     for row in (row for row in rows if not row.flags):
-        choices = f" One of {', '.join(row.said.choices)}." if row.said.choices else ""
+        choices = f" One of {', '.join(row.choices)}." if row.choices else ""
         shown = "required" if row.required else row.shown_default
         default = f" [default: {shown}]" if shown else ""
         found.append((f"[{row.section}] {row.key}" if row.section else row.key, f"{row.help}{choices}{default}"))

@@ -348,20 +348,16 @@ def turned(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: n
     return out
 
 
-def _turned_apart(positions_nm: FloatArray, quad: Sequence[int], angle: float, graph: nx.Graph) -> FloatArray:
-    """Return `turned` positions, unless atoms that this moves against each other then collide."""
-    out = turned(positions_nm, quad, angle, graph)
-    before, apart = (np.linalg.norm(at[:, None] - at, axis=-1) for at in (positions_nm, out))
-    return positions_nm if apart[np.abs(apart - before) > 1e-9].min(initial=np.inf) < _CLASH_NM else out
-
-
 def turn_torsions(scene: Scene, states_nm: FloatArray, every: int, rng: np.random.Generator) -> None:
     """Turn one torsion, rotors' too, of each `every`-th of the states `(n, n_atoms, 3)` nm to any angle, in place;
     where atoms would collide a state is left as it is."""
     torsions, graph = rotatable_torsions(scene, rotors=True), bonded_graph(scene)
     for k in range(0, len(states_nm) if len(torsions) else 0, every):
         quad = torsions[rng.integers(len(torsions))]
-        states_nm[k] = _turned_apart(states_nm[k], quad, rng.uniform(-np.pi, np.pi), graph)
+        out = turned(states_nm[k], quad, rng.uniform(-np.pi, np.pi), graph)
+        before, apart = (np.linalg.norm(at[:, None] - at, axis=-1) for at in (states_nm[k], out))
+        if apart[np.abs(apart - before) > 1e-9].min(initial=np.inf) >= _CLASH_NM:
+            states_nm[k] = out
 
 
 def rotatable_torsions(scene: Scene, *, rotors: bool = False) -> IntArray:

@@ -373,7 +373,10 @@ def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray
         for start, columns in column_blocks(positions, widest):
             part = flags[start : start + columns.shape[2]]
             part |= np.uint16(NOT_FINITE) * ~np.isfinite(columns).all(axis=(0, 1))
-            _check_bonds(columns, geometry, part)
+            mean = geometry.bond_mean_nm[:, None]
+            deviation = np.abs(np.sqrt(squared_distance(columns, geometry.bond_idx)) - mean.astype(columns.dtype))
+            part |= np.uint16(BOND_HALF_ANGSTROM) * (deviation > HALF_ANGSTROM_NM).any(axis=0)
+            part |= np.uint16(BOND_20_PERCENT) * (deviation > (0.2 * mean).astype(columns.dtype)).any(axis=0)
             _check_clashes(columns, geometry, part)
             turned = signed_volume(columns, geometry.stereo_idx) * geometry.stereo_sign[:, None] <= 0
             part |= np.uint16(CHIRALITY) * turned.any(axis=0)
@@ -387,14 +390,6 @@ def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray
 def flag_names(flags: int) -> list[str]:
     """Return what the bits of one frame's flags say, in words."""
     return [name for bit, name in _NAMES.items() if int(flags) & bit]
-
-
-def _check_bonds(columns: FloatArray, geometry: Geometry, part: npt.NDArray[np.uint16]) -> None:
-    length = np.sqrt(squared_distance(columns, geometry.bond_idx))
-    deviation = np.abs(length - geometry.bond_mean_nm[:, None].astype(columns.dtype))
-    part |= np.uint16(BOND_HALF_ANGSTROM) * (deviation > HALF_ANGSTROM_NM).any(axis=0)
-    limit = (0.2 * geometry.bond_mean_nm)[:, None].astype(columns.dtype)
-    part |= np.uint16(BOND_20_PERCENT) * (deviation > limit).any(axis=0)
 
 
 def _check_clashes(columns: FloatArray, geometry: Geometry, part: npt.NDArray[np.uint16]) -> None:
@@ -474,8 +469,10 @@ def limits_from_frames(scene: Scene, positions_nm: npt.ArrayLike, next_nm: npt.A
         raise InputError("None of the reference frames is finite.")
     first, second = first[finite], second[finite]
     near = scene.neighbours()
-    angle_idx = _rows([(a, b, c) for b, around in enumerate(near) for a in around for c in around if a < c], 3)
-    centres = _rows([(i, *around) for i, around in enumerate(near) if len(around) == 3], 4)
+    triples = [(a, b, c) for b, around in enumerate(near) for a in around for c in around if a < c]
+    angle_idx = np.array(triples, dtype=np.int64).reshape(-1, 3)
+    quads = [(i, *around) for i, around in enumerate(near) if len(around) == 3]
+    centres = np.array(quads, dtype=np.int64).reshape(-1, 4)
     angles = np.arccos(np.clip(_gather(first, angle_idx, _angle_cosine), -1.0, 1.0))
     heights = np.abs(_gather(first, centres, _height))
     flat = np.sqrt((heights**2).mean(axis=1)) < _FLAT_NM
@@ -521,10 +518,6 @@ def check_limits(positions_nm: npt.ArrayLike, limits: Limits, previous_nm: npt.A
                 far = max(limits.jump_max_nm, limits.drift_max_nm)
                 part |= np.uint16(DRIFT) * ~(np.sqrt((moved * moved).sum(axis=0)) <= far)
     return flags
-
-
-def _rows(rows: list[tuple[int, ...]], width: int) -> IntArray:
-    return np.array(rows, dtype=np.int64).reshape(-1, width)
 
 
 def _jump_pairs(scene: Scene) -> IntArray:

@@ -20,6 +20,7 @@ from systems.scene import FloatArray, IntArray, neighbours_of
 # Lengths in Å and angles in degrees of Engh and Huber, Acta Cryst. A47, 392 (1991).
 _C_N, _C_O, _C_CH3, _N_CH3 = 1.335, 1.231, 1.52, 1.45
 _C_N_CA, _CH3_C_N, _O_C_N = 121.7, 116.2, 123.0
+_NH_ANGSTROM = 1.3
 _PHI = (-65.0, -85.0, -110.0, -135.0, -160.0, 180.0, 60.0, 90.0, 120.0, 150.0)
 
 
@@ -79,11 +80,16 @@ def caps_of(gaps: Sequence[tuple[Residue, Residue]], atoms: Sequence[AtomRecord]
 def _acetyls(atoms: Sequence[AtomRecord], residue: Residue) -> list[dict[str, FloatArray]]:
     """Possible ACE before a residue: the one that its nitrogen's other atoms leave, else one for each φ."""
     n, ca, c = (_at(atoms, residue, a) for a in ("N", "CA", "C"))
-    third = [i for i in residue.atoms if atoms[i].element == "H" and np.linalg.norm(_position(atoms[i]) - n) < 1.3]
+    nitrogen = atoms[residue.heavy["N"]]
+    third = [
+        atoms[i]
+        for i in residue.atoms
+        if atoms[i].element == "H" and distance_angstrom(atoms[i], nitrogen) < _NH_ANGSTROM
+    ]
     if "CD" in residue.heavy and residue.template is not None and residue.template.name == "PRO":
-        third = [residue.heavy["CD"]]
+        third = [atoms[residue.heavy["CD"]]]
     if len(third) == 1:
-        carbons = [n + _C_N * _between(n, ca, _position(atoms[third[0]]))]
+        carbons = [n + _C_N * _between(n, ca, np.array(third[0].position_angstrom))]
     else:
         carbons = [extend(c, ca, n, _C_N, _C_N_CA, phi) for phi in _PHI]
     return [
@@ -107,12 +113,8 @@ def _beside(residue: Residue, step: int) -> tuple[str, str]:
     return chain, str(int(digits[0]) + step) if digits else number
 
 
-def _position(atom: AtomRecord) -> FloatArray:
-    return np.array(atom.position_angstrom, dtype=np.float64)
-
-
 def _at(atoms: Sequence[AtomRecord], residue: Residue, name: str) -> FloatArray:
-    return _position(atoms[residue.heavy[name]])
+    return np.array(atoms[residue.heavy[name]].position_angstrom)
 
 
 def _between(centre: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:

@@ -74,9 +74,7 @@ def _freest(oxygen: FloatArray, near: FloatArray, rng: np.random.Generator) -> F
     side = np.stack([across, -across], axis=1) * np.sin(_HALF_HOH)
     pairs: FloatArray = oxygen + _OH_ANGSTROM * (along[:, None] * np.cos(_HALF_HOH) + side)
     others = near[np.linalg.norm(near - oxygen, axis=1) > _OH_ANGSTROM / 2]
-    if not len(others):
-        return pairs[0]
-    gaps = np.linalg.norm(pairs[:, :, None] - others[None, None], axis=3).min(axis=(1, 2))
+    gaps = np.linalg.norm(pairs[:, :, None] - others[None, None], axis=3).min(axis=(1, 2), initial=np.inf)
     return pairs[int(gaps.argmax())]
 
 
@@ -108,23 +106,19 @@ def is_water(atoms: Sequence[AtomRecord]) -> bool:
     if len(oxygens) + len(hydrogens) < len(atoms):
         return False
     if is_water_name(atoms[0].residue_name):
-        return not oxygens or (len(hydrogens) <= 2 * len(oxygens) and _are_apart(oxygens))
+        if len(oxygens) < 2 or len(hydrogens) > 2 * len(oxygens):  # of a box of water, each has one
+            return not oxygens or len(hydrogens) <= 2
+        from scipy.spatial import cKDTree
+
+        return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
     if len(hydrogens) < 2 * len(oxygens) or not oxygens:
         return False
-    if len(oxygens) == 1:  # of a box of water, each
+    if len(oxygens) == 1:
         return len(hydrogens) == 2 and all(math.dist(oxygens[0], h) < WATER_BOND_ANGSTROM for h in hydrogens)
     from scipy.spatial import cKDTree
 
     gaps, owners = cKDTree(oxygens).query(hydrogens)
     return bool((gaps < WATER_BOND_ANGSTROM).all()) and bool((np.bincount(owners, minlength=len(oxygens)) == 2).all())
-
-
-def _are_apart(oxygens: Sequence[tuple[float, float, float]]) -> bool:
-    if len(oxygens) == 1:  # of a box of water, each
-        return True
-    from scipy.spatial import cKDTree
-
-    return not cKDTree(oxygens).query_pairs(_PEROXIDE_ANGSTROM)
 
 
 def resolve_solvent(
@@ -170,7 +164,7 @@ def _free(atoms: Sequence[AtomRecord], ions: Sequence[int], solute: Sequence[int
     from scipy.spatial import cKDTree
 
     gap, _ = cKDTree(np.array(donors)).query(np.array([atoms[i].position_angstrom for i in ions]))
-    return {i for i, d in zip(ions, np.atleast_1d(gap).tolist(), strict=True) if d > _BOUND_ANGSTROM}
+    return {i for i, d in zip(ions, gap.tolist(), strict=True) if d > _BOUND_ANGSTROM}
 
 
 def ligand_atoms(atoms: Sequence[AtomRecord], bonding: Bonding) -> list[int]:

@@ -105,7 +105,10 @@ def _read_molecule(path: Path, notes: list[str]) -> Any:
     with rdBase.BlockLogs():
         if suffix_of(path) == ".mol2":
             return _read_mol2(text, path, notes)
-        molecule = Chem.MolFromMolBlock(_first_mol_block(text, notes), sanitize=False, removeHs=False)
+        records = [r for r in text.split("$$$$") if r.strip()]
+        if len(records) > 1:
+            notes.append(f"{len(records)} molecules in the file: the first is taken")
+        molecule = Chem.MolFromMolBlock("".join(records[:1]), sanitize=False, removeHs=False)
     if molecule is None:
         raise InputError(f"{path} holds no molecule that can be read as {suffix_of(path)[1:].upper()}; write it again.")
     return _resolved(main_molecule(molecule, notes), notes)
@@ -224,13 +227,6 @@ def _reperceived(molecule: Any, notes: list[str]) -> Any | None:
     return out
 
 
-def _first_mol_block(text: str, notes: list[str]) -> str:
-    records = [r for r in text.split("$$$$") if r.strip()]
-    if len(records) > 1:
-        notes.append(f"{len(records)} molecules in the file: the first is taken")
-    return records[0] if records else ""
-
-
 def _with_geometry(molecule: Any, notes: list[str]) -> Any:
     from rdkit import Chem
 
@@ -252,8 +248,13 @@ def _with_geometry(molecule: Any, notes: list[str]) -> Any:
     out = Chem.AddHs(molecule, addCoords=True)
     if out.GetNumAtoms() > n_atoms:
         notes.append(f"hydrogens added: {out.GetNumAtoms() - n_atoms}")
-    _refuse_coincident(out)
-    _refuse_broken(out)
+    symbols, positions = [atom.GetSymbol() for atom in out.GetAtoms()], np.array(out.GetConformer().GetPositions())
+    for i, j in near_pairs(positions, 0.3, "the molecule").tolist():
+        raise PreparationError(
+            f"atoms {i + 1} ({symbols[i]}) and {j + 1} ({symbols[j]}) stand on one point; correct the coordinates."
+        )
+    bonds = np.array([(b.GetBeginAtomIdx(), b.GetEndAtomIdx()) for b in out.GetBonds()], dtype=np.int64)
+    refuse_long_bonds(symbols, positions / 10.0, bonds, lambda i: f"{symbols[i]}{i + 1}")
     Chem.AssignStereochemistryFrom3D(out)
     return out
 
@@ -268,24 +269,6 @@ def _is_drawing(molecule: Any, conformer: Any) -> bool:
     return not positions[:, 2].any() and any(
         atom.GetSymbol() == "C" and atom.GetTotalDegree() == 4 and atom.GetDegree() > 2 for atom in molecule.GetAtoms()
     )
-
-
-def _refuse_broken(molecule: Any) -> None:
-    atoms = [atom.GetSymbol() for atom in molecule.GetAtoms()]
-    bonds = np.array([(b.GetBeginAtomIdx(), b.GetEndAtomIdx()) for b in molecule.GetBonds()], dtype=np.int64)
-    positions_nm = np.array(molecule.GetConformer().GetPositions()) / 10.0
-    refuse_long_bonds(atoms, positions_nm, bonds, lambda i: f"{atoms[i]}{i + 1}")
-
-
-def _refuse_coincident(molecule: Any) -> None:
-    positions = np.array(molecule.GetConformer().GetPositions())
-    pairs = near_pairs(positions, 0.3, "the molecule")
-    if len(pairs):
-        i, j = pairs[0].tolist()
-        symbols = [molecule.GetAtomWithIdx(k).GetSymbol() for k in (i, j)]
-        raise PreparationError(
-            f"atoms {i + 1} ({symbols[0]}) and {j + 1} ({symbols[1]}) stand on one point; correct the coordinates."
-        )
 
 
 # ---- files of the chemical component dictionary ---------------------------------------------------------------------
@@ -412,9 +395,14 @@ def main_molecule(molecule: Any, notes: list[str]) -> Any:
     if len(parts) < 2:
         return molecule
     keys = [_key(part) for part in parts]
-    companions = [_is_lone(part) or key in _known() for part, key in zip(parts, keys, strict=True)]
+    lone = [part.GetNumAtoms() == 1 and part.GetAtomWithIdx(0).GetSymbol() in _MONATOMIC for part in parts]
+    companions = [alone or key in _known() for alone, key in zip(lone, keys, strict=True)]
     wanted = [k for k, companion in enumerate(companions) if not companion]
-    acids = [k for k, companion in enumerate(companions) if companion and _is_neutral_organic(parts[k])]
+    acids = [
+        k
+        for k, companion in enumerate(companions)
+        if companion and _is_organic(parts[k]) and not any(a.GetFormalCharge() for a in parts[k].GetAtoms())
+    ]
     if wanted and acids and not any(a.GetSymbol() == "N" for a in parts[wanted[0]].GetAtoms()):
         wanted += acids  # acetic acid and ethanol are no salt
     if not wanted:  # acetate, with sodium: of counterions alone, the organic one
@@ -431,18 +419,10 @@ def main_molecule(molecule: Any, notes: list[str]) -> Any:
     return parts[wanted[0]]
 
 
-def _is_lone(part: Any) -> bool:
-    return part.GetNumAtoms() == 1 and part.GetAtomWithIdx(0).GetSymbol() in _MONATOMIC
-
-
 def _is_organic(part: Any) -> bool:
     """Whether it has a carbon, and not carbonate's alone."""
     carbons = [a for a in part.GetAtoms() if a.GetSymbol() == "C"]
     return len(carbons) > 1 or any(n.GetSymbol() != "O" for a in carbons for n in a.GetNeighbors())
-
-
-def _is_neutral_organic(part: Any) -> bool:
-    return _is_organic(part) and not any(a.GetFormalCharge() for a in part.GetAtoms())
 
 
 @cache
@@ -452,8 +432,8 @@ def _known() -> frozenset[str]:
     return frozenset(_key(Chem.MolFromSmiles(smiles)) for smiles in _COUNTERIONS)
 
 
-def _key(part: Any) -> str:
-    """Canonical SMILES without charge, stereo and isotopes; empty for what is no possible molecule."""
+def _clean(part: Any, *, uncharged: bool) -> Any | None:
+    """Return a molecule sanitised, without hydrogens, and without charges if asked; None for no possible molecule."""
     from rdkit import Chem, rdBase
     from rdkit.Chem.MolStandardize import rdMolStandardize
 
@@ -461,24 +441,28 @@ def _key(part: Any) -> str:
         try:
             clean = Chem.Mol(part)
             Chem.SanitizeMol(clean)
-            clean = rdMolStandardize.Uncharger().uncharge(Chem.RemoveHs(clean))
+            clean = Chem.RemoveHs(clean)
+            return rdMolStandardize.Uncharger().uncharge(clean) if uncharged else clean
         except (Chem.MolSanitizeException, ValueError):
-            return ""
+            return None
+
+
+def _key(part: Any) -> str:
+    """Canonical SMILES without charge, stereo and isotopes; empty for what is no possible molecule."""
+    from rdkit import Chem
+
+    clean = _clean(part, uncharged=True)
+    if clean is None:
+        return ""
     for atom in clean.GetAtoms():
         atom.SetIsotope(0)
     return str(Chem.MolToSmiles(clean, isomericSmiles=False))
 
 
 def _smiles(part: Any) -> str:
-    from rdkit import Chem, rdBase
+    from rdkit import Chem
 
-    with rdBase.BlockLogs():
-        try:
-            clean = Chem.Mol(part)
-            Chem.SanitizeMol(clean)
-            return str(Chem.MolToSmiles(Chem.RemoveHs(clean)))
-        except (Chem.MolSanitizeException, ValueError):
-            return str(Chem.MolToSmiles(part))
+    return str(Chem.MolToSmiles(_clean(part, uncharged=False) or part))
 
 
 def _ionic(molecule: Any, notes: list[str]) -> Any:
@@ -565,7 +549,7 @@ def require(molecule: Any) -> None:
 
 def embed(molecule: Any, *, seed: int, notes: list[str]) -> Any:
     """Return the molecule (all hydrogens in it) with one conformer: ETKDG (Riniker and Landrum, 2015), then MMFF94 or
-    UFF. Stereo is the molecule's own; stereocentres and double bonds it leaves open are drawn and said in `notes`.
+    UFF. Stereo that it leaves open is drawn, and said in `notes`.
 
     Raises PreparationError when RDKit finds no geometry or the geometry has other stereo than the molecule.
     """
@@ -676,8 +660,7 @@ def sanitise(molecule: Any) -> None:
         with rdBase.BlockLogs():
             Chem.SanitizeMol(molecule)
     except (Chem.MolSanitizeException, ValueError) as error:
-        reason = (str(error).strip().splitlines() or ["no reason given"])[0].rstrip(".")
-        raise PreparationError(f"it is no possible molecule ({reason}).") from error
+        raise PreparationError(f"it is no possible molecule ({first_line(error)}).") from error
 
 
 def drop_isotopes(molecule: Any, notes: list[str]) -> None:

@@ -417,9 +417,8 @@ def protonation_summary(
     for label, key, variant in zip(labels, keys, given, strict=True):
         template = template_for(key[2])
         if variant is None and template is not None and template.name in TITRATED:
-            marks = tuple(h in hydrogens.get(key, set()) for h in TITRATED[template.name])
-            state = _STATES.get((template.name, marks))
-            if state:
+            marks = tuple(h in hydrogens.get(key, ()) for h in TITRATED[template.name])
+            if state := _STATES.get((template.name, marks)):
                 states.setdefault(state, []).append(label)
     return [f"protonation at pH {ph:g}: {state}: {listed(found)}" for state, found in sorted(states.items())]
 

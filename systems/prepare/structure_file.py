@@ -166,9 +166,11 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
     groups = nx.Graph()
     occupancy: dict[tuple[str, str], dict[str, list[float]]] = {}
     for i in labelled:
-        groups.add_node(_place(atoms[i]))
-        occupancy.setdefault(_place(atoms[i]), {}).setdefault(atoms[i].altloc, []).append(atoms[i].occupancy)
-    groups.add_edges_from((_place(atoms[i]), _place(atoms[j])) for i, j in _bonds_of_alternates(found, labelled))
+        groups.add_node(atoms[i].residue_key[:2])
+        occupancy.setdefault(atoms[i].residue_key[:2], {}).setdefault(atoms[i].altloc, []).append(atoms[i].occupancy)
+    groups.add_edges_from(
+        (atoms[i].residue_key[:2], atoms[j].residue_key[:2]) for i, j in _bonds_of_alternates(found, labelled)
+    )
     chosen: dict[tuple[str, str], str] = {}
     for group in nx.connected_components(groups):
         of_label: dict[str, list[list[float]]] = {}
@@ -183,7 +185,7 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
         order = sorted(of_label, key=rank, reverse=True)
         chosen |= {place: next(label for label in order if label in occupancy[place]) for place in group}
     chosen = {place: chosen[place] for place in occupancy}
-    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[_place(a)] == a.altloc]
+    kept = [i for i, a in enumerate(atoms) if not a.altloc or chosen[a.residue_key[:2]] == a.altloc]
     instead = {(*atoms[i].residue_key, atoms[i].name): i for i in kept if atoms[i].altloc}
     stays = [instead.get((*a.residue_key, a.name), i) if a.altloc else i for i, a in enumerate(atoms)]
     found.conect = sorted({(min(p), max(p)) for p in ((stays[i], stays[j]) for i, j in found.conect) if p[0] != p[1]})
@@ -195,10 +197,6 @@ def _choose_alternates(found: StructureFile, repairs: list[str]) -> list[int]:
             f"{len(atoms) - len(kept)} atoms left out"
         )
     return kept
-
-
-def _place(atom: AtomRecord) -> tuple[str, str]:
-    return atom.chain, atom.residue_id
 
 
 def _bonds_of_alternates(found: StructureFile, labelled: Sequence[int]) -> list[tuple[int, int]]:
@@ -253,15 +251,17 @@ def _overfull(atoms: Sequence[AtomRecord], bonds: IntArray) -> set[int]:
 def _clashing_hydrogens(atoms: Sequence[AtomRecord], bonds: IntArray) -> list[PreparationError]:
     """Say which hydrogens of one residue stand at an atom of another that has all it can have: to be raised where
     placing hydrogens anew does not part them."""
-    found, overfull = [], _overfull(atoms, bonds)
-    for i, j in (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ():
-        if j in overfull and atoms[i].element == "H" and atoms[i].residue_key != atoms[j].residue_key:
-            gap = distance_angstrom(atoms[i], atoms[j])
-            found.append(PreparationError(
-                f"{atoms[i].label} and {atoms[j].label} are {gap:.2f} Å apart, and no bond can join them: "
-                "the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
-            ))  # fmt: skip
-    return found
+    overfull = _overfull(atoms, bonds)
+    both = (*bonds.tolist(), *bonds[:, ::-1].tolist()) if overfull else ()
+    clashes = [(atoms[i], atoms[j]) for i, j in both if j in overfull and atoms[i].element == "H"]
+    return [
+        PreparationError(
+            f"{first.label} and {second.label} are {distance_angstrom(first, second):.2f} Å apart, and no bond can "
+            "join them: the atoms clash; model them again, or take all hydrogens out, which are then placed anew."
+        )
+        for first, second in clashes
+        if first.residue_key != second.residue_key
+    ]
 
 
 def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> None:
@@ -281,12 +281,10 @@ def _refuse_surplus_hydrogens(bonding: Bonding, atoms: Sequence[AtomRecord]) -> 
 def _refuse_bare_skeletons(residues: Sequence[Residue], atoms: Sequence[AtomRecord]) -> None:
     """A molecule without any hydrogen is most often a file without hydrogens, and would get absurd double bonds."""
     for residue in residues:
-        symbols = [atoms[i].element for i in residue.atoms]
-        if residue.heavy or "C" not in symbols or "H" in symbols:
+        symbols = {atoms[i].element for i in residue.atoms}
+        if residue.heavy or "C" not in symbols or "H" in symbols or len(residue.atoms) <= 3:
             continue
-        if len(symbols) > 3 and not (
-            {"F", "Cl", "Br", "I"} & set(symbols) and set(symbols) <= _COMPLETE_WITHOUT_HYDROGEN
-        ):
+        if not {"F", "Cl", "Br", "I"} & symbols or not symbols <= _COMPLETE_WITHOUT_HYDROGEN:
             raise PreparationError(
                 f"{residue.label} has no hydrogens and is no standard amino acid; add them first (for instance "
                 "`obabel in.pdb -O out.pdb -h`)."

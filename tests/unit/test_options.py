@@ -161,7 +161,7 @@ def test_what_a_table_of_the_manual_shows() -> None:
     assert (found["time_ps"].flags, found["time_ps"].unit, found["time_ps"].required) == (("--time",), "ps", True)
     assert (found["start_from"].flags, found["start_from"].key) == (("--from", "-f"), "from")
     assert (found["solver_steps"].flags, found["solver_steps"].section) == ((), "sampling")
-    assert found["save_every_ps"].shown_default == "1ps" and found["guard"].said.choices == ("flag", "repair")
+    assert found["save_every_ps"].shown_default == "1ps" and found["guard"].choices == ("flag", "repair")
 
 
 def test_a_dataclass_made_by_hand_can_be_checked() -> None:
