@@ -38,6 +38,7 @@ from systems.trajectory.base import (
     TrajectoryReader,
     TrajectoryWriter,
     add_column,
+    consistent_length,
     create_store,
     damage_reported,
     open_hdf5,
@@ -238,11 +239,13 @@ class CompanionWriter(TrajectoryWriter):
             os.fsync(self._fd)
             self._store(block, columns, stored)
         except BaseException as error:
-            # Taking space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
-            self._forgotten(self.n_frames)
-            with suppress(OSError):
-                self._set_length(self.n_frames)
             failed = self.failed(error) if isinstance(error, OSError) else error
+            # The companion may hold these frames, where its own last step failed: what it lacks is cut off. Taking
+            # space back needs none, so this also succeeds on a full disk; and frames too many do no harm.
+            with suppress(OSError, SurromdError), open_hdf5(self._meta) as file:
+                n_frames = consistent_length(file, self._meta)
+                self._forgotten(n_frames)
+                self._set_length(n_frames)
             self.close()
             raise failed from error
 
