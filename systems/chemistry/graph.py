@@ -397,12 +397,10 @@ def match_atoms(scene: Scene, template: Scene) -> IntArray:
     """Return `order (n_atoms,)` such that template atom k is scene atom `order[k]`.
 
     Elements, connectivity, total charge and stereo must agree; names, order, residues and bond orders play no part.
-    Of the equivalent assignments one is taken in which every four-coordinate atom keeps its handedness at the two
-    scenes' positions, prochiral groups, CH2 and methyl hydrogens included, so that `positions_nm[order]` superposes on
-    the template with no group inverted; rotors and planar NH2 take the labelling nearest in torsion.
-    Particles of a model system are matched one by one in their order, and their laws must agree.
-    Raises OutOfDomainError with the reason: another formula, charge, connectivity or law, the mirror image, a
-    stereoisomer.
+    Of the equivalent assignments one is taken in which every four-coordinate atom keeps its handedness, prochiral
+    groups and methyl hydrogens included, so that `positions_nm[order]` superposes on the template with no group
+    inverted; rotors and planar NH2 take the labelling nearest in torsion. Particles of a model system are matched in
+    their order. Raises OutOfDomainError with the reason.
     """
     if scene.interactions != template.interactions:
         raise OutOfDomainError(f"{scene.name} and {template.name} are under different laws: not the same model system.")

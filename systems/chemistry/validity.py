@@ -432,7 +432,7 @@ class Limits(Recorded):
     Angles: `angle_idx (k, 3)` rows (end, middle, end) within `angle_min_rad` and `angle_max_rad (k,)`. Flat centres:
     `flat_idx (k, 4)` rows (centre, a, b, c) no farther than `flat_max_nm (k,)` from the plane of a, b, c. Jumps:
     `jump_idx (k, 2)` pairs of atoms, whose distances change from one frame to the next, `lag_ps` later, by no more than
-    `jump_max_nm`, root mean square, and no less than `jump_min_nm` (0 in files of older versions). The middle of those
+    `jump_max_nm`, root mean square, and no less than `jump_min_nm`. The middle of those
     atoms moves no farther than `jump_max_nm` either: frames stand in one pose, so what it does beyond is drift; or no
     farther than `drift_max_nm`, if that is more, where frames turn about a centre of mass that is elsewhere.
     """

@@ -144,7 +144,7 @@ def locked_outputs(
     patience_s: float = 0.0,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[None]:
-    """Hold the claims of a run's trajectories; when it fails, remove those it made that have no frames.
+    """Lock a run's trajectories; when it fails, remove those it made that have no frames.
 
     What there is to go on from is kept when the run was stopped, or the disk is full: files of a run with a checkpoint.
     Raises what `OutputLock` raises, TrajectoryError where one exists unless it `may_exist`, InputError where another

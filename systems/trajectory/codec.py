@@ -35,6 +35,7 @@ __all__ = ["FrameBlock", "TrajectoryReader", "TrajectoryWriter", "companions", "
 
 _HDF5 = (".h5", ".hdf5")
 _WITH_COMPANIONS = (".dcd", ".xtc")
+_COLUMNS = ("velocities", "forces")
 # What trajectories are written as.
 WRITTEN = (*_HDF5, *_WITH_COMPANIONS)
 
@@ -103,6 +104,9 @@ def refuse_columns(path: Path, columns: Sequence[str]) -> None:
     if columns and path.suffix.lower() in _WITH_COMPANIONS:
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: {kind} files hold positions only; write an .h5 to keep {' and '.join(columns)}.")
+    for name in columns:
+        if name not in _COLUMNS:
+            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(_COLUMNS)}.")
 
 
 def companions(path: Path) -> tuple[Path, ...]:
@@ -177,7 +181,7 @@ def join(paths: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
         interval_ps = intervals[0] if intervals else float(stated) if isinstance(stated, int | float) else 1.0
         if any(abs(other - interval_ps) > 1e-6 * interval_ps for other in intervals):
             raise InputError(f"{out}: its replicas differ in the time between frames; join those of one interval.")
-        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else ["velocities", "forces"]
+        columns = [] if out.suffix.lower() in _WITH_COMPANIONS else list(_COLUMNS)
         columns = [c for c in columns if all(getattr(r, f"read_{c}")(0, 1) is not None for r in readers)]
         starts = np.cumsum([0, *(r.n_frames for r in readers)]).tolist()
         replicas = [
@@ -328,7 +332,7 @@ def _read(
 # ---- weights of frames ----------------------------------------------------------------------------------------------
 
 
-# Scalar column of a rollout: U_truth - U_model in kJ/mol, NaN where the reference was not asked.
+# Scalar column of a rollout: U_reference - U_model in kJ/mol, NaN where the reference was not computed.
 DIFFERENCE_COLUMN = "energy_difference_kj_mol"
 
 
@@ -336,8 +340,8 @@ def reweighting(differences_kj_mol: npt.ArrayLike, temperature_k: float) -> tupl
     """Return the weights `(n,)`, summing to one, that turn a potential's frames into those of the reference, and how
     many effective frames they leave (Kish: 1 / sum w^2).
 
-    `differences_kj_mol` (n,): U_truth - U_model at the frames; w is proportional to exp(-difference / kT). Independent
-    frames are assumed; correlation in time lessens the number further.
+    `differences_kj_mol` (n,): U_reference - U_model at the frames; w is proportional to exp(-difference / kT).
+    Independent frames are assumed; correlation in time lessens the number further.
     """
     reduced = -np.asarray(differences_kj_mol, dtype=np.float64) / (GAS_CONSTANT_KJ_MOL_K * temperature_k)
     weights = np.exp(reduced - reduced.max())

@@ -97,14 +97,13 @@ class DcdLayout:
             raise TrajectoryError(f"{path} is cut short inside its header.") from error
         if not 1 <= n_atoms < _MOST_ATOMS:
             raise TrajectoryError(f"{path} is damaged: its header states {n_atoms} atoms.")
-        unit_ps = AKMA_PS
-        notes: tuple[str, ...] = ()
+        unit_ps, notes = AKMA_PS, list[str]()
         # MDTraj and VMD write a time step of one unit, whatever the times were.
         states_time = not (delta == 1.0 and fields[2] == 1)
         if _LAMMPS_TITLE in titles:
             # LAMMPS writes its time step in its own units, which no title names: fs (real), ps (metal) or reduced ones.
             unit_ps, states_time = 1e-3, bool(delta >= _LEAST_LAMMPS_FS)
-            notes = (_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN,)
+            notes = [_LAMMPS_NOTE if states_time else _LAMMPS_UNKNOWN]
         # The time step is float32: digits beyond its seventh are noise.
         interval_ps = float(f"{float(delta) * unit_ps * max(int(fields[2]), 1):.6g}")
         states_time = states_time and bool(np.isfinite(interval_ps) and interval_ps > 0)
@@ -113,7 +112,7 @@ class DcdLayout:
         first_time_ps = interval_ps * int(fields[1]) / max(int(fields[2]), 1)
         return DcdLayout(n_atoms, first_frame_at, order, bool(charmm and fields[10]), int(fields[0]),
                          first_time_ps, interval_ps, size, path, _TITLE in titles, states_time,
-                         int(fields[19]), notes)  # fmt: skip
+                         int(fields[19]), tuple(notes))  # fmt: skip
 
     @property
     def frame_dtype(self) -> np.dtype[Any]:

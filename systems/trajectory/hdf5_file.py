@@ -1,4 +1,4 @@
-"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone; others' H5MD.
+"""HDF5 trajectories that follow MDTraj's and H5MD's conventions at once, written and read by h5py alone.
 
 MDTraj: `/coordinates` (n, n_atoms, 3) float32 nm, `/time` ps, `/topology` JSON (mdtraj.org, HDF5 format, version 1.1).
 H5MD 1.1 (de Buyl, Colberg and Höfling, Comput. Phys. Commun. 185, 1546 (2014)): `/particles/trajectory/position` with
@@ -59,13 +59,6 @@ _LAYOUT = {
     "forces": ("force", b"kilojoules_per_mole/nanometer", "kJ mol-1 nm-1"),
 }
 _POSITION = "particles/trajectory/position"
-
-
-def check_wanted(wanted: Sequence[str], path: Path) -> None:
-    """Raise InputError for a column that a file cannot have."""
-    for name in wanted:
-        if name not in PER_ATOM:
-            raise InputError(f"{path}: no column {name!r} can be stored; known: {', '.join(PER_ATOM)}.")
 
 
 def lay_out_extras(file: h5py.File, wanted: Sequence[str], *, periodic: bool) -> None:
@@ -148,7 +141,6 @@ class Hdf5Writer(TrajectoryWriter):
         columns: Sequence[str] = (),
         run_id: str = "",
     ) -> None:
-        check_wanted(columns, path)
         topology = b"" if append and topology_path(path).exists() else topology_bytes(scene)
         if not append:
             refuse_existing(path, overwrite)
