@@ -1,9 +1,6 @@
-"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison; and
-the reference geometry that they go by, of a scene's bond graph and of reference frames.
-
-For guards also limits of a reference's frames: angles, flat centres, jumps, stillness and drift. Every one is measured
-on the reference: the farthest that its frames go from their mean, and half as far again; the least that they change
-from one to the next, and a third of it.
+"""Validity of frames: NumPy checks of bonds, clashes, chirality and planarity, for guards and for the comparison, by
+the geometry of a scene or of reference frames. For guards also limits of angles, flat centres, jumps, stillness and
+drift: the farthest that the reference goes from its mean, and half as far again; the least it changes, and a third.
 """
 
 from __future__ import annotations
@@ -355,12 +352,10 @@ def small_rings(scene: Scene, *, most_neighbours: int | None = None) -> list[lis
 def check_frames(positions_nm: npt.ArrayLike, geometry: Geometry) -> npt.NDArray[np.uint16]:
     """Return validity bits `(n_frames,)` of frames `(n_frames, n_atoms, 3)` nm (or one frame); 0 is a valid frame.
 
-    NOT_FINITE: a coordinate is NaN or infinite. BOND_HALF_ANGSTROM: a bond is more than 0.05 nm from its mean (the
-    stability rule of Fu et al., Forces are not enough, TMLR 2023). BOND_20_PERCENT: more than 20 % from it; the
-    stricter warning, which INVALID leaves out. CLASH: atoms more than three bonds apart nearer than the geometry
-    allows. CHIRALITY: a stereocentre is inverted or flat. OMEGA: a peptide or double bond has gone from cis to trans or
-    back. RING: a torsion inside a planar ring beyond 60°. Raises InputError when the frames do not have the geometry's
-    atoms.
+    BOND_HALF_ANGSTROM: a bond is more than 0.05 nm from its mean (the stability rule of Fu et al., Forces are not
+    enough, TMLR 2023). BOND_20_PERCENT: more than 20 %; INVALID leaves it out. CLASH: atoms more than three bonds apart
+    nearer than the geometry allows. CHIRALITY: a stereocentre is inverted or flat. OMEGA: a peptide or double bond has
+    gone from cis to trans or back. RING: a torsion inside a planar ring beyond 60°. Raises InputError for other atoms.
     """
     positions = np.asarray(positions_nm)
     if positions.ndim == 2:

@@ -302,13 +302,13 @@ def journal_path(path: Path) -> Path:
 class AtomicFile(io.RawIOBase):
     """A seekable binary file whose writes wait in memory until `commit`, which makes all of them or none.
 
-    HDF5 has no transactions: a process killed, a disk filled or the power lost between two of its writes can leave
-    metadata that name data which never arrived, and then the whole file is lost. Given to h5py as its file object, this
-    class collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium,
-    then the writes to the file; when these are on the medium, too, the journal is void. A journal that is not void is
-    from a transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees
-    them in their place. Other programs read such a file as well after a kill: in-place writes are made in an order in
-    which every prefix is readable (superblock, index nodes from the root down, data and object headers, names last).
+    HDF5 has no transactions: a kill, a full disk or a power failure between two of its writes can leave metadata that
+    name data which never arrived, and then the whole file is lost. Given to h5py as its file object, this class
+    collects the writes of one append. What they overwrite goes to a journal beside the file first, on the medium, then
+    the writes to the file; when these are on the medium, too, the journal is void. One that is not void is from a
+    transaction that did not end: who opens the file to write puts the old bytes back, who opens it to read sees them in
+    their place. Other programs read such a file as well: in-place writes are made in an order in which every prefix is
+    readable (superblock, index nodes from the root down, data and object headers, names last).
 
     `key`: where in the file bytes lie that no other file has, and that no transaction changes; by them a journal knows
     its file. One writer at a time is for the caller to see to. `failure`: why the file could not be read. Raises

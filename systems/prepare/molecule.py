@@ -31,10 +31,9 @@ SUFFIXES = (".sdf", ".sd", ".mol", ".mdl", ".mol2")
 def scene_from_smiles(smiles: str, *, seed: int = 0) -> Scene:
     """Return the scene of a SMILES string: all hydrogens, charges as written, 3-D coordinates drawn with `seed`.
 
-    Bond orders are those of one Kekulé structure. Stereo is the SMILES' own; what it leaves open is drawn and said in
+    Bond orders are those of one Kekulé structure. Stereo that the SMILES leaves open is drawn and said in
     `provenance["repairs"]`. `provenance["multiplicity"]` is 1 + the number of unpaired electrons. Raises
-    PreparationError for text that is no SMILES, several fragments, metals and elements without a model, and stereo
-    that no geometry can have.
+    PreparationError for what is no SMILES, mixtures, metals, and stereo that no geometry can have.
     """
     notes: list[str] = []
     text = smiles.strip()

@@ -543,12 +543,11 @@ class TrajectoryWriter(FrameStore, ABC):
         """Append frames `(n, n_atoms, 3)` nm at times `(n,)` ps, later than all before, and flush them to disk.
 
         `flags` `(n,)` are validity bits (systems.chemistry.validity), given for all frames of a file or for none;
-        `chunk_idx` is the surrogate's chunk these frames came from, one number or `(n,)` (-1: none); `scalars` are
-        further `(n,)` series by name, NaN in frames where they are not given. Velocities nm/ps and forces kJ/mol/nm,
-        shaped as the positions, come with every frame of a file that was opened for them; `cell_nm` `(n, 3, 3)` holds
-        the box vectors of a periodic scene (its own where not given). Raises InputError for frames that do not fit the
-        scene, the times or what was appended before; StorageError when the disk is full (what was complete stays
-        readable, the writer is then closed to further frames).
+        `chunk_idx` is the surrogate's chunk they came from, one number or `(n,)` (-1: none); `scalars` are further
+        `(n,)` series by name, NaN where not given. Velocities nm/ps and forces kJ/mol/nm, shaped as the positions, come
+        with every frame of a file that was opened for them; `cell_nm` `(n, 3, 3)`: box vectors (the scene's own where
+        not given). Raises InputError for frames that do not fit the scene, the times or what was appended before;
+        StorageError when the disk is full: what was complete stays readable, the writer is closed.
         """
         block = self._checked(positions_nm, time_ps, flags, chunk_idx, scalars or {})
         n, shape = len(block), block.positions_nm.shape
@@ -618,10 +617,9 @@ class TrajectoryWriter(FrameStore, ABC):
 class TrajectoryReader(ABC):
     """Reads one file. `flags` and `chunk_idx` are None, `record` is empty, where the file does not say.
 
-    `times_known` is False where the format or the file holds no times: `time_ps` then only counts frames. `run_id` is
-    the number of the run that wrote the file, and `checksums` are those of its frames `(n_frames,)`, where it has them.
-    `notes`: sentences on what was assumed or left out, for people. `grid_nm`: what coordinates are rounded to as the
-    file states it, None where it does not say.
+    `times_known` is False where the file holds no times: `time_ps` then only counts frames. `run_id`: of the run that
+    wrote the file; `checksums`: of its frames `(n_frames,)`. `notes`: what was assumed or left out, for people.
+    `grid_nm`: what coordinates are rounded to, where the file states it.
     """
 
     path: Path

@@ -53,14 +53,13 @@ def open_writer(
 ) -> TrajectoryWriter:
     """Start a trajectory file (`.h5`, `.hdf5`, `.dcd` or `.xtc`), or continue one with `append=True`.
 
-    Beside it stands `NAME.pdb`, its topology in its atom order (up to 99,999 atoms), beside a DCD or XTC also
-    `NAME.meta.h5` (record, exact times, flags). With `append` the file must be ours and hold the same ordered topology;
-    what it records stays, new keys of `record` are added, and an append that a crash interrupted is cut off.
-    `columns`: what each frame has beside positions, 'velocities' and 'forces' (HDF5 only); the cell of a periodic scene
-    is kept in any case. `run_id`: whose file it is. The writer locks the file, unless its caller has (`locked`).
-    Raises InputError for an unknown suffix or column, or a record that is not JSON; TrajectoryError when the file
-    exists (and neither `append` nor `overwrite` is set), is missing with `append`, damaged, of another topology, or
-    written by another process; StorageError when the folder is missing, not writable or full.
+    Beside it lies `NAME.pdb`, its topology (up to 99,999 atoms), beside a DCD or XTC also `NAME.meta.h5` (record, exact
+    times, flags). With `append` the file must be ours and hold the same ordered topology; new keys of `record` are
+    added, and an append that a crash interrupted is cut off. `columns`: what each frame has beside positions and cell,
+    'velocities' and 'forces' (HDF5 only). `run_id`: whose file it is. The writer locks the file, unless its caller has
+    (`locked`). Raises InputError for an unknown suffix or column, or a record that is not JSON; TrajectoryError when
+    the file exists already, is missing with `append`, damaged, of another topology, or written by another process;
+    StorageError when the folder is missing, not writable or full.
     """
     path = Path(path)
     if append and overwrite:
@@ -124,10 +123,9 @@ def open_trajectory(path: str | Path, *, top: str | Path | None = None) -> Traje
     ASE trajectory where ase is installed.
 
     `top` names a structure or topology file for formats without topology; a DCD or XTC of ours finds its companions.
-    A file without our record has `record == {}` and `flags is None`; one without times has `times_known` False.
-    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds.
-    Raises TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes);
-    InputError when a topology is needed, or does not fit.
+    Warns (UserWarning) of a DCD of another program whose header states another number of frames than it holds. Raises
+    TrajectoryError when the file is missing, damaged or incomplete (it is never read as far as it goes); InputError
+    when a topology is needed, or does not fit.
     """
     from systems.trajectory import companion_writer, dcd_file, foreign_readers, hdf5_file
     from systems.trajectory.foreign_scenes import XYZ_SUFFIXES, is_mdtraj_format

@@ -1,9 +1,8 @@
-"""What stands beside trajectories: `NAME.pdb` has the topology; `NAME.meta.h5` the rest, where a format holds positions
+"""What lies beside trajectories: `NAME.pdb` has the topology; `NAME.meta.h5` the rest, where a format holds positions
 alone, as DCD (`dcd_file`) and XTC do.
 
-A trajectory is not read by its PDB, so that may be missing (copies); a file of another program is never replaced. The
-text is written here: every bond and the scene's own atom order must stand in it, while OpenMM's PDBFile writes CONECT
-records of non-standard residues alone (12 of alanine dipeptide's 21 bonds).
+A trajectory is not read by its PDB, so that may be missing. The text is written here, with every bond and in the
+scene's own atom order: OpenMM's PDBFile writes CONECT records of non-standard residues alone.
 
 `NAME.xtc` holds positions in nm to three decimals and times as float32. Frames are compressed and read by MDTraj. No
 library appends to a file whose last frame is cut short, or cuts one to a number of frames: where each frame ends stands

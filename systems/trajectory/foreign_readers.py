@@ -296,10 +296,10 @@ class MdtrajReader(TrajectoryReader):
         self.time_ps, self.times_known = np.asarray(frames.time, dtype=np.float64), self._format.times != NONE
         suffix = path.name.lower()
         if suffix.endswith(".gro"):
-            titles, names = zip(*_gro_frames(path), strict=True)
-            self._put_in_order(frames, names)
+            titled = list(_gro_frames(path))
+            self._put_in_order(frames, [names for _, names in titled])
             # Where one title states no time MDTraj counts frames.
-            self.times_known = all(_GRO_TIME.search(title) for title in titles)
+            self.times_known = all(_GRO_TIME.search(title) for title, _ in titled)
         elif suffix.endswith((".pdb", ".pdb.gz")):
             self._put_in_order(frames, _pdb_names(path))
         elif suffix.endswith(".arc"):
